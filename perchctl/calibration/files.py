@@ -83,8 +83,8 @@ def _text(path: Path) -> str:
         if file_kind(path) in ("another kind of file", "a camera calibration", "a profile"):
             return data.decode("cp1252", errors="replace")  # Latin-1, and quotes of Windows
     raise InvalidValue(
-        f"this is {file_kind(path)}, no camera calibration: name the .yaml of perchctl calibrate, "
-        f"or one of ROS, OpenCV or Kalibr"
+        f"this is {file_kind(path)}, not a camera calibration: name the .yaml file from "
+        "perchctl calibrate, or one from ROS, OpenCV or Kalibr"
     )
 
 

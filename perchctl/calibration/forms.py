@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue
 from perchctl.plain_yaml import clip_text, parse_documents
 
-READ_FORMS = "camera_info of ROS, FileStorage of OpenCV, or camchain of Kalibr"
+READ_FORMS = "camera_info file (ROS), FileStorage file (OpenCV) or camchain (Kalibr)"
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ CAMERA_MESSAGE = Form(
 a script's file with K and D."""
 
 KALIBR_CAMERA = Form(
-    name="camchain of Kalibr",
+    name="Kalibr camchain",
     read={
         "size": ("resolution",),
         "projection": ("camera_model",),
@@ -158,28 +158,28 @@ _AS_CAMERA_INFO = (
 _OTHER_FORMS = (
     (
         r"^\[image\]\s*$",
-        "an .ini or ost.txt of ROS without the lens's name",
-        "name the ost.yaml beside it",
+        "a ROS .ini or ost.txt file, which does not name the lens model",
+        "name the ost.yaml next to it",
     ),
     (
         r"^\d+ [A-Z_]+ \d+ \d+(?: [-+\d.e]+){3,}\s*$",
-        "a cameras.txt of COLMAP",
-        f"{_AS_CAMERA_INFO}, its cx and cy less 0.5 px",
+        "a COLMAP cameras.txt",
+        f"{_AS_CAMERA_INFO}, and subtract 0.5 px from cx and cy",
     ),
     (
         r"^\s*Camera\d?\.fx\s*:",
-        "a settings file of ORB-SLAM",
+        "an ORB-SLAM settings file",
         f"{_AS_CAMERA_INFO}; PinHole is plumb_bob, KannalaBrandt8 is equidistant",
     ),
     (
         r"^\s*model_type\s*:",
-        "a camera of VINS or camodocal",
+        "a VINS or camodocal camera file",
         f"{_AS_CAMERA_INFO}; PINHOLE is plumb_bob, KANNALA_BRANDT is equidistant, others are not "
         f"supported",
     ),
-    (r"^sensor_type\s*:\s*camera", "a sensor.yaml of the EuRoC data set", _AS_CAMERA_INFO),
-    (r'"camera_type"\s*:', "a calibration of Basalt", _AS_CAMERA_INFO),
-    (r'"cameraData"\s*:', "a calibration of DepthAI (OAK)", _AS_CAMERA_INFO),
+    (r"^sensor_type\s*:\s*camera", "a sensor.yaml from the EuRoC data set", _AS_CAMERA_INFO),
+    (r'"camera_type"\s*:', "a Basalt calibration", _AS_CAMERA_INFO),
+    (r'"cameraData"\s*:', "a DepthAI (OAK) calibration", _AS_CAMERA_INFO),
 )
 """Forms that are known and not read: a pattern in the text, the name, and what to do."""
 
@@ -202,11 +202,13 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     """
     for pattern, name, advice in _OTHER_FORMS:
         if re.search(pattern, text, re.MULTILINE):
-            raise InvalidValue(f"this is {name}, which is not read: {advice}")
+            raise InvalidValue(f"this is {name}, which is not supported: {advice}")
     values = _values(text)
     cameras = [key for key in values if re.fullmatch(r"cam\d+", key)]
     if len(cameras) > 1:
-        raise InvalidValue(f"holds the cameras {', '.join(cameras)}: keep the one that flies")
+        raise InvalidValue(
+            f"holds the cameras {', '.join(cameras)}: keep only the one on the vehicle"
+        )
     if cameras:
         return _kalibr_lens(cameras[0], values[cameras[0]]), values
     is_message = {"k", "d"} <= {_plain_key(key) for key in values}
@@ -237,9 +239,9 @@ def _values(text: str) -> dict[str, Any]:
     try:
         differ = any(other != first for other in others)
     except RecursionError:  # in YAML a value may hold itself
-        raise InvalidValue("values are nested too deeply to be read") from None
+        raise InvalidValue("values are nested too deeply") from None
     if differ:
-        raise InvalidValue(f"holds {len(documents)} documents that differ: keep one")
+        raise InvalidValue(f"holds {len(documents)} different documents: keep one")
     return first
 
 
@@ -249,20 +251,22 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) < len(pairs):
         (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
-        raise InvalidValue(f"key {clip_text(key)} is there twice: keep one")
+        raise InvalidValue(f"key {clip_text(key)} appears twice: keep one")
     return values
 
 
 def _xml_values(text: str) -> dict[str, Any]:
     """The values of OpenCV's FileStorage in XML."""
     if "<opencv_storage>" not in text:
-        raise InvalidValue(f"this is XML of another program: a calibration is a {READ_FORMS}")
+        raise InvalidValue(
+            f"this XML file is from another program: a calibration is a {READ_FORMS}"
+        )
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         keys = storage.root().keys()
         return {key: _node_value(storage.getNode(key)) for key in keys}
     except (cv2.error, SystemError):
-        raise InvalidValue("this is not a readable FileStorage file of OpenCV in XML") from None
+        raise InvalidValue("this is not a readable OpenCV FileStorage file in XML") from None
 
 
 def _node_value(node: Any) -> Any:
@@ -288,7 +292,7 @@ def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
     if K.size != 9:
         raise InvalidValue(f"{key} needs 9 numbers, found {K.size}")
     if not K.any():
-        raise InvalidValue(f"{key} is all 0: the camera was not calibrated")
+        raise InvalidValue(f"{key} holds only zeros: the camera was not calibrated")
     _check_rms(found, size_px[0])
     _check_entries(found, K)
     model, distortion = _distortion(found, _named_lens(found))
@@ -359,8 +363,8 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
             raise InvalidValue(_missing(form.read[meaning][0], values, unknown))
     if unknown:
         raise InvalidValue(
-            f"{'key' if len(unknown) == 1 else 'keys'} {clip_text(', '.join(unknown))} of this "
-            f"{form.name} may change the projection, and perchctl does not know "
+            f"{'key' if len(unknown) == 1 else 'keys'} {clip_text(', '.join(unknown))} of "
+            f"this {form.name} may change the projection, and perchctl does not know "
             f"{'it' if len(unknown) == 1 else 'them'}: remove what is only a note"
         )
     return found
@@ -369,9 +373,9 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
 def _missing(key: str, values: Mapping[str, Any], unknown: list[str]) -> str:
     """The sentence about a missing key, with the one that may have been meant."""
     if close := difflib.get_close_matches(key, unknown, 1):
-        return f"key {key} is missing: is {close[0]} meant?"
+        return f"key {key} is missing: is {close[0]} a misspelling of it?"
     return (
-        f"key {key} is missing, found {clip_text(', '.join(values))}: a calibration is a "
+        f"key {key} is missing among {clip_text(', '.join(values))}: a calibration is a "
         f"{READ_FORMS}"
     )
 
@@ -381,13 +385,14 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
         return
     if _plain_key(key) == "xi":
         raise InvalidValue(
-            f"xi = {clip_text(str(value))} is an omnidirectional lens, which is not supported: "
-            f"calibrate as plumb_bob, rational_polynomial or fisheye"
+            f"xi = {clip_text(str(value))} means an omnidirectional lens, which is not "
+            "supported: calibrate as plumb_bob, rational_polynomial or fisheye"
         )
     neutral = " or ".join(f"{each:g}" for each in allowed)
     raise InvalidValue(
-        f"{key} = {clip_text(str(value))} changes the projection, and is not supported: calibrate "
-        f"with pictures as the camera gives them, and {key} {neutral}"
+        f"{key} = {clip_text(str(value))} changes the projection, which is not "
+        f"supported: calibrate with unmodified pictures from the camera, and {key} "
+        f"{neutral}"
     )
 
 
@@ -404,8 +409,8 @@ def _check_region(found: _Found) -> None:
         whole = tuple(_pixels(*found[each][0]) for each in ("width", "height") if each in found)
         if offset != (0, 0) or size not in ((0, 0), whole):
             raise InvalidValue(
-                f"{key} is a part of the picture, {size[0]}x{size[1]} px at {offset}: calibrate "
-                f"with pictures as the camera gives them"
+                f"{key} is only a part of the picture, {size[0]}x{size[1]} px at {offset}: "
+                "calibrate with unmodified pictures from the camera"
             )
 
 
@@ -416,7 +421,7 @@ def _check_rms(found: _Found, width_px: int) -> None:
         if (rms_px > _MAX_RMS_SHARE * width_px).any():
             raise InvalidValue(
                 f"{key} = {rms_px.max():g} px: the calibration misses its own pictures by more "
-                f"than {100 * _MAX_RMS_SHARE:g} % of their width, calibrate again"
+                f"than {100 * _MAX_RMS_SHARE:g} % of their width; calibrate again"
             )
 
 
@@ -426,8 +431,8 @@ def _check_entries(found: _Found, K: NDArray[np.float64]) -> None:
         for key, value in found.get(entry, []):
             if not np.allclose(_numbers(key, value), K[i]):
                 raise InvalidValue(
-                    f"{key} is {clip_text(str(value))} but the camera matrix has {K[i]:g}: keep "
-                    f"the true one"
+                    f"{key} is {clip_text(str(value))}, but the camera matrix has {K[i]:g}: "
+                    f"keep one"
                 )
 
 
@@ -440,8 +445,9 @@ def _size(found: _Found, form: Form) -> tuple[int, int]:
         return _pixels(key, numbers[0]), _pixels(key, numbers[1])
     if not {"width", "height"} <= found.keys():
         raise InvalidValue(
-            f"the image size is missing in this {form.name}: add {form.read['width'][0]} and "
-            f"{form.read['height'][0]}, in px, of the pictures that the camera was calibrated with"
+            f"the image size is missing in this {form.name}: add {form.read['width'][0]} "
+            f"and {form.read['height'][0]}, the size in px of the pictures that the camera "
+            "was calibrated with"
         )
     width, height = (_pixels(*found[each][0]) for each in ("width", "height"))
     return width, height
@@ -451,7 +457,7 @@ def _pixels(key: str, value: Any, least: int = 1) -> int:
     number = _numbers(key, value)
     if number.size != 1 or number[0] < least or number[0] != np.floor(number[0]):
         raise InvalidValue(
-            f"{key} must be a whole number of pixels, {least} or more, found "
+            f"{key} must be a whole number of pixels, at least {least}, found "
             f"{clip_text(str(value))}"
         )
     return int(number[0])
@@ -477,7 +483,7 @@ def _named_lens(found: _Found) -> str | None:
         elif "fisheye" in named.values():
             named[key] = "no fisheye"
     if len(set(named.values())) > 1:
-        raise InvalidValue(f"{' and '.join(named)} name different lenses: keep the true one")
+        raise InvalidValue(f"{' and '.join(named)} name different lenses: keep the right one")
     return next(iter(named.values()), None)
 
 
@@ -503,8 +509,8 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
         return model, kept
     if given.size in _OPENCV_LONG and model != "fisheye":
         raise InvalidValue(
-            f"{key} has {given.size} numbers, which describe a thin prism or a tilted sensor: that "
-            f"is not supported, calibrate with 5 or 8"
+            f"{key} has {given.size} numbers, which describe a thin prism or a tilted "
+            "sensor and are not supported: calibrate with 5 or 8"
         )
     raise InvalidValue(
         f"{model} needs {' or '.join(map(str, counts))} distortion coefficients, found {given.size}"

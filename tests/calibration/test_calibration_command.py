@@ -99,7 +99,7 @@ def test_a_calibration_is_not_judged_by_its_own_pictures(
     said = calibrate("check", file, f"images:{tmp_path}")
     assert said.exit_code == 30
     assert f"the board is {BOARD} (the calibration's)" in said.stderr
-    assert "10 of 10 views are those that the calibration was made from" in said.stderr
+    assert "10 of 10 views are from the pictures that the calibration was made from" in said.stderr
     render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
     passed = calibrate("check", file, f"images:{tmp_path}")
     assert passed.exit_code == 0, passed.output
@@ -114,7 +114,7 @@ def test_a_board_in_the_older_layout_is_calibrated_and_stored(tmp_path: Path) ->
     file = tmp_path / "camera.yaml"
     result = calibrate(f"images:{tmp_path / 'board'}", "-b", named, "-o", file)
     assert result.exit_code == 0, result.output
-    assert "the board has the layout before OpenCV 4.6" in result.stderr
+    assert "the board has the layout used before OpenCV 4.6" in result.stderr
     assert yaml.safe_load(file.read_text())["board"] == board.notation()
     error = np.abs(lens_parameters(load_calibration(file)) - lens_parameters(camera))
     assert error[:4].max() < 2.0
@@ -134,7 +134,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     (tmp_path / "board_02b.png").write_bytes(whole[: len(whole) // 2])
     left = calibrate(*words, "--json")
     assert left.exit_code == 0, left.output
-    assert "left out board_02b.png: is cut off" in left.stderr
+    assert "left out board_02b.png: is truncated" in left.stderr
     told = json.loads(left.stdout)
     assert told["views_used"] == 6
     named = [picture["name"] for picture in told["pictures_without_board"]]

@@ -119,7 +119,7 @@ def test_kalibr_s_file_of_one_camera_is_read(tmp_path: Path) -> None:
     ("  distortion_model: radtan\n", "", "key distortion_model is missing"),
     ("  camera_model: pinhole\n", "", "key camera_model is missing"),
     ("radtan", "none", "are not 0 although distortion_model is none"),
-    ("  resolution", "  xi: 0.9\n  resolution", "key xi of this camchain of Kalibr may"),
+    ("  resolution", "  xi: 0.9\n  resolution", "key xi of this Kalibr camchain may"),
 ])  # fmt: skip
 def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expected: str) -> None:
     chain = tmp_path / "camchain.yaml"

@@ -145,25 +145,31 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
         (ros(FIVE, "distortion_model: equidistant\n"), "fisheye needs 4 .* found 5"),
         (ros([*EIGHT, 0, 0, 0.001, 0]), "has 12 numbers, which describe a thin prism or a tilted"),
         (opencv([*EIGHT, *[0] * 5, 0.01]), "has 14 numbers, which describe a thin prism"),
-        (opencv(FISHEYE, "xi: 0.77\n"), "xi = 0.77 is an omnidirectional lens"),
+        (opencv(FISHEYE, "xi: 0.77\n"), "xi = 0.77 means an omnidirectional lens"),
         (ros(FIVE, "alpha: 0.01\n"), "alpha = 0.01 changes the projection"),
         (ros(FIVE, "binning_x: 2\nbinning_y: 2\n"), "binning_x = 2 changes the projection"),
         (
             ros(FIVE, "roi: {x_offset: 9, y_offset: 0, width: 200, height: 150}\n"),
-            "roi is a part of the picture",
+            "roi is only a part of the picture",
         ),
-        (ros(FIVE, "roi: {x_offset: 0, y_offset: 0, width: 200, height: 150}\n"), "roi is a part"),
+        (
+            ros(FIVE, "roi: {x_offset: 0, y_offset: 0, width: 200, height: 150}\n"),
+            "roi is only a part",
+        ),
         (ros(FIVE, "lens_type: wide\n"), "key lens_type of this .* may change the projection"),
         (opencv(FIVE, "w: 0.93\ngamma: [1.0, 2.0]\n"), "keys w, gamma of this"),
         (ros(FIVE, f"dist_coeffs: {FIVE}\n"), "has distortion_coefficients and dist_coeffs"),
-        (ros(FIVE, f"fx: {K[0] + 1}\n"), "fx is 211.5 but the camera matrix has 210.5"),
+        (ros(FIVE, f"fx: {K[0] + 1}\n"), "fx is 211.5, but the camera matrix has 210.5"),
         (ros(FIVE, "crop_width: 300\n"), "key crop_width of this"),
         (ros(FIVE, "mm: 3\nfov: 0.9\np: 1\n"), "keys mm, fov, p of this"),
-        (ros(FIVE).replace("coefficients", "coefficents"), "is distortion_coefficents meant"),
+        (
+            ros(FIVE).replace("coefficients", "coefficents"),
+            "is distortion_coefficents a misspelling",
+        ),
         (ros(FIVE).replace("image_width: 400", "image_width: 400.5"), "whole number of pixels"),
-        (ros(FIVE, matrix=[0.0] * 9), "camera_matrix is all 0"),
+        (ros(FIVE, matrix=[0.0] * 9), "camera_matrix holds only zeros"),
         (message(FIVE, "plumb_bob").replace("binning_x: 0", "binning_x: 2"), "binning_x = 2"),
-        (message(FIVE, "plumb_bob") + message(FISHEYE, "equidistant"), "2 documents that differ"),
+        (message(FIVE, "plumb_bob") + message(FISHEYE, "equidistant"), "2 different documents"),
         (message([], "''"), "distortion_model is empty: the camera was not calibrated"),
         (opencv(FIVE).replace("0.31", "31.0"), "avg_reprojection_error = 31 px"),
     ],
@@ -235,21 +241,24 @@ RECURSIVE = f"{ros(FIVE)}note: &own [*own]\n"
         (opencv(FIVE, "rms: '50'\n").replace("avg_re", "re"), "rms = 50 px: the calibration"),
         (
             "cam0: {camera_model: pinhole, 1: 2}\n",
-            "key resolution is missing, found camera_model, 1:",
+            "key resolution is missing among camera_model, 1:",
         ),
-        ("cam0: {2026-02-02: 2}\n", "is missing, found 2026-02-02"),
-        pytest.param("[" * 2000, "values are nested too deeply to be read", marks=pytest.mark.long),
-        ('{"K":' * 2000, "values are nested too deeply to be read"),
-        (f"{RECURSIVE}---\n{RECURSIVE}", "values are nested too deeply to be read"),
-        ('{"image_width": 400, "image_width": 401}', "key image_width is there twice: keep one"),
-        ('{"K": {"data": 1, "data": 2}}', "key data is there twice: keep one"),
-        ("image_width: 400\nimage_width: 401\n", "line 2: key image_width is there twice"),
+        ("cam0: {2026-02-02: 2}\n", "is missing among 2026-02-02"),
+        pytest.param("[" * 2000, "values are nested too deeply", marks=pytest.mark.long),
+        ('{"K":' * 2000, "values are nested too deeply"),
+        (f"{RECURSIVE}---\n{RECURSIVE}", "values are nested too deeply"),
+        ('{"image_width": 400, "image_width": 401}', "key image_width appears twice: keep one"),
+        ('{"K": {"data": 1, "data": 2}}', "key data appears twice: keep one"),
+        ("image_width: 400\nimage_width: 401\n", "line 2: key image_width appears twice"),
         ("a: 1\nb: !!timestamp x\n", "line 2: 'x' is not a valid timestamp"),
         ("a: !!bool 7\n", "line 1: '7' is not a valid bool"),
         ("a: !!int ''\n", "line 1: '' is not a valid int"),
         ("a: 2026-99-99\n", "line 1: '2026-99-99' is not a valid timestamp"),
         (ros(FIVE, "roi: {x_offset: left}\n"), "a value of roi.x_offset is not a number: left"),
-        (ros(FIVE, "roi: {width: [1, 2]}\n"), "roi.width must be a whole number of pixels, 0 or"),
+        (
+            ros(FIVE, "roi: {width: [1, 2]}\n"),
+            "roi.width must be a whole number of pixels, at least 0",
+        ),
     ],
 )
 def test_a_malformed_file_is_refused_in_one_sentence(text: str, said: str, tmp_path: Path) -> None:
@@ -330,22 +339,25 @@ def test_lists_of_rows_are_read(tmp_path: Path) -> None:
         (
             "# oST version 5.0 parameters\n\n[image]\n\nwidth\n400\n\n[narrow]\n\ncamera matrix\n"
             "210 0 203\n",
-            "ost.txt of ROS.*name the ost.yaml",
+            "ROS .ini or ost.txt.*name the ost.yaml",
         ),
-        ("# Camera list\n1 OPENCV 400 300 210.5 212 203.2 148.7 -0.2 0.1 0 0\n", "of COLMAP.*0.5"),
-        ('%YAML:1.0\nCamera.type: "KannalaBrandt8"\nCamera.fx: 210.5\n', "settings file of ORB"),
-        ('%YAML:1.0\nFile.version: "1.0"\nCamera1.fx: 210.5\n', "settings file of ORB-SLAM"),
-        ("%YAML:1.0\n---\nmodel_type: MEI\nmirror_parameters:\n   xi: 1.7\n", "of VINS"),
-        ("sensor_type: camera\nintrinsics: [210.5, 212, 203.2, 148.7]\n", "of the EuRoC data set"),
-        ('{"value0": {"intrinsics": [{"camera_type": "kb4"}]}}', "of Basalt"),
+        ("# Camera list\n1 OPENCV 400 300 210.5 212 203.2 148.7 -0.2 0.1 0 0\n", "COLMAP.*0.5"),
+        ('%YAML:1.0\nCamera.type: "KannalaBrandt8"\nCamera.fx: 210.5\n', "ORB-SLAM settings"),
+        ('%YAML:1.0\nFile.version: "1.0"\nCamera1.fx: 210.5\n', "ORB-SLAM settings file"),
+        ("%YAML:1.0\n---\nmodel_type: MEI\nmirror_parameters:\n   xi: 1.7\n", "VINS"),
+        (
+            "sensor_type: camera\nintrinsics: [210.5, 212, 203.2, 148.7]\n",
+            "from the EuRoC data set",
+        ),
+        ('{"value0": {"intrinsics": [{"camera_type": "kb4"}]}}', "Basalt"),
         ('{"cameraData": []}', "DepthAI"),
-        ("<calibration><f>210.5</f></calibration>", "XML of another program"),
-        ("<opencv_storage><camera_matrix>", "not a readable FileStorage file"),
-        ("M1: [1, 2]\nD1: [0]\n", "camera_matrix is missing, found M1, D1"),
+        ("<calibration><f>210.5</f></calibration>", "XML file is from another program"),
+        ("<opencv_storage><camera_matrix>", "not a readable OpenCV FileStorage file"),
+        ("M1: [1, 2]\nD1: [0]\n", "camera_matrix is missing among M1, D1"),
         ("extends: sim\ncamera: {}\n", "camera_matrix is missing.*it is a profile"),
         ("- 1\n", "holds no keys"),
         ("", "holds no keys"),
-        ("a: !!python/tuple [1]\n", "line 1: only plain numbers, texts, lists and keys are read"),
+        ("a: !!python/tuple [1]\n", "line 1: only plain numbers, strings, lists and mappings"),
     ],
 )
 def test_other_forms_are_refused_by_name(text: str, said: str, tmp_path: Path) -> None:
@@ -355,7 +367,7 @@ def test_other_forms_are_refused_by_name(text: str, said: str, tmp_path: Path) -
 
 def test_bytes_that_are_no_text_are_named(tmp_path: Path) -> None:
     for content, said in ((b"\x89PNG\r\n\x1a\n\0\0", "is a picture"), (b"PK\3\4\0", "is another")):
-        with pytest.raises(InvalidValue, match=f"{said}.*, no camera calibration"):
+        with pytest.raises(InvalidValue, match=f"{said}.*, not a camera calibration"):
             load(tmp_path, content)
 
 

@@ -97,16 +97,16 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends(shown: list[Grey]) 
 
 
 FOLLOWED = {
-    "move the board to the left rim": (0, 0.1),
-    "move the board to the right rim": (0, 0.9),
-    "move the board to the top rim": (1, 0.1),
-    "move the board to the bottom rim": (1, 0.9),
-    "come nearer": (2, 0.95),
-    "go farther away": (2, 0.1),
+    "move the board to the left edge": (0, 0.1),
+    "move the board to the right edge": (0, 0.9),
+    "move the board to the top edge": (1, 0.1),
+    "move the board to the bottom edge": (1, 0.9),
+    "move closer": (2, 0.95),
+    "move farther away": (2, 0.1),
     "tilt the board's right side away": (3, 0.3),
     "tilt the board's left side away": (3, -0.3),
-    "tilt the board's lower side away": (4, 0.3),
-    "tilt the board's upper side away": (4, -0.3),
+    "tilt the board's bottom side away": (4, 0.3),
+    "tilt the board's top side away": (4, -0.3),
 }
 """What is to be done, and how a view's signature shows that it was."""
 
@@ -163,14 +163,14 @@ def test_what_became_of_each_frame_is_counted() -> None:
     # The first still frame and the first blurred one moved, too.
     assert (frames.moved, frames.alike, frames.blurred) == (8, 3, 1)
     assert frames.text == (
-        "13 of 15 frames show the board: 1 taken, 8 moved by more than 1.5 px from the frame "
-        "before, 1 too blurred, 3 like a view that was taken"
+        "13 of 15 frames show the board: 1 taken, 8 moved by more than 1.5 px since "
+        "the previous frame, 1 too blurred, 3 similar to a view already taken"
     )
 
 
 @pytest.mark.parametrize(
     ("live", "advised"),
-    [(True, "hold the board still for a moment in each place"), (False, "record again .*images:")],
+    [(True, "hold the board still for a moment at each place"), (False, "record again .*images:")],
 )
 def test_too_few_views_of_a_film_are_not_said_to_be_too_few_boards(
     live: bool, advised: str
@@ -179,7 +179,7 @@ def test_too_few_views_of_a_film_are_not_said_to_be_too_few_boards(
     said = rf"only 1 usable views, .* \(13 of 15 frames show the board: .*\): {advised}"
     with pytest.raises(InvalidValue, match=said):
         calibrate_camera(found, CHARUCO.notation())
-    said = rf"1 usable views \(13 of 15 frames .*\), a check needs at least 3: {advised}"
+    said = rf"1 usable views \(13 of 15 frames .*\), but a check needs at least 3: {advised}"
     with pytest.raises(InvalidValue, match=said):
         check_calibration(draw_camera(np.random.default_rng(4)), found)
     assert found.frames is not None
@@ -199,10 +199,10 @@ def test_a_recording_is_not_told_what_to_do() -> None:
         said.append(capture.advice)
     assert said == [
         "no board found yet",
-        "moved since the frame before",
+        "moved since the previous frame",
         "too blurred",
         "taken, 1 views",
-        "like a view that was taken",
+        "similar to a view already taken",
     ]
 
 
@@ -230,7 +230,7 @@ def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
         page.show(Sketch(np.zeros((48, 64), np.uint8)))
         url = page.url.replace("/?", "/stream?")
         sentence = refused(calibrate(url), 30)
-        assert "camera_64x48.yaml exists already; add --force" in sentence
+        assert "camera_64x48.yaml already exists; add --force" in sentence
     assert output.read_text() == "mine"
 
 

@@ -178,7 +178,7 @@ def test_a_check_passes_the_camera_and_says_where_it_cannot_tell() -> None:
     straight = CameraModel(camera.size_px, camera.K, np.zeros(5))
     assert not check_calibration(straight, FoundViews(tuple(views))).passed
     views, camera = drawn(12, noise_px=0.3, max_tilt_deg=2.0, views=4)
-    with pytest.raises(InvalidValue, match=r"too little to judge|do not fit"):
+    with pytest.raises(InvalidValue, match=r"not enough to judge|do not fit"):
         check_calibration(camera, FoundViews(tuple(views)))
     with pytest.raises(InvalidValue, match="at least 3"):
         check_calibration(camera, FoundViews(tuple(views[:2])))

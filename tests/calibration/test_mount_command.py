@@ -77,8 +77,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["-p", "no_such"], 20, ["no_such", "crazyflie"]),
         (["-p", "mine.yaml", "--part", "both sides"], 2, ["--part", "pivot"]),
         (["-p", "mine.yaml", "-u", "nonsense://x"], 30, ["nonsense://x", "radio://"]),
-        (["-p", "mine.yaml", "-u", "sim://"], 2, ["simulator's floor", "--part pivot"]),
-        (["-p", "sim"], 2, ["sim:", "simulator's floor", "--source"]),
+        (["-p", "mine.yaml", "-u", "sim://"], 2, ["nobody can move it", "--part pivot"]),
+        (["-p", "sim"], 2, ["sim:", "nobody can move it", "--source"]),
         (["-p", "mine.yaml", "--source", "sim:"], 2, ["name a real one"]),
         (["-p", "mine.yaml", "--source", "video:no.mp4"], 2, ["--part pivot", "clock"]),
         (["-p", "mine.yaml", "--source", "no.mp4"], 20, ["no.mp4"]),
@@ -103,7 +103,7 @@ def test_wrong_usage(place: Path, words: list[str], code: int, expected: list[st
         (["still"], [], ["lacks motion", "tilt"]),
         (["mirrored"], [], ["camera.mirrored"]),
         (["brief", "pivot"], [], ["the carry lacks motion"]),
-        (["carry"], ["--part", "pivot"], ["no pivot", "a carry"]),
+        (["carry"], ["--part", "pivot"], ["no pivot", "only carry"]),
         (["cut"], [], ["cut.jsonl, line"]),
     ],
 )
@@ -144,8 +144,8 @@ def test_both_parts_measure_all_and_say_what_was_written_before(
     assert set(record["sigma"]) == set(record["written"]) == set(KEYS)
     assert record["written"]["rpy_deg"] == [0.0, 0.0, 0.0]
     assert record["recordings"] == [str(logs["both"])]
-    assert "you wrote 0 0 0: " in result.stderr
-    assert "deg away" in result.stderr
+    assert "the profile has 0 0 0: " in result.stderr
+    assert "deg off" in result.stderr
     assert [path.name for path in folder.iterdir() if path.suffix not in (".yaml", ".bak")] == []
 
 
@@ -205,7 +205,7 @@ def test_numbers_that_cannot_be_written_are_still_reported(
     Path("odd.yaml").write_text(odd, encoding="utf-8")
     result = mount("-p", "odd.yaml", "--from", logs["pivot"], "--write")
     assert result.exit_code == 30
-    assert "write them yourself: vehicle.gear_body_m: [" in result.stderr
+    assert "write the values by hand: vehicle.gear_body_m: [" in result.stderr
     assert result.stdout.startswith("vehicle.gear_body_m: [")
     assert Path("odd.yaml").read_text(encoding="utf-8") == odd
 
@@ -216,7 +216,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     c = MountingReport(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
     assert "camera.latency_s" not in c.new_profile_values()
     assert "latency_s" not in c.record()["written"]
-    assert "you wrote measured: each flight measures it" in "\n".join(c.lines())
+    assert "the profile says measured, which is kept" in "\n".join(c.lines())
 
 
 def carried(R: Array) -> RotationSolution:

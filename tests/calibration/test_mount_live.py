@@ -209,7 +209,7 @@ def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
     ("film", "looks", "error", "said"),
     [
         (_Film(ends_s=3.0), _Looks([]), TimedOut, "camera:0 is unplugged"),
-        (_Film(), _Looks([]), TimedOut, "the vehicle is gone: nothing heard"),
+        (_Film(), _Looks([]), TimedOut, "lost the vehicle: no packet received"),
         (_Film(), _Looks([], mirrored=True), InvalidValue, r"mirrored.*camera\.mirrored"),
     ],
 )
@@ -221,7 +221,7 @@ def test_what_ends_it_early_is_named_and_what_was_recorded_is_kept(
     with pytest.raises(error, match=said):
         recorded(
             recording, film, looks, samples,
-            lambda now_s: "nothing heard for 2 s" if now_s > 4.5 and "gone" in said else None,
+            lambda now_s: "no packet received for 2 s" if now_s > 4.5 and "lost" in said else None,
         )  # fmt: skip
     assert film.now_s < 7.0
     assert len(recording.attitudes) > 200
@@ -278,14 +278,14 @@ def test_a_wrong_line_is_named(path: Path, line: int, found: str, put: str) -> N
     assert found in lines[line - 1]
     lines[line - 1] = lines[line - 1].replace(found, put, 1)
     path.write_text("\n".join(lines))
-    with pytest.raises(InvalidValue, match=f"line {line} is no line of a recording"):
+    with pytest.raises(InvalidValue, match=f"line {line} is not a line of a"):
         MountingRecording.read(path)
 
 
 def test_what_is_no_file_or_empty_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").write_text("")
     (tmp_path / "flip").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(NotFound, match="not there"):
+    with pytest.raises(NotFound, match="does not exist"):
         MountingRecording.read(tmp_path / "none.jsonl")
     for name in (".", "empty", "flip"):
         with pytest.raises(InvalidValue, match=r"cannot be read: (Is a|it is no)|is empty"):

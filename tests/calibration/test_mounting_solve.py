@@ -135,10 +135,10 @@ LACKING = {
     "tilt it": turned_about("carry", (1.0, 0.0), 0.0),
     "turn it about": turned_about("carry", (1.0, 1.0), 0.1),
     "faster": slower(CARRY, 8.0),
-    "longer": replace(CARRY, poses=CARRY.poses[:150]),
+    "continue": replace(CARRY, poses=CARRY.poses[:150]),
     "bring the target": replace(CARRY, poses=[]),
     "wait for the vehicle": MountingRecording("carry"),
-    "tilt it to all sides": turned_about("pivot", (1.0, 0.0), 0.0),
+    "tilt it in every direction": turned_about("pivot", (1.0, 0.0), 0.0),
 }
 
 
@@ -169,8 +169,8 @@ def later(recording: MountingRecording, seconds: float) -> MountingRecording:
     ("recording", "said"),
     [
         (replace(CARRY, poses=[], mirrored_pictures=200), "the picture is mirrored"),
-        (carried_about(CARRY), "must not move"),
-        (later(CARRY, -0.1), "stamped 80 ms before"),
+        (carried_about(CARRY), "fix the target"),
+        (later(CARRY, -0.1), "time stamps 80 ms before"),
         (later(CARRY, 1000.0), "clock"),
         (PIVOT, "a recording of the pivot, not of the carry"),
     ],

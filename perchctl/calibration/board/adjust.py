@@ -180,9 +180,9 @@ def reject_outliers(
         if len(rejections) > MAX_VIEWS_OUT * len(views):
             named = ", ".join(r.view for r in rejections[:4])
             raise InvalidValue(
-                f"{len(rejections)} of {len(views)} views do not fit one camera "
-                f"({named}): is the board flat and --board its true layout, and were "
-                f"zoom and focus left alone between the pictures?"
+                f"{len(rejections)} of {len(views)} views do not fit one camera ({named}): "
+                "check that the board is flat, that --board matches it, and that zoom and "
+                "focus were not changed between the pictures"
             )
         kept = [
             view.select(mask)
@@ -215,7 +215,7 @@ def _find_outliers(
         left = int(mask.sum())
         had = len(whole[view.name])
         if view_rms > limit:
-            reasons[view.name] = f"RMS {view_rms:.2f} px, the median view has {median:.2f}"
+            reasons[view.name] = f"RMS {view_rms:.2f} px, but the median view has {median:.2f} px"
         elif had - left > MAX_CORNERS_OUT * had or left < MIN_CORNERS:
             reasons[view.name] = f"{had - left} of its {had} corners are outliers"
     return masks, reasons

@@ -91,15 +91,15 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
     odd = {name: size for name, size in sizes.items() if size not in (most, None)}
     named = ", ".join(f"{name} is {size[0]}x{size[1]} px" for name, size in odd.items() if size)
     raise InvalidValue(
-        f"{count} of {counts.total()} pictures are {most[0]}x{most[1]} px, but {named}: a "
-        f"calibration belongs to one size, remove those of another"
+        f"{count} of {counts.total()} pictures are {most[0]}x{most[1]} px, but {named}: "
+        "a calibration is for one size, so remove the others"
     )
 
 
 def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Rejection]]:
     """The views of the layout that most show, and the others as rejected: there is one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
-    reason = "its markers stand in another layout than in most pictures"
+    reason = "its markers have another layout than in most pictures"
     others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
     return [view for view in views if view.legacy == legacy], others
 
@@ -158,11 +158,11 @@ _BLUR_SHARE = 2.5 / 640.0
 _UNSEEN_EVERY = 15
 """Of the frames without a board every so many is kept, to name the board that they show."""
 _ADVICE = (
-    (0.5, "move the board to the right rim", "move the board to the left rim"),
-    (0.5, "move the board to the bottom rim", "move the board to the top rim"),
-    (0.5, "come nearer", "go farther away"),
+    (0.5, "move the board to the right edge", "move the board to the left edge"),
+    (0.5, "move the board to the bottom edge", "move the board to the top edge"),
+    (0.5, "move closer", "move farther away"),
     (0.0, "tilt the board's right side away", "tilt the board's left side away"),
-    (0.0, "tilt the board's lower side away", "tilt the board's upper side away"),
+    (0.0, "tilt the board's bottom side away", "tilt the board's top side away"),
 )
 """The middle of each part of a signature, and what brings more and less of it."""
 
@@ -246,13 +246,15 @@ class GuidedCapture:
         here = view_signature(seen, self._board)
         if before is None or _moved_px(before, seen) > self.counts.still_px:
             self._count("moved")
-            self.advice = "hold still" if live else "moved since the frame before"
+            self.advice = "hold still" if live else "moved since the previous frame"
         elif seen.blur_px > min(max(_BLUR_SHARE * width, 1.0), 2.5 * sharpest_px):
             self._count("blurred")
-            self.advice = "too blurred: more light, or hold still" if live else "too blurred"
+            self.advice = "too blurred: add light, or hold still" if live else "too blurred"
         elif any(signature_distance(here, there) <= NEW_BEYOND for there in self._signatures):
             self._count("alike")
-            self.advice = next_advice(self._signatures) if live else "like a view that was taken"
+            self.advice = (
+                next_advice(self._signatures) if live else "similar to a view already taken"
+            )
         else:
             self._count("taken")
             self.taken.append(seen)

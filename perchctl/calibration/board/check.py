@@ -91,22 +91,22 @@ def check_calibration(
     found = replace(found, views=tuple(view for view in found.views if view not in own))
     if own and len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
-            f"{len(own)} of {len(own) + len(found.views)} views are those that the calibration was "
-            f"made from, which cannot judge it: take new pictures"
+            f"{len(own)} of {len(own) + len(found.views)} views are from the pictures that "
+            "the calibration was made from, which cannot test it: take new pictures"
         )
     if len(found.views) < MIN_CHECK_VIEWS:
-        advice = "add some with the board tilted by 20 to 45 deg and near the picture's rims"
+        advice = "add some with the board tilted by 20 to 45 deg and near the picture's edges"
         seen = f"{len(found.views)} pictures show the board"
         if found.frames is not None:
             seen = f"{len(found.views)} usable views ({found.frames.text})"
             advice = found.frames.advice or advice
-        raise InvalidValue(f"{seen}, a check needs at least {MIN_CHECK_VIEWS}: {advice}")
+        raise InvalidValue(f"{seen}, but a check needs at least {MIN_CHECK_VIEWS}: {advice}")
     free, kept, outliers = robust_fit(found.views)
     reason = "the calibration was made from it"
     rejections = [*(Rejection(view.name, reason) for view in own), *outliers]
     fixed = fit_poses(kept, camera)
     if fixed is None:
-        reason = "the calibration cannot see the boards where they are: it is another camera's"
+        reason = "no pose of the boards fits the calibration: it may be another camera's"
         return CheckResult(False, reason, np.inf, free.rms_px, (), tuple(rejections))
     deviations = tuple(
         Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)
@@ -123,14 +123,14 @@ def _verdict(
 ) -> tuple[bool, str]:
     if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
         return False, (
-            f"reprojection RMS {fixed.rms_px:.2f} px, where these pictures allow "
-            f"{free.rms_px:.2f} px"
+            f"reprojection RMS {fixed.rms_px:.2f} px, but {free.rms_px:.2f} px is possible "
+            "with these pictures"
         )
     worst = max(deviations, key=lambda d: d.allowed_error_share, default=None)
     if worst is not None and worst.allowed_error_share > 0.5:
         return False, (
             f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
-            f"these pictures put it (+-{worst.mm95:.1f} mm), and "
+            f"these pictures place it (+-{worst.mm95:.1f} mm), but only "
             f"{0.5 * allowed_error_mm(worst.z_m):.1f} mm is allowed"
         )
     return True, f"reprojection RMS {fixed.rms_px:.2f} px ({free.rms_px:.2f} px at best)"
@@ -141,7 +141,7 @@ def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(
-        f"{len(free.poses)} pictures (board tilted by at most {tilts_deg(free.poses).max():.0f} "
-        f"deg) are too little to judge a focal length: add some with the board tilted by 20 to "
-        f"45 deg, filling the picture"
+        f"{len(free.poses)} pictures (board tilted by at most "
+        f"{tilts_deg(free.poses).max():.0f} deg) are not enough to judge a focal "
+        "length: add some with the board tilted by 20 to 45 deg and filling the picture"
     )

@@ -104,9 +104,9 @@ class FrameCounts:
         """What became of the frames, in words."""
         reasons = (
             (self.taken, "taken"),
-            (self.moved, f"moved by more than {self.still_px:.2g} px from the frame before"),
+            (self.moved, f"moved by more than {self.still_px:.2g} px since the previous frame"),
             (self.blurred, "too blurred"),
-            (self.alike, "like a view that was taken"),
+            (self.alike, "similar to a view already taken"),
         )
         counted = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
         text = f"{self.with_board} of {self.with_board + self.without_board} frames show the board"
@@ -118,10 +118,10 @@ class FrameCounts:
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
-            return "hold the board still for a moment in each place, in good light"
+            return "hold the board still for a moment at each place, in good light"
         return (
-            "record again and hold still for a moment in each place, in good light, or save sharp "
-            "frames as pictures (images:)"
+            "record again and hold still for a moment at each place, in good light, or "
+            "save sharp frames as pictures (images:)"
         )
 
 
@@ -237,7 +237,10 @@ def _without_board(image: Grey) -> str:
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
     if ids is not None and marker.id in ids:
-        return "it shows the perching target; print a board with perchctl make-target board"
+        return (
+            "it shows the perching target, not a board; print a board with perchctl "
+            "make-target board"
+        )
     return "no board found"
 
 

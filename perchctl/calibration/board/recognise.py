@@ -73,7 +73,10 @@ def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
     if len(ids) < MIN_MARKERS:
         tags = (_marker_ids(image, [_APRIL_GRID], border_bits=2)[_APRIL_GRID] for image in images)
         if any(len(each) >= MIN_MARKERS for each in tags):
-            return "an AprilGrid, which is not read: print a board with perchctl make-target board"
+            return (
+                "an AprilGrid, which is not supported: print a board with perchctl make-target "
+                "board"
+            )
         return None
     dictionary = _smallest(family, max(ids))
     is_named_family = _stem(str(named.dictionary)) == _stem(dictionary)
@@ -84,7 +87,7 @@ def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
     )
     if board is None:
         is_part = is_named_family and max(ids) < named.columns * named.rows // 2
-        numbers = f"markers of {dictionary} with the numbers {min(ids)} to {max(ids)}"
+        numbers = f"markers of {dictionary} with ids {min(ids)} to {max(ids)}"
         return "" if is_part else numbers
     if is_named_family and (board.columns, board.rows) == (named.columns, named.rows):
         return ""

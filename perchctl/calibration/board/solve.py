@@ -97,7 +97,7 @@ class Calibration:
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
-            text += f", aside {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
+            text += f", but off axis {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
         return text
 
     def lines(self) -> list[str]:
@@ -220,7 +220,7 @@ def robust_fit(
             return reject_outliers(views, best)
     except NoSolution:
         pass
-    raise InvalidValue("no camera fits these pictures: is --board the true layout of the board?")
+    raise InvalidValue("no camera model fits these pictures: check that --board matches the board")
 
 
 def _is_usable(camera: CameraModel) -> bool:
@@ -262,14 +262,14 @@ def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
     if found.frames is not None:
         advice = found.frames.advice or f"show the board {variety.removeprefix('with the board ')}"
         raise InvalidValue(
-            f"only {len(views)} usable views, at least {MIN_VIEWS} are needed "
+            f"only {len(views)} usable views, but at least {MIN_VIEWS} are needed "
             f"({found.frames.text}): {advice}"
         )
     pictures = len(found.views) + len(found.without_board)
     of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
     raise InvalidValue(
-        f"only {len(views)} {of} show the board, at least {MIN_VIEWS} are needed: add "
-        f"{missing} or more (15 to 25 are good) {variety}"
+        f"only {len(views)} {of} show the board, but at least {MIN_VIEWS} are needed: "
+        f"add {missing} or more (15 to 25 are good) {variety}"
     )
 
 
@@ -285,9 +285,9 @@ def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
         )
     if covered.mean() < MIN_COVERED:
         raise InvalidValue(
-            f"the boards cover {100 * covered.mean():.0f} % of the picture, at least "
+            f"the boards cover {100 * covered.mean():.0f} % of the picture, but at least "
             f"{100 * MIN_COVERED:.0f} % are needed: add views with the board "
-            f"{_uncovered_text(covered)} of the picture, or nearer"
+            f"{_uncovered_text(covered)} of the picture, or closer"
         )
 
 
@@ -295,16 +295,16 @@ def _check_focal(parameters: Array, std: Array) -> None:
     share = float((std[:2] / parameters[:2]).max())
     if not share <= MAX_FOCAL_ERROR:
         raise InvalidValue(
-            f"the views fix the focal length only to +-{100 * share:.1f} % (at most "
-            f"{100 * MAX_FOCAL_ERROR:g} % is accepted): add sharp views with the board tilted by "
-            f"20 to 45 deg about both axes and filling half of the picture"
+            f"the views determine the focal length only to +-{100 * share:.1f} % (at most "
+            f"{100 * MAX_FOCAL_ERROR:g} % is accepted): add sharp views with the board "
+            "tilted by 20 to 45 deg about both axes and filling half of the picture"
         )
 
 
 def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
     lacks = []
     if not _is_usable(fit.camera):
-        lacks.append("the lens model folds back inside of the picture: add views at its rims")
+        lacks.append("the lens model folds back inside the picture: add views at its edges")
     if views < GOOD_VIEWS:
         lacks.append(f"only {views} views: add {GOOD_VIEWS - views} or more")
     if covered.mean() < GOOD_COVERED:
@@ -328,4 +328,4 @@ def _uncovered_text(covered: NDArray[np.bool_]) -> str:
         for cell, name in zip(np.array_split(row, 3, axis=1), names, strict=True)
     ]
     empty = [name for share, name in sorted(thirds) if share < 0.6][:4]
-    return f"at the {' and '.join(empty) or 'rims'}"
+    return f"at the {' and '.join(empty) or 'edges'}"

@@ -57,7 +57,7 @@ def record_mounting(
     progress = _Progress(recording)
     for now_s, frame in poll_frames(source, clock, sleep):
         if (trouble := problem(now_s)) is not None:
-            raise TimedOut(f"the vehicle is gone: {trouble}")
+            raise TimedOut(f"lost the vehicle: {trouble}")
         recording.attitudes += [a for a in attitudes() if a.t_s >= oldest_s]
         if stopped() or (source.live and progress.over):
             return
@@ -108,7 +108,7 @@ class _Progress:
         elif share < LEAST_TARGET_SHARE:
             advice = "no target in view"
         else:
-            advice = (*self._missing, "enough; a little longer makes it surer")[0]
+            advice = (*self._missing, "enough; continue a little for a more precise result")[0]
         done = min(self._seconds / self._least_s, 1.0)
         rows = (
             (recording.part, f"{self._seconds:.0f} s of {self._least_s:.0f}", done),

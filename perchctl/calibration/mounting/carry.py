@@ -150,29 +150,30 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
     off_rad = float(np.median(np.linalg.norm(rows.misfit, axis=1)))
     if off_rad > MOST_MISFIT_RAD or rows.rejected_share > MOST_LEFT_OUT:
         raise InvalidValue(
-            f"the turns that the vehicle felt and those that the camera saw differ by "
-            f"{math.degrees(off_rad):.1f} deg ({100 * rows.rejected_share:.0f} % of the pictures "
-            f"do not fit at all): target and camera must not move in the room or on the vehicle; "
-            f"then {HOW_TO_RECORD['carry']}"
+            "the rotations from the gyroscope and from the camera differ by "
+            f"{math.degrees(off_rad):.1f} deg ({100 * rows.rejected_share:.0f} % of the "
+            "pictures do not fit at all): fix the target in the room and the camera on the "
+            f"vehicle; then {HOW_TO_RECORD['carry']}"
         )
     sigma = np.sqrt(np.diagonal(cov))
     turn_deg = math.degrees(sigma[TURN].max())
     sigma_s = float(sigma[LATENCY])
     if not turn_deg <= MOST_TURN_SIGMA_DEG:
         raise InvalidValue(
-            f"the camera's turn is known to {turn_deg:.1f} deg only (at most "
-            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {HOW_TO_RECORD['carry']}, and farther to each "
-            f"side"
+            f"the camera's rotation is known only to {turn_deg:.1f} deg (at most "
+            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {HOW_TO_RECORD['carry']}, and turn it "
+            "farther to each side"
         )
     if not sigma_s <= MOST_LATENCY_SIGMA_S:
         raise InvalidValue(
-            f"the latency is known to {1e3 * sigma_s:.0f} ms only (at most "
-            f"{1e3 * MOST_LATENCY_SIGMA_S:g} is accepted): turn faster to and fro"
+            f"the latency is known only to {1e3 * sigma_s:.0f} ms (at most "
+            f"{1e3 * MOST_LATENCY_SIGMA_S:g} is accepted): turn the vehicle back and forth "
+            "faster"
         )
     if latency_s < -2.0 * sigma_s:
         raise InvalidValue(
-            f"the pictures are stamped {-1e3 * latency_s:.0f} ms before they can have "
-            f"been taken: camera and telemetry must be on one clock"
+            f"the pictures have time stamps {-1e3 * latency_s:.0f} ms before they can have "
+            "been taken: camera and telemetry must use the same clock"
         )
 
 
@@ -272,7 +273,7 @@ def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[A
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         raise InvalidValue(
-            f"the target was not seen twice within half a second: {HOW_TO_RECORD['carry']}"
+            f"the target was never seen twice within half a second: {HOW_TO_RECORD['carry']}"
         )
     R = poses.R_cam_target
     seen = _vectors(R[first] @ R[second].transpose(0, 2, 1))

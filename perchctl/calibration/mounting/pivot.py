@@ -77,9 +77,9 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
     if rows.rejected_share > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
         raise InvalidValue(
-            f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
-            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.rejected_share:.0f} % of the "
-            f"pictures do not fit: {HOW_TO_RECORD['pivot']}"
+            f"the tip is known only to {1e3 * sigma_m:.1f} mm, at most "
+            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.rejected_share:.0f} % "
+            f"of the pictures do not fit: {HOW_TO_RECORD['pivot']}"
         )
     return PivotSolution(
         gear_cam_m=tip_m,
@@ -120,8 +120,8 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
             at_s = float(poses.t_s[k] - poses.t_s[0])
     if moved_m > SLIPPED_M and explains > SLIP_EXPLAINS:
         raise InvalidValue(
-            f"the tip slipped by {1e3 * moved_m:.1f} mm {at_s:.0f} s after "
-            f"the beginning: {HOW_TO_RECORD['pivot']}; a dent or a ring of tape holds it"
+            f"the tip slipped by {1e3 * moved_m:.1f} mm {at_s:.0f} s after the start: "
+            f"{HOW_TO_RECORD['pivot']}; hold the tip in place with a dent or a ring of tape"
         )
 
 

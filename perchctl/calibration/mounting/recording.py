@@ -93,7 +93,9 @@ class MountingRecording:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            raise NotFound(f"{path} is not there: name a recording of calibrate mount") from None
+            raise NotFound(
+                f"{path} does not exist: name a recording from calibrate mount"
+            ) from None
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "it is not text"
             raise InvalidValue(f"{path} cannot be read: {why}") from None
@@ -115,10 +117,10 @@ class MountingRecording:
                     parts[-1].attitudes.append(AttitudeSample(t_s, roll, pitch, yaw, gyro_radps))
             except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
                 raise InvalidValue(
-                    f"{path}, line {number} is no line of a recording of calibrate mount: {error}"
+                    f"{path}, line {number} is not a line of a calibrate mount recording: {error}"
                 ) from None
         if not parts:
-            raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
+            raise InvalidValue(f"{path} is empty: name a recording from calibrate mount")
         return parts
 
 
@@ -156,12 +158,12 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
 
 
 HOW_TO_RECORD: dict[MountingPart, str] = {
-    "carry": "turn the vehicle by hand in view of the target for 30 s, about all axes",
-    "pivot": "keep the tip on its point and tilt the vehicle around it to all sides for 20 s",
+    "carry": "turn the vehicle by hand about every axis for 30 s, with the target in view",
+    "pivot": "keep the tip on its point and tilt the vehicle around it in every direction for 20 s",
 }
 MIRRORED = (
-    "the picture is mirrored: switch that off in the camera, or change camera.mirrored in the "
-    "profile"
+    "the picture is mirrored: turn mirroring off in the camera, or change "
+    "camera.mirrored in the profile"
 )
 LEAST_SEEN_S: dict[MountingPart, float] = {"carry": 20.0, "pivot": 12.0}
 LEAST_POSES: dict[MountingPart, int] = {"carry": 150, "pivot": 100}
@@ -186,8 +188,8 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
         together = sum(begin_s <= p.t_s <= end_s + MOST_LATE_S for p in poses)
         if together < 0.5 * len(poses):
             raise InvalidValue(
-                f"only {together} of {len(poses)} pictures fall into the time of the "
-                f"telemetry: both must be on one clock; record anew"
+                f"only {together} of {len(poses)} pictures were taken while telemetry was "
+                "recorded: both must use the same clock; record again"
             )
     if lacking := missing_motion(recording):
         raise InvalidValue(f"the {part} lacks motion: {'; '.join(lacking)}")
@@ -209,7 +211,7 @@ def missing_motion(recording: MountingRecording) -> list[str]:
     along = tilts_deg @ np.stack([np.cos(directions), np.sin(directions)])
     tilted = min(_extent(column) for column in along.T)
     if tilted < TILT_DEG[part]:
-        lacking.append(f"tilt it to all sides ({tilted:.0f} of {TILT_DEG[part]:.0f} deg)")
+        lacking.append(f"tilt it in every direction ({tilted:.0f} of {TILT_DEG[part]:.0f} deg)")
     if part == "carry":
         across = arrays.R_cam_target[:, :2, 0]
         turned = _extent(np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0]))))
@@ -218,12 +220,12 @@ def missing_motion(recording: MountingRecording) -> list[str]:
         gyro_radps = np.array([a.gyro_radps for a in attitudes])
         rate_dps = math.degrees(math.sqrt(float((gyro_radps**2).sum(axis=1).mean())))
         if rate_dps < LEAST_RATE_DPS:
-            lacking.append(f"faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
+            lacking.append(f"turn faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
         if len(attitudes) < LEAST_ATTITUDES:
             lacking.append(f"telemetry: {len(attitudes)} of {LEAST_ATTITUDES} samples")
     seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # in which the target is seen
     if seen_s < LEAST_SEEN_S[part] or len(poses) < LEAST_POSES[part]:
-        lacking.append(f"longer: {seen_s:.0f} of {LEAST_SEEN_S[part]:.0f} s in view")
+        lacking.append(f"continue: {seen_s:.0f} of {LEAST_SEEN_S[part]:.0f} s in view")
     return lacking
 
 

@@ -34,13 +34,16 @@ class _Value:
         interval = self._text(SIGMAS_95 * self.sigma)
         line = f"{self.name:<12}{self._text(self.measured)} +- {interval} {self.unit} (95 %)"
         if self.written is None:
-            return [line, f"{'':<12}you wrote measured: each flight measures it, and it stays so"]
+            return [
+                line,
+                f"{'':<12}the profile says measured, which is kept: each flight measures it",
+            ]
         apart = self.measured - self.written
         apart = (apart + 180.0) % 360.0 - 180.0 if self.unit == "deg" else apart
         within = (np.abs(apart) <= SIGMAS_95 * self.sigma).all()
         away = self.scale * np.linalg.norm(apart)
-        said = "within that" if within else f"{away:.1f} {self.unit} away"
-        return [line, f"{'':<12}you wrote {self._text(self.written)}: {said}"]
+        said = "within the interval" if within else f"{away:.1f} {self.unit} off"
+        return [line, f"{'':<12}the profile has {self._text(self.written)}: {said}"]
 
     def _text(self, values: Array) -> str:
         return " ".join(f"{v:g}" for v in _rounded(self.scale * np.ravel(values), self.decimals))
