@@ -125,7 +125,7 @@ class Board:
         if found is None:
             raise _wrong(
                 text,
-                "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
+                "it must be chessboard:COLUMNSxROWS:SQUARE or "
                 "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, with :legacy for the layout of "
                 "OpenCV before 4.6",
             )
@@ -172,13 +172,13 @@ def _check_markers(board: Board, text: str) -> None:
     largest_m = 0.95 * board.square_m
     needed = board.columns * board.rows // 2
     if board.marker_m is not None and board.marker_m > largest_m:
-        raise _wrong(text, f"the marker needs white around it: at most {mm_text(largest_m)} mm")
+        raise _wrong(text, f"the marker needs a white margin: at most {mm_text(largest_m)} mm")
     try:
         held = dictionary_size(str(board.dictionary))
     except ValueError as error:
         raise _wrong(text, str(error)) from None
     if held < needed:
-        raise _wrong(text, f"{needed} markers are needed, and {board.dictionary} holds {held}")
+        raise _wrong(text, f"{needed} markers are needed, but {board.dictionary} has only {held}")
 
 
 def _wrong(text: str, why: str) -> InvalidValue:

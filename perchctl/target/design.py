@@ -69,31 +69,34 @@ class TargetDesign:
         start_m = self.start_range_m
         far_m = self.z1_m
         if far_m is None or self.z2_m is None or self.z3_m is None:
-            return ("a marker is never read through this blur: a sharper picture is needed",)
+            return (
+                "one of the markers can never be read with this blur: a sharper picture is needed",
+            )
         if self.start_height_m == 0.0:
             sure_px = reliable_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
         if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
             found.append(
-                f"the ceiling is hardly above the search height ({self.start_height_m:g} m), or "
-                f"below it: lower planner.search.max_height_m"
+                f"where the search begins ({self.start_height_m:g} m above the floor) the "
+                "target is less than 0.3 m above the camera: lower planner.search.max_height_m"
             )
         if start_m is not None and start_m > far_m:
             found.append(
-                f"gap at the start: from {self.start_height_m:g} m over the floor the target is "
-                f"{start_m:.2f} m from the camera, and is found up to {far_m:.2f} m"
+                f"gap at the start: from {self.start_height_m:g} m above the floor the target "
+                f"is {start_m:.2f} m from the camera, but it is found only within {far_m:.2f} m"
             )
         if self.z2_m <= self.z3_m:
             found.append(
-                f"gap between the markers: the small one is read up to {_cm(self.z2_m)}, and "
-                f"the large one is whole at any turn only from {_cm(self.z3_m)} on"
+                f"gap between the markers: the small one is read only within {_cm(self.z2_m)}, "
+                "and the large one is wholly in view at any heading only beyond "
+                f"{_cm(self.z3_m)}"
             )
         nearest_m = self.small_nearest_m
         if nearest_m is None or nearest_m > self.standoff_m:
             found.append(
-                f"gap before contact: with the gear {_cm(self.standoff_m)} under the target the "
-                f"small marker is not wholly in the picture, but from {_cm(nearest_m)} on; mount "
-                f"the camera nearer to the gear"
+                f"gap before contact: with the gear {_cm(self.standoff_m)} below the target the "
+                f"small marker is not wholly in view, which takes {_cm(nearest_m)}; mount the "
+                "camera closer to the gear"
             )
         return tuple(found)
 
@@ -113,22 +116,24 @@ class TargetDesign:
             "blur": f"sigma {self.blur_px:g} px",
             "target": f"{mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
             f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}",
-            "z1": f"{_cm(self.z1_m):<9} large marker from here on (side {_px(self.large_px)})",
-            "z2": f"{_cm(self.z2_m):<9} small marker from here on (side {_px(self.small_px)})",
-            "z3": f"{_cm(self.z3_m):<9} whole large marker down to here at any turn; "
-            f"{_cm(self.z3_upright_m)} where it is upright",
-            "at gear": f"{_cm(self.small_nearest_m):<9} whole small marker down to here between "
-            f"gear and target",
+            "z1": f"{_cm(self.z1_m):<9} and closer: large marker readable (side "
+            f"{_px(self.large_px)})",
+            "z2": f"{_cm(self.z2_m):<9} and closer: small marker readable (side "
+            f"{_px(self.small_px)})",
+            "z3": f"{_cm(self.z3_m):<9} and farther: whole large marker in view at any heading; "
+            f"{_cm(self.z3_upright_m)} if upright",
+            "at gear": f"{_cm(self.small_nearest_m):<9} and farther, gear to target: whole small "
+            "marker in view",
             "mounting": self.blind_range.text,
         }
         if self.start_range_m is not None:
             rows["search"] = (
-                f"{_cm(self.start_range_m):<9} to the target from {self.start_height_m:g} m over "
-                f"the floor, where the search begins"
+                f"{_cm(self.start_range_m):<9} to the target from {self.start_height_m:g} m "
+                "above the floor, where the search begins"
             )
         lines = [f"{name:<10}{text}" for name, text in rows.items()]
         warnings = [f"warning: {text}" for text in self.warnings]
-        return "\n".join([*lines, "", *(warnings or ["no gap from search to stand-off"])])
+        return "\n".join([*lines, "", *(warnings or ["no gap between search and stand-off"])])
 
 
 def _cm(length_m: float | None) -> str:

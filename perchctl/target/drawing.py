@@ -239,7 +239,7 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
         raise InvalidValue(f"{what}: unit {unit!r} in {text!r} is unknown; allowed are mm, cm, m")
     value = float(number) * UNITS_M[unit]
     if not (math.isfinite(value) and value > 0.0):
-        raise InvalidValue(f"{what}: {text!r} must be more than zero")
+        raise InvalidValue(f"{what}: {text!r} must be greater than zero")
     # What a person writes has no more than 12 digits: 0.1 cm is 0.001 m, not 0.0010000000000000002.
     return float(f"{value:.12g}")
 
@@ -256,12 +256,14 @@ def print_scale(
     off = scale - 1.0
     if abs(off) > MAX_SCALE_ERROR:
         raise InvalidValue(
-            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(spec_m)} "
-            f"mm of {source}: measure what is black, in mm"
+            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the "
+            f"{mm_text(spec_m)} mm of {source}: measure the black area, in mm"
         )
     notes = [f"{name}: {mm_text(measured_m)} mm, {100 * off:+.2f} % against {mm_text(spec_m)} mm"]
     if abs(off) > NOTABLE_SCALE_ERROR:
-        notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+        notes.append(
+            f"{name}: more than 1 % off: the page may have been scaled when it was printed"
+        )
     return scale, notes
 
 

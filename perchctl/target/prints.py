@@ -41,11 +41,11 @@ def measured_target(
         target = target.model_copy(update={name: marker.model_copy(update={"side_m": side_m})})
     if len(scales) == 2:
         between = scales["small"] - scales["large"]
-        notes.append(f"small against large: {100 * between:+.2f} %")
+        notes.append(f"small relative to large: {100 * between:+.2f} %")
         sigma = min(nominal.size_sigma, MEASURED_SIGMA)
         target = target.model_copy(update={"size_sigma": sigma})
     if target.size_sigma > MEASURED_SIGMA:
-        notes.append("measure both markers: distances claim less until both sizes are known")
+        notes.append("measure both markers: until then, distances have a larger uncertainty")
     return target, notes
 
 
@@ -117,8 +117,8 @@ class PrintCheck:
         frames), and a sentence on the ratio."""
         if not self.has_enough_frames:
             return False, (
-                f"print not judged: both markers were seen in {len(self._ratios)} frames, "
-                f"{MIN_FRAMES} needed"
+                f"print not judged: both markers were seen in only {len(self._ratios)} frames "
+                f"of {MIN_FRAMES} needed"
             )
         values, biases = np.array(self._ratios).T
         value = float(np.median(values))
@@ -128,12 +128,13 @@ class PrintCheck:
         total = math.hypot(sigma, float(np.median(biases)))
         nominal = self.target.small.side_m / self.target.large.side_m
         ratio_text = (
-            f"the small marker is {value * nominal:.4f} of the large one, the profile says "
-            f"{nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
+            f"the small marker is {value * nominal:.4f} of the large one, and the profile "
+            f"says {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
         )
         if abs(off) <= max(SIGMAS * total, MIN_ERROR):
-            return False, f"print good within its noise: {ratio_text}"
+            return False, f"print correct within the noise: {ratio_text}"
         return True, (
-            f"print error: {ratio_text}; measure both black squares and give them to "
-            f"perchctl make-target measured --measured-large MM --measured-small MM"
+            f"print error: {ratio_text}; measure both black squares and write them to the "
+            "profile with perchctl make-target measured --measured-large MM "
+            "--measured-small MM"
         )

@@ -145,7 +145,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     if magnet_m > large.side_m:
         raise InvalidValue(
             f"the magnet ({mm_text(magnet_m)} mm) does not fit behind the large marker "
-            f"({mm_text(large.side_m)} mm): take a smaller one (--magnet)"
+            f"({mm_text(large.side_m)} mm): use a smaller one (--magnet)"
         )
     diagonal = math.sqrt(2.0) * small.side_m
     if diagonal > magnet_m:
@@ -157,21 +157,22 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     for kind, marker in (("large", large), ("small", small)):
         if _cells_apart(marker, marker, turns=(1, 2, 3)) == 0:
             raise InvalidValue(
-                f"{kind} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
-                f"so that its heading is ambiguous: take another id"
+                f"{kind} marker: id {marker.id} of {marker.dictionary} looks the same when "
+                "rotated, so its heading is ambiguous: choose another id"
             )
     if _cells_apart(large, small) < MIN_DISTANCE:
         raise InvalidValue(
-            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
-            f"nearly the same pattern, so one marker would be taken for the other: take another "
-            f"id for one of them"
+            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} "
+            "have nearly the same pattern, so one marker would be taken for the other: "
+            "choose another id for one of them"
         )
     seen = ArucoReader(target).read(draw_target(target).bitmap(_READ_SIDE_PX / large.side_m))
     for name in MARKERS:
         if name not in seen:
             raise InvalidValue(
-                f"the {name} marker cannot be read from this drawing: take a smaller small one, or "
-                f"an id of the large one that is white in the middle, as 997 of DICT_4X4_1000"
+                f"the {name} marker cannot be read from this drawing: make the small one "
+                "smaller, or choose an id for the large one that is white in the middle, such "
+                "as 997 of DICT_4X4_1000"
             )
 
 

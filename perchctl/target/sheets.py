@@ -77,8 +77,8 @@ def target_pdf(
     place = _layout_on(target, size, texts)
     if place is None:
         raise InvalidValue(
-            f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
-            f"fit on {page}; --page {_fitting_page(target, texts)} holds it"
+            f"a target of {1e3 * target.large.side_m:g} mm with its margin and rulers does "
+            f"not fit on {page}; use --page {_fitting_page(target, texts)}"
         )
     pdf = _Paper(*size, f"perchctl target, {mm_text(target.large.side_m)} mm", 2, date)
     _draw_front(pdf, target, *place)
@@ -97,17 +97,18 @@ def board_pdf(board: Board, page: str) -> bytes:
     if held is None:
         named = next((name for name, size in PAGES_MM.items() if _holding(needed, size)), None)
         raise InvalidValue(
-            f"a board of {width:g} x {height:g} mm with its rulers does not fit on "
-            f"{page}; --page {named or _page_text(*needed)} holds it"
+            f"a board of {width:g} x {height:g} mm with its rulers does not fit on {page}; "
+            f"use --page {named or _page_text(*needed)}"
         )
     pdf = _Paper(*held, f"perchctl {board.notation()}", 1, None)
     pdf.start()
     pdf.fill(board_rectangles(board))
     texts = (
-        f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
-        f"100 mm",
-        f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
-        f"calibrate, behind the board: {board.notation()}:measured=WIDTHxHEIGHTmm.",
+        f"perchctl {board.notation()}   Print at 100 %, not scaled: both rulers must "
+        "measure 100 mm.",
+        f"Then measure the black area ({width:g} x {height:g} mm) and append its sides "
+        "to the board for perchctl calibrate: "
+        f"{board.notation()}:measured=WIDTHxHEIGHTmm.",
     )
     left = max(UNPRINTABLE, pdf.cx - width / 2)
     lines = wrap_texts(texts, _LABEL, held[0] - UNPRINTABLE - left)
@@ -164,10 +165,10 @@ def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> t
         f"perchctl target:  large {named(target.large)},  small {named(target.small)}"
         + (f"  ({origin}{dated})" if origin else ""),
         "FRONT: this side faces the floor. Its x axis points right, y down.",
-        "Print at 100 %, not scaled: both rulers must measure 100 mm. Cut along the corner marks, "
-        "glue the magnet to the back.",
-        "Then measure the black squares and give their sides to perchctl make-target measured "
-        "--measured-large and --measured-small.",
+        "Print at 100 %, not scaled: both rulers must measure 100 mm. Cut along the "
+        "corner marks, and glue the magnet to the back.",
+        "Then measure the black squares, and write their sides to the profile with "
+        "perchctl make-target measured.",
     )
 
 
@@ -316,8 +317,8 @@ def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
     pdf.circle(cx, cy, radius)
     texts = (
         "BACK: this side faces the ceiling. Its x axis points left, y down.",
-        f"Glue the magnet ({mm_text(magnet_m)} mm across) into the circle. The cross lies over the "
-        f"centre of both markers.",
+        f"Glue the magnet ({mm_text(magnet_m)} mm across) into the circle. The cross "
+        "marks the centre of both markers.",
     )
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT
     for i, line in enumerate(wrap_texts(texts, _TEXT, pdf.w - 2 * UNPRINTABLE)):

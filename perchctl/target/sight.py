@@ -112,12 +112,12 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
     axis = f"leans {axis}" if axis else "points straight up"
     heights_m = sorted({min(h, highest_m) for h in (1.0, 2.0)})
     reaches = [(h, overhead_reach_m(side_m, camera, mount, h)) for h in heights_m]
-    within = [f"{r:.2g} m at {h:.2g} m above it" for h, r in reaches if r is not None]
+    within = [f"{r:.2g} m (at {h:.2g} m above it)" for h, r in reaches if r is not None]
     if not within:
-        return f"in the picture of a camera that looks up, not {axis}"
+        return f"visible only to a camera that looks up; the axis of this one {axis}"
     return (
-        f"at most {highest_m:.1f} m above the camera, and its centre no farther from the "
-        f"camera's axis than {', '.join(within)}; the axis {axis}"
+        f"at most {highest_m:.1f} m above the camera, its centre within "
+        f"{', '.join(within)} of the camera's axis, which {axis}"
     )
 
 
@@ -231,12 +231,12 @@ class BlindRange:
     def text(self) -> str:
         """Both ranges in words."""
         left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
-        return f"{left} (by whole markers alone: {whole}), the gear under the target's centre"
+        return f"{left} (with whole markers only: {whole}), the gear under the target's centre"
 
 
 def _blind_words(nearest_m: float | None) -> str:
     if nearest_m is None:
-        return f"blind in all of the last {1e2 * FROM_M:g} cm"
+        return f"blind over the whole last {1e2 * FROM_M:g} cm"
     return "never blind" if nearest_m == 0.0 else f"blind from {1e3 * nearest_m:.0f} mm to contact"
 
 

@@ -102,20 +102,20 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
     """Return why a position must be taken again, in one sentence; None if the position is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
-        return f"only {count} frames came"
+        return f"only {count} frames arrived"
     centers = np.array([r.center_px for r in readings if r.center_px is not None])
     if len(centers) < SEEN_SHARE * count:
         return (
-            f"half seen: both markers at once were found in {len(centers)} of {count} frames; "
-            f"move so that both are whole in the picture"
+            f"both markers were seen together in only {len(centers)} of {count} frames; "
+            "move so that both are wholly in view"
         )
     thirds = np.array([part.mean(axis=0) for part in np.array_split(centers, 3)])
     drift_px = float(np.linalg.norm(np.ptp(thirds, axis=0)))
     wander_px = max(float(np.linalg.norm(centers.std(axis=0))), drift_px)
     if wander_px > MOST_WANDER_PX:
         return (
-            f"shaken: the target wandered {wander_px:.1f} px in the picture (allowed is "
-            f"{MOST_WANDER_PX:g}); fix the camera and hold still"
+            f"not still: the target moved by {wander_px:.1f} px in the picture (at most "
+            f"{MOST_WANDER_PX:g} px allowed); fix the camera in place"
         )
     return None
 
@@ -166,8 +166,8 @@ class SessionFile:
             raise InvalidValue(f"{self.path} cannot be read: {error.strerror}") from None
         if not lines or lines[0].strip() != HEADER.encode():
             raise InvalidValue(
-                f"{self.path}: line 1: not a session of perchctl (its header differs), so "
-                f"nothing is appended; name a new file"
+                f"{self.path}: line 1: not a perchctl session (its header differs), so nothing "
+                "was appended; name a new file"
             )
         try:
             positions = [int(line.partition(b",")[0]) for line in lines[1:]]
@@ -179,7 +179,7 @@ class SessionFile:
             if positions and rows[positions[-1]] < frames:
                 del lines[-rows.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
-            self.note = f"{self.path}: an unfinished end was taken off"
+            self.note = f"{self.path}: removed an incomplete position at the end"
         self.done, self.next_position = len(rows), max(rows, default=0) + 1
 
 
@@ -195,15 +195,13 @@ class TypedPoses:
 
     def actual_pose(self, ask: Ask) -> ActualPose:
         """Ask the person for the pose. Raises InvalidValue if the answer is not four numbers."""
-        text = ask("actual pose of the target from the gear, x y z [cm] and yaw [deg]: ")
+        text = ask("actual pose of the target relative to the gear, x y z [cm] and yaw [deg]: ")
         try:
             x, y, z, yaw = (float(cell) for cell in text.replace(",", " ").split())
         except ValueError:
             x = y = z = yaw = math.nan
         if not math.isfinite(x + y + z + yaw):
-            raise InvalidValue(
-                f"{text.strip()!r} is not a pose: four numbers are needed, x y z and yaw"
-            )
+            raise InvalidValue(f"{text.strip()!r} is not a pose: enter four numbers, x y z and yaw")
         return np.array([0.01 * x, 0.01 * y, 0.01 * z, wrap_rad(math.radians(yaw))]), None
 
     def close(self) -> None:
@@ -301,14 +299,14 @@ class Experiment:
         while self.session.done < positions:
             number = self.session.next_position
             self.say(
-                f"position {self.session.done + 1} of {positions}: place the camera so that both "
-                f"markers are whole in the picture, at another height, place and heading"
+                f"position {self.session.done + 1} of {positions}: place the camera so that "
+                "both markers are wholly in view, at another height, place and heading"
             )
             fault = self._try_position(number, frames)
             if fault is None:
-                self.say(f"position {number} is kept in {self.session.path}")
+                self.say(f"position {number} was saved to {self.session.path}")
             else:
-                self.say(f"position {number} is refused, take it again: {fault}")
+                self.say(f"position {number} was rejected, take it again: {fault}")
 
     def _try_position(self, number: int, frames: int) -> str | None:
         """Take one position into the file; return a sentence if it must be taken again."""
@@ -335,8 +333,8 @@ class Experiment:
             text = "q"
         if text.strip().lower() in ("q", "quit"):
             raise Interrupted(
-                f"stopped with {self.session.done} positions in {self.session.path}; the same "
-                f"command goes on from there"
+                f"stopped with {self.session.done} positions in {self.session.path}; run the "
+                "same command again to continue"
             )
         return text
 

@@ -98,7 +98,7 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing:
         raise InvalidValue(
-            f"{path}: line 1: column {missing[0]} is missing, or there twice; needed are "
+            f"{path}: line 1: column {missing[0]} is missing, or appears twice; needed are "
             f"{HEADER}, separated by commas"
         )
     pick = operator.itemgetter(*(header.index(name) for name in NEEDED))
@@ -109,12 +109,12 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
         lines.append(reader.line_num)
         try:
             if len(cells) != len(header):
-                raise ValueError(f"{len(cells)} cells where the header has {len(header)} columns")
+                raise ValueError(f"{len(cells)} cells, but the header has {len(header)} columns")
             numbers.extend([float(cell or "nan") for cell in pick(cells)])
         except ValueError as error:
             raise InvalidValue(f"{path}: line {reader.line_num}: {error}") from None
     if not lines:
-        raise InvalidValue(f"{path}: line 2: there is no row of data after the header")
+        raise InvalidValue(f"{path}: line 2: no data after the header")
     return np.array(lines), np.array(numbers).reshape(len(lines), len(NEEDED))
 
 
@@ -129,19 +129,19 @@ def _check_cells(
 
     refuse(
         ~np.isfinite(heads).all(axis=1) | (heads[:, 0] != np.floor(heads[:, 0])),
-        "position must be a whole number, and t_s a number",
+        "position must be a whole number, and t_s must be finite",
     )
     for source, pose in poses.items():
-        refuse(np.isinf(pose).any(axis=1), f"the {source} pose holds an infinite number")
+        refuse(np.isinf(pose).any(axis=1), f"the {source} pose has an infinite number")
         refuse(
             np.abs(pose[:, YAW]) > 2.0 * np.pi + 1e-6,
-            f"{source}_yaw_rad looks like degrees where radians are needed",
+            f"{source}_yaw_rad looks like degrees: radians are needed",
         )
         empty = np.isnan(pose)
         refuse(
             empty.any(axis=1) & ~empty.all(axis=1),
-            f"a cell of the {source} pose is empty, but others are not; leave all four empty "
-            f"where the marker was not seen",
+            f"only some cells of the {source} pose are empty; leave all four empty if the "
+            "marker was not seen",
         )
     refuse(np.isnan(poses["actual"][:, 0]), "the actual pose is empty")
 
@@ -149,12 +149,12 @@ def _check_cells(
 def _check_positions(data: Measurements) -> None:
     for source in ("large", "small"):
         if np.isnan(getattr(data, source)).all():
-            raise InvalidValue(f"{data.name}: the {source} marker is never seen")
+            raise InvalidValue(f"{data.name}: the {source} marker was never seen")
     places = np.unique(data.position[data.has_both_markers])
     if len(places) < 2:
         raise InvalidValue(
-            f"{data.name}: {len(places)} positions show both markers; frames of one position are "
-            f"not independent, so at least 2 are needed (10 are usual)"
+            f"{data.name}: {len(places)} positions show both markers; frames of one "
+            "position are not independent, so at least 2 are needed (10 are typical)"
         )
     for place in places:
         rows = data.has_both_markers & (data.position == place)
@@ -164,7 +164,7 @@ def _check_positions(data: Measurements) -> None:
             far = np.abs(np.median(apart, axis=0)) > MOST_APART
             if far.any():
                 raise InvalidValue(
-                    f"{data.name}: position {place}: {source} and actual do not agree in "
-                    f"{AXES[int(np.argmax(far))]}: all poses must be in metres and radians, and "
-                    f"in one frame"
+                    f"{data.name}: position {place}: {source} and actual pose disagree in "
+                    f"{AXES[int(np.argmax(far))]}: all poses must be in metres and radians, and in "
+                    "the same frame"
                 )

@@ -214,8 +214,8 @@ def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
     if np.isnan(closed).any():
         raise InvalidValue(
             f"{errors.name}: the two markers differ by nothing or by a constant in "
-            f"{AXES[int(np.argmax(np.isnan(closed)))]}, so every weight fits alike; were frames "
-            f"repeated, or a column copied?"
+            f"{AXES[int(np.argmax(np.isnan(closed)))]}, so every weight fits equally well; "
+            "check for repeated frames or a copied column"
         )
     held_out = closed_form_weights(total[:, None] - errors.sums)
     folds = np.where(np.isfinite(held_out), held_out, closed)

@@ -76,7 +76,9 @@ def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
     Errors: NotFound, InvalidValue.
     """
     if test is not None and same_file(path, test):
-        raise InvalidValue(f"{test} is the data itself, and no test of what is fitted to it")
+        raise InvalidValue(
+            f"{test} is the data that the weights are fitted to, so it cannot test them"
+        )
     errors = marker_errors(read_data(path))
     fits = fit_by_each_method(errors)
     other = None
@@ -160,8 +162,8 @@ def report_text(result: FitResult) -> str:
     errors = result.errors
     left_out = int((~errors.is_inlier).any(axis=1).sum())
     data = (
-        f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show both "
-        f"markers; {left_out} of them are outliers"
+        f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show "
+        f"both markers; {left_out} of the rows are outliers"
     )
     parts = [_wrapped(data), _verdict(result)]
     judged = [(result.evidence, "on positions left out of the fit")]
@@ -191,8 +193,9 @@ def report_text(result: FitResult) -> str:
 def _verdict(result: FitResult) -> str:
     if not any(result.is_proven_better):
         return _wrapped(
-            "not recommended: on no axis do these weights beat the better single marker beyond "
-            "the 95 % interval; take more positions, or fly merge.method: joint"
+            "not recommended: on no axis are these weights better than the better single "
+            "marker by more than the 95 % interval; take more positions, or fly with "
+            "merge.method: joint"
         )
     lines = [f"recommended weights of the large marker ({LABELS[result.method]})"]
     for axis, name, proven, weight in zip(
@@ -203,9 +206,9 @@ def _verdict(result: FitResult) -> str:
         strict=True,
     ):
         why = (
-            f"beats the {name} marker alone beyond the 95 % interval"
+            f"better than the {name} marker alone by more than the 95 % interval"
             if proven
-            else f"the {name} marker alone: no weight is proven to beat it"
+            else f"the {name} marker alone: no weight is significantly better"
         )
         lines.append(f"  {axis:<4} {weight:.3f}  {why}")
     return "\n".join(lines)

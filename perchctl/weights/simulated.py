@@ -65,7 +65,7 @@ class SimulatedStand:
             if fault is not None:
                 raise InvalidValue(
                     f"position {position} of the simulated experiment cannot be used ({fault}): "
-                    f"take another --seed"
+                    "choose another --seed"
                 )
             session.append(session_rows(position, readings, place.actual))
 

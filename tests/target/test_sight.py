@@ -108,7 +108,7 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     ("rpy_deg", "words"),
     [
         ((0.0, 0.0, 0.0), "at most 3.2 m above the camera"),
-        ((0.0, 0.0, 0.0), "than 0.53 m at 1 m above it"),
+        ((0.0, 0.0, 0.0), "within 0.53 m (at 1 m above it)"),
         ((0.0, 12.0, 0.0), "leans 12 deg forward"),
         ((0.0, -12.0, 90.0), "leans 12 deg to the right"),
         ((0.0, 17.0, 45.0), "leans 12 deg forward and 12 deg to the left"),
@@ -225,9 +225,9 @@ def test_z3_is_the_geometry_s() -> None:
     [
         ({}, ""),
         ({"z1_m": 0.9}, "gap at the start"),
-        ({"start_range_m": 0.2}, "hardly above the search height"),
+        ({"start_range_m": 0.2}, "less than 0.3 m above the camera"),
         ({"z2_m": 0.15}, "gap between the markers"),
-        ({"z1_m": None}, "never read"),
+        ({"z1_m": None}, "never be read"),
         ({"small_nearest_m": 0.2}, "gap before contact"),
         ({"small_nearest_m": None}, "gap before contact"),
     ],

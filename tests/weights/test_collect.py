@@ -41,7 +41,7 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     torn.write_bytes(whole[: len(whole) - 700])  # within position 4
     done = run("collect", torn, "--truth", "sim", "--frames", 12, "--positions", 4)
     assert done.exit_code == 0, done.output
-    assert "an unfinished end was taken off" in done.stderr
+    assert "removed an incomplete position" in done.stderr
     assert torn.read_bytes() == whole
     torn.write_bytes(b"".join(line for line in whole.splitlines(True) if line[:2] != b"2,"))
     run("collect", torn, "--truth", "sim", "--frames", 12, "--positions", 4)
@@ -53,7 +53,7 @@ def test_a_file_that_is_no_session_is_left_alone(tmp_path: Path) -> None:
     other.write_text("position,t_s\n1,0.1\n", encoding="utf-8")
     done = run("collect", other, "--truth", "sim")
     assert done.exit_code == 30
-    assert "nothing is appended" in done.stderr
+    assert "nothing was appended" in done.stderr
     assert other.read_text(encoding="utf-8") == "position,t_s\n1,0.1\n"
     other.write_text(f"{HEADER}\nx,0.1\n", encoding="utf-8")
     for path, said in ((other, "position is not a whole number"), (tmp_path, "cannot be read")):
@@ -71,13 +71,13 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     moved[0, 3] += 0.002
     other = type(place)(moved, place.actual)
     late = list(read_markers(stand.frames(1, other, 6), profile, camera))
-    assert "shaken" in (position_fault([*good, *late]) or "")
+    assert "not still" in (position_fault([*good, *late]) or "")
     blind = [type(s)(s.t_s, s.large, None, None) for s in good]
-    assert "at once were found in 6 of 12" in (position_fault([*good, *blind]) or "")
+    assert "seen together in only 6 of 12" in (position_fault([*good, *blind]) or "")
     assert "only 2 frames" in (position_fault(good[:2]) or "")
     strict = apply_settings(profile, ["pose.max_reprojection_px=1e-6"])
     poseless = list(read_markers(stand.frames(1, place, 3), strict, camera))
-    assert "at once were found in 0 of 3" in (position_fault(poseless) or "")
+    assert "seen together in only 0 of 3" in (position_fault(poseless) or "")
 
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     words = ("collect", path, "--frames", 10, "--positions", 2, "--source", f"images:{pictures}")
     done = run(*words, stdin="\n".join(answers) + "\n")
     assert done.exit_code == 130, done.output
-    assert "is not a pose: four numbers are needed" in done.stderr
+    assert "is not a pose: enter four numbers" in done.stderr
     assert "but the actual pose is (0.0, 0.0, 60.0) cm" in done.stderr
     assert "stopped with 1 positions" in done.stderr
     assert path.read_text(encoding="utf-8").count("\n") == 11
@@ -107,7 +107,7 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
         old.unlink()
     done = run(*words, stdin=f"{typed[2]}\n\n")
     assert done.exit_code == 0, done.output
-    assert "holds 1 positions already" in done.stderr
+    assert "already holds 1 positions" in done.stderr
     assert np.unique(read_data(path).position).tolist() == [1, 2]
 
 

@@ -46,7 +46,7 @@ def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_pa
     closed = out.read_text()
     refused = run(session, "-o", out, "--method", "lms")
     assert (refused.exit_code, refused.stdout) == (30, "")
-    assert "w.yaml exists already; add --force" in refused.stderr
+    assert "w.yaml already exists; add --force" in refused.stderr
     assert run(session, "-o", out, "--method", "lms", "--force").exit_code == 0
     assert out.read_text() != closed
     assert run(session, "-o", session).exit_code == 2
@@ -115,12 +115,22 @@ BAD: list[tuple[str, slice, Edit, str]] = [
         "like degrees",
     ),
     ("position", slice(1, None), lambda r: "1", "1 positions show both markers"),
-    ("large_x_m", slice(8, 9), lambda r: "1e999", "line 9: the large pose holds an infinite"),
+    ("large_x_m", slice(8, 9), lambda r: "1e999", "line 9: the large pose has an infinite"),
     ("large_x_m", slice(99, 100), lambda r: "abc", "line 100: could not convert"),
-    ("small_y_m", slice(49, 50), lambda r: "", "line 50: a cell of the small pose is empty"),
-    ("actual_z_m", slice(50, 51), lambda r: "", "line 51: a cell of the actual pose is empty"),
+    (
+        "small_y_m",
+        slice(49, 50),
+        lambda r: "",
+        "line 50: only some cells of the small pose are",
+    ),
+    (
+        "actual_z_m",
+        slice(50, 51),
+        lambda r: "",
+        "line 51: only some cells of the actual pose are",
+    ),
     ("large_z_m", slice(1, None), lambda r: r[8], "constant in z"),
-    ("small_yaw_rad", slice(5, 6), lambda r: "0.1,0.2", "line 6: 15 cells where the header has 14"),
+    ("small_yaw_rad", slice(5, 6), lambda r: "0.1,0.2", "line 6: 15 cells, but the header has 14"),
     ("position", slice(7, 8), lambda r: "1.5", "line 8: position must be a whole number"),
 ]
 
@@ -150,7 +160,7 @@ def test_a_marker_that_is_never_seen_and_a_file_that_is_cut_are_named(tmp_path: 
     text = write(data, path).read_text().splitlines()
     blind = [",".join([*(c := row.split(","))[:6], *[""] * 4, *c[10:]]) for row in text[1:]]
     path.write_text("\n".join([text[0], *blind, ""]))
-    assert "the small marker is never seen" in run(path).stderr
+    assert "the small marker was never seen" in run(path).stderr
 
 
 def test_other_columns_orders_blanks_and_quotes_are_read(tmp_path: Path) -> None:
