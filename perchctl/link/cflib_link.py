@@ -147,7 +147,7 @@ class CflibLink:
             return trouble
         silent_s = now_s - self._blocks.last_arrival_s
         if silent_s > SILENCE_S:
-            return f"nothing heard for {silent_s:.1f} s"
+            return f"no packet received for {silent_s:.1f} s"
         return None
 
     def new_notes(self) -> list[str]:
@@ -203,13 +203,15 @@ class CflibLink:
         """Unlock the raw thrust; on the ground only, since its zero thrust cuts the motors."""
         newest, now_s = self._blocks.newest, self._clock()
         if not is_fresh(newest, now_s):
-            raise ConnectionFailed(f"the telemetry of {self._uri} has stopped: not taken over")
+            raise ConnectionFailed(
+                f"the telemetry of {self._uri} has stopped: perchctl does not take over the vehicle"
+            )
         if newest is not None and newest.has_bit(FLYING):
             raise ConnectionFailed(
-                f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
+                f"the vehicle at {self._uri} is already flying: land it before perchctl takes over"
             )
         if self._is_armed:
-            raise ConnectionFailed(f"the vehicle at {self._uri} is armed already: {DISARM_IT}")
+            raise ConnectionFailed(f"the vehicle at {self._uri} is already armed: {DISARM_IT}")
         for _ in range(UNLOCK_TIMES):
             send_packets(connection.cf, UNLOCK_THRUST)
             time.sleep(UNLOCK_PERIOD_S)
@@ -238,9 +240,11 @@ class CflibLink:
             sender.repeat_order(self._lost_since_s - UNHEARD_S)
             self._lost_since_s = None
         if hangs:
-            connection.reopen(f"cflib has held a packet for more than {LIBRARY_HANG_S:g} s")
+            connection.reopen(
+                f"cflib has been sending one packet for more than {LIBRARY_HANG_S:g} s"
+            )
         elif stuck_s > LIBRARY_HANG_S and connection.is_dead():
-            connection.reopen(f"the radio has taken nothing for {stuck_s:.1f} s, nor lost anything")
+            connection.reopen(f"the radio has neither taken nor lost a packet for {stuck_s:.1f} s")
 
     def _may_hear_more(self) -> bool:
         """True unless the link is lost permanently: with a sender, it is being reopened."""

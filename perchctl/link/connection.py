@@ -259,8 +259,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
                 connection.claim = claim.pop_all()
                 return connection
     raise ConnectionFailed(
-        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s "
-        f"(is it switched on, is the address right?)"
+        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s; check that it is "
+        "switched on and that the address is right"
     )
 
 
@@ -297,12 +297,13 @@ def _as_cflib(packet: Packet) -> Any:
     return outgoing
 
 
-_PERMISSION = f"there is no permission to use it.\n{UDEV_HELP}"
+_PERMISSION = f"you have no permission to use it.\n{UDEV_HELP}"
 _CAUSES = {
-    "Resource busy": "another program has it open: a Crazyradio, or a USB cable, serves one "
-    "program at a time; end that one, or plug in another Crazyradio and name it as radio://1/...",
+    "Resource busy": "another program has it open: a Crazyradio or a USB cable serves one program "
+    "at a time; end that program, or plug in another Crazyradio and name it as "
+    "radio://1/...",
     "Connection refused": "nothing listens there (connection refused)",
-    "Could not open usb": "no Crazyflie is plugged in by USB and switched on, or " + _PERMISSION,
+    "Could not open usb": "no Crazyflie is connected by USB and switched on, or " + _PERMISSION,
     "Cannot find": "no Crazyradio is plugged in, or " + _PERMISSION,
     "Access denied": _PERMISSION,
 }
@@ -355,7 +356,7 @@ def lock_vehicle(uri: str) -> contextlib.ExitStack:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ConnectionFailed(
-                    f"the vehicle at {uri} is in use by another program: two would steer it two "
-                    f"ways; end that one, or name another vehicle"
+                    f"the vehicle at {uri} is in use by another program: end that program, or name "
+                    "another vehicle"
                 ) from None
         return claim.pop_all()

@@ -87,14 +87,14 @@ def settle_estimator(
     while (status := feed.status(clock())).problem is not None or not status.sent:
         if clock() >= end_s:
             raise TimedOut(
-                f"no position from outside within {config.connect_timeout_s:g} s: "
+                f"no external position within {config.connect_timeout_s:g} s: "
                 f"{status.problem or 'none was sent'}"
             )
         wait(ESTIMATE_POLL_S)
     for _ in range(RESETS):
         if may_be_flying(newest(), clock()):
             raise ConnectionFailed(
-                f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
+                f"the vehicle at {uri} may be flying: its estimate is set only on the ground"
             )
         start = feed.sent_pose()
         assert start is not None  # the loop above has waited for one
@@ -107,12 +107,12 @@ def settle_estimator(
             wait(RESET_PULSE_S * value)
         if _agree(feed, start, newest, clock, wait):
             return
-    where = "the origin, where it stands"
+    where = "the origin, where the vehicle stands"
     if not config.source.is_target:
         where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees it"
     raise TimedOut(
-        f"the estimate of {uri} does not come to {where}: does it stand still, and do positions "
-        f"arrive, of this vehicle and in metres?"
+        f"the estimate of {uri} does not converge to {where}: check that the vehicle is "
+        "at rest and that its own positions arrive, in metres"
     )
 
 

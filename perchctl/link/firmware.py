@@ -29,8 +29,8 @@ def check_firmware(cf: Any, uri: str) -> None:
     version, remedy = cf.platform.get_protocol_version(), "update the firmware to 2026.08 or later"
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
-            f"the firmware at {uri} has protocol {version}, perchctl needs {NEEDED_PROTOCOL} or "
-            f"later: {remedy}"
+            f"the firmware at {uri} has protocol {version}, but perchctl needs "
+            f"{NEEDED_PROTOCOL} or later: {remedy}"
         )
     for name in missing_variables(cf):
         raise NotFound(f"the firmware at {uri} has no log variable {name}: {remedy}")
@@ -65,7 +65,7 @@ def check_airframe(cf: Any, uri: str) -> None:
     device_type = read_device_type(cf)
     if device_type in AIRFRAMES:
         return
-    found = f"is a {device_type}" if device_type else "does not say what kind of vehicle it is"
+    found = f"is a {device_type}" if device_type else "does not report its airframe"
     raise ConnectionFailed(
         f"the vehicle at {uri} {found}: perchctl's thrust and battery figures are those of a "
         f"{', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}; fly one of these"
@@ -100,7 +100,7 @@ def set_parameters(
         except (AttributeError, ValueError, KeyError) as error:
             raise InvalidValue(f"parameter {name} cannot be set to {wanted}: {error}") from None
         if kept is None:
-            raise TimedOut(f"parameter {name} was set to {wanted}, but no answer came")
+            raise TimedOut(f"parameter {name} was set to {wanted}, but the vehicle did not answer")
         if not math.isclose(float(kept), float(wanted), rel_tol=1e-5, abs_tol=1e-9):
             raise InvalidValue(
                 f"parameter {name} was set to {wanted}, but the vehicle keeps {kept}"

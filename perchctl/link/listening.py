@@ -184,7 +184,7 @@ class ProbeLink(ReadOnlyLink):
 
     def lost(self) -> str | None:
         """Return why the link is lost; None while it works."""
-        return "it was closed" if self.connection is None else self.connection.lost
+        return "the link was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:
         """Send echo packets for `duration_s`, and wait `LAST_ECHO_WAIT_S` for the last one. Return

@@ -63,12 +63,13 @@ class GuardedLink:
         threading.Thread(target=self._read, name="perchctl-own-link", daemon=True).start()
         if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S) or self._newest is None:
             cause = f": {self._trouble}" if self._trouble else ""
-            raise TimedOut(f"your own link is connected but gives no telemetry{cause}")
+            raise TimedOut(f"your own link is connected but delivers no telemetry{cause}")
         if is_armed_by_request(self._newest.supervisor):
             raise ConnectionFailed(
-                "the vehicle of your own link is armed already: keep away from its propellers; "
+                "the vehicle of your own link is already armed: keep away from its propellers; "
                 "connect must not arm it, since perchctl sends Arm just before take-off; if it "
-                "arms itself, with its motors still, its telemetry must have the bit AUTO_ARM"
+                "arms itself without turning its motors, its telemetry must have the bit "
+                "AUTO_ARM"
             )
 
     def telemetry(self) -> list[Telemetry]:
@@ -86,7 +87,11 @@ class GuardedLink:
 
     def problem(self, now_s: float) -> str | None:
         silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
-        hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > LIBRARY_HANG_S else None
+        hangs = (
+            f"telemetry() has not returned for {silent_s:.1f} s"
+            if silent_s > LIBRARY_HANG_S
+            else None
+        )
         return self._sender.trouble() or hangs or self._trouble
 
     def new_notes(self) -> list[str]:

@@ -160,7 +160,7 @@ def check_uri(uri: str) -> str:
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
     if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
-        raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
+        raise InvalidValue(f"{uri!r} is not the URI of a vehicle; examples: {EXAMPLES}")
     return scheme
 
 

@@ -149,7 +149,7 @@ class Sender:
             failing_s = self._clock() - since_s
             return f"no command could be sent for {failing_s:.1f} s: {self._error}"
         if self.stuck_s() > LIBRARY_HANG_S:
-            return f"no command has gone out for {self.stuck_s():.1f} s"
+            return f"no command has been sent for {self.stuck_s():.1f} s"
         return None
 
     def new_notes(self) -> list[str]:
@@ -160,7 +160,7 @@ class Sender:
             return []
         self._noted, self._noted_s = errors, now_s
         times = "once" if errors == 1 else f"{errors} times"
-        return [f"sending a command has failed {times} so far, and was tried again: {self._error}"]
+        return [f"sending a command has failed {times} so far and was retried: {self._error}"]
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all commands are passed on; return False after `timeout_s`."""
@@ -294,7 +294,7 @@ class Sender:
                 try:
                     part()
                 except BaseException as error:  # any error; this thread continues
-                    failed = f"the link is not looked after: {error}"
+                    failed = f"the link is not supervised: {error}"
             self._keeper_error = failed
 
     def _look_after_worker(self) -> None:

@@ -76,17 +76,17 @@ class LateFrames:
         """Return what is wrong with the capture `who`, and what to do."""
         if self.count == 0:
             return (
-                f"{who} has paused for {self.pause_s:.2f} s, and a frame after a pause may be old: "
-                f"it is not used"
+                f"{who} has paused for {self.pause_s:.2f} s: frames after a pause may be old, "
+                "so they are not used"
             )
         if self.count == 1:
             return (
                 f"{who} sends a frame only every {self.pause_s:.2f} s, and such frames are not "
-                f"used; set it to at least 50 Hz"
+                "used; set its rate to at least 50 Hz"
             )
         return (
             f"{who} sends its frames late, in bursts ({self.count} at once after "
-            f"{self.pause_s:.2f} s), and late frames are not used; connect it by cable"
+            f"{self.pause_s:.2f} s), and such frames are not used; connect it by cable"
         )
 
 
@@ -199,8 +199,8 @@ class MotionCapture:
             if self._late is not None:
                 raise ConnectionFailed(self._late[1].text(self._who))
             raise ConnectionFailed(
-                f"no {self._who}: no frame within {self._setup.timeout_s:g} s (does it stream, is "
-                f"the address right?){self._words()}"
+                f"no {self._who}: no frame within {self._setup.timeout_s:g} s (check that it "
+                f"streams and that the address is right){self._words()}"
             )
         if self._failed is not None and not self._failed.is_loaded:
             raise broken_motion_capture(self._failed.text)

@@ -47,12 +47,12 @@ class CaptureComparison(BaseModel):
         """Return why no flight may rely on this comparison, and what to do; None if it passed at
         most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
-            return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
+            return "the motion capture has never been compared with this vehicle", AGAIN
         when, age_s = self.text(now), (now - self.at).total_seconds()
         if not self.passed:
-            return f"{self.found} ({when})", f"mend that, then {AGAIN}"
+            return f"{self.found} ({when})", f"correct that, then {AGAIN}"
         if age_s < -CLOCK_ADJUSTMENT_S:
-            return f"{when}, which is yet to come", f"set this computer's clock, then {AGAIN}"
+            return f"{when}, which is in the future", f"set this computer's clock, then {AGAIN}"
         if age_s > VALID_S:
             return f"{when}, {age_s / 3600.0:.0f} h ago (24 h at most)", AGAIN
         return None

@@ -72,8 +72,8 @@ RATE_OVER_S = 1.0
 END_TIMEOUT_S = 1.0
 """Longest wait for the end of the thread, s."""
 UNSEEN = "the target is not seen"
-STOPPED = "the positions contradict the accelerometer, and are not sent any more"
-BUSY = "the link is busy with something else, and a position does not wait"
+STOPPED = "the positions contradict the accelerometer and are no longer sent"
+BUSY = "the link is busy, and positions are not queued"
 
 
 @dataclass(frozen=True)
@@ -161,10 +161,10 @@ class PositionFeed:
             return  # your own source checks its configuration itself
         if not config.host.strip():
             raise InvalidValue(
-                "positioning.host, the computer of the motion capture, is not given: write it into "
-                "the profile, as in positioning: {by: mocap, system: vicon, host: 192.168.1.2, "
-                "body: crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the "
-                "vehicle's rigid body there"
+                "positioning.host, the computer of the motion capture, is missing: write it in "
+                "the profile, as in positioning: {by: mocap, system: vicon, host: "
+                "192.168.1.2, body: crazyflie}; system is vicon, optitrack, qualisys or vrpn, "
+                "and body is the vehicle's rigid body there"
             )
         if find_spec("motioncapture") is None:
             raise no_motion_capture()
@@ -201,7 +201,7 @@ class PositionFeed:
         try:
             problem = STOPPED if self._stopped else self._one(now_s)
         except Exception as error:  # errors of source or link: the growing age ends the flight
-            problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
+            problem = f"the position cannot be sent: {type(error).__name__}: {error}"
         with self._lock:
             self._turned_s, self._problem = now_s, problem
 
@@ -243,13 +243,11 @@ class PositionFeed:
     def _why(self, now_s: float) -> str:
         who = self._config.label
         if self._turned_s is not None and now_s - self._turned_s > FEED_HANG_S:
-            return (
-                f"the positions of {who} have not been passed on for {now_s - self._turned_s:.1f} s"
-            )
+            return f"no position from {who} has been passed on for {now_s - self._turned_s:.1f} s"
         if self._problem is not None:
             return self._problem
         for_s = "yet" if self._framed_s < 0.0 else f"for {now_s - self._framed_s:.1f} s"
-        return f"no frame has come from {who} {for_s}"
+        return f"no frame has arrived from {who} {for_s}"
 
 
 # --- Validation of a capture's frames, and the vehicle's pose in them ---
@@ -329,16 +327,18 @@ class PoseValidator:
             self.problem = f"{label} does not see the rigid body {who!r}; it sees {others}"
             return None
         if now_s - arrived_s > STALE_FRAME_S:
-            self.problem = f"{self._who} is {now_s - arrived_s:.3f} s old when it is read"
+            self.problem = f"{self._who} is {now_s - arrived_s:.3f} s old on arrival"
             return None
         if not _is_pose(pose):
-            self.problem = f"{self._who} has a pose that is none: {pose}"
+            self.problem = f"{self._who} has an invalid pose: {pose}"
             return None
         if pose == self._newest:
             # Measurement noise never repeats all seven numbers. A filter or a duplicated frame may
             # repeat them for a frame or two, which does no harm.
             if self._stranger is None:
-                self.problem = f"{self._who} is frozen: is it hidden, or the capture paused?"
+                self.problem = (
+                    f"{self._who} is frozen: the body may be hidden, or the capture paused"
+                )
             return None
         self._newest = pose
         return self._followed(
@@ -361,8 +361,8 @@ class PoseValidator:
                 self._stranger = placed
                 self.problem = (
                     f"{self._who} jumped by {way_m:.2f} m and "
-                    f"{math.degrees(_turn_rad(last, placed)):.0f} deg: perhaps another body is "
-                    f"taken for it; it is not believed until it is seen where it was"
+                    f"{math.degrees(_turn_rad(last, placed)):.0f} deg: another body may be taken "
+                    "for it; its poses are rejected until it is seen near its last accepted pose"
                 )
                 return None
         self._believed, self._stranger, self.problem = placed, None, None

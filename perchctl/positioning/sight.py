@@ -175,11 +175,11 @@ class TargetFeed:
         if not age_s <= OLDEST_S:
             return f"the picture is {age_s:.2f} s old"
         if not sigma_m <= WORST_SIGMA_M:
-            return f"the target's pose is unsure by {sigma_m:.2f} m"
+            return f"the target's pose is uncertain by {sigma_m:.2f} m"
         off_m = float(np.linalg.norm(place.position_m - then.position_m))
         if not off_m <= GATE_M + GATE_MPS * silent_s + GATE_SIGMAS * sigma_m:
             self._beside_m = off_m
-            return f"by the target the vehicle is {off_m:.2f} m beside its estimate"
+            return f"the target places the vehicle {off_m:.2f} m from its estimate"
         return ""
 
     def _learn_place(self, pose: MarkerPose, then: Attitude) -> None:

@@ -218,8 +218,8 @@ def test_connecting_arms_nothing_and_closing_disarms(sim: SimProcess) -> None:
         ("Crazyflie Bolt", "is a Crazyflie Bolt: perchctl's"),
         ("Flapper (Bolt 1.1)", "is a Flapper"),
         ("Roadrunner 1.0", "is a Roadrunner 1.0"),
-        ("", "does not say what kind of vehicle it is"),
-        (None, "does not say"),
+        ("", "does not report its airframe"),
+        (None, "does not report"),
     ],
 )
 def test_another_airframe_is_not_taken_over(
@@ -348,7 +348,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         assert (sent, told) == ([], [])
         assert sim.truth()["position_m"][2] > 0.3
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
-        with pytest.raises(ConnectionFailed, match="flying already: land it"):
+        with pytest.raises(ConnectionFailed, match="already flying: land it"):
             second.connect()
         listener = ProbeLink(sim.uri, CONFIG, time.monotonic)
         listener.connect()

@@ -233,7 +233,7 @@ def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
         vehicle.settimeout(0.05)
         uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
         with lock_vehicle(uri):
-            with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
+            with pytest.raises(ConnectionFailed, match="end that program"):
                 open_connection(uri, 5.0)
             with pytest.raises(TimeoutError):
                 vehicle.recv(64)

@@ -122,8 +122,8 @@ def test_what_it_raises_is_a_lost_link_that_goes_on_sending(
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("telemetry", "hangs for 0.6 s"), ("problem", "hangs for 0.6 s"),
-    ("send", "no command has gone out for 0.6 s"),
+    ("telemetry", "has not returned for 0.6 s"), ("problem", "has not returned for 0.6 s"),
+    ("send", "no command has been sent for 0.6 s"),
 ])  # fmt: skip
 def test_what_hangs_in_it_is_a_lost_link_that_goes_on_sending(
     name: str, words: str, vehicle: Vehicle
@@ -235,7 +235,7 @@ def test_a_link_that_arms_as_it_connects_is_refused_and_disarmed(bits: int) -> N
     """Its propellers would turn while the operator is asked."""
     vehicle = Vehicle()
     vehicle.bits = bits
-    with pytest.raises(ConnectionFailed, match=r"armed already: keep away .* must not arm it"):
+    with pytest.raises(ConnectionFailed, match=r"already armed: keep away .* must not arm it"):
         vehicle.link.connect()
     vehicle.act["send"] = lambda: setattr(vehicle, "bits", CAN_ARM)
     vehicle.act["problem"] = lambda: setattr(vehicle, "now_s", vehicle.now_s + 0.01)
@@ -254,7 +254,7 @@ def test_a_link_that_does_not_arm_is_connected(bits: int) -> None:
 
 
 @pytest.mark.parametrize(("gives", "words"), [
-    (lambda: [], "gives no telemetry$"), (raises(OSError("no port")), "no telemetry: .*no port"),
+    (lambda: [], "delivers no telemetry$"), (raises(OSError("no port")), "no telemetry: .*no port"),
 ], ids=["none", "an error"])  # fmt: skip
 def test_a_link_without_telemetry_is_refused_since_it_may_be_armed(
     gives: Any, words: str, monkeypatch: pytest.MonkeyPatch

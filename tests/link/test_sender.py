@@ -240,7 +240,7 @@ def test_an_error_that_passes_is_counted_and_no_trouble(library: Library) -> Non
     library.error = None
     library.takes(LAND)
     (note,) = sender.new_notes()
-    assert note.endswith(f"failed {sender.errors} times so far, and was tried again: no room")
+    assert note.endswith(f"failed {sender.errors} times so far and was retried: no room")
     library.now_s += 100.0
     assert sender.trouble() is None
     assert sender.new_notes() == []
@@ -304,7 +304,7 @@ def test_a_guard_that_raises_is_a_trouble_until_it_works_again(library: Library)
             raise ZeroDivisionError("of the guard")
 
     sender = library.sender(guard=guard)
-    until(lambda: "not looked after: of the guard" in str(sender.trouble()))
+    until(lambda: "not supervised: of the guard" in str(sender.trouble()))
     works.set()
     until(lambda: sender.trouble() is None)
 

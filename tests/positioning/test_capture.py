@@ -99,7 +99,7 @@ def test_a_library_that_does_not_load_is_not_a_capture_that_is_gone(
     with pytest.raises(UsageError) as caught:
         faulty("good")
     said = str(caught.value)
-    assert f"the library motioncapture cannot be loaded: {why}; reinstall it with: " in said
+    assert f"the motioncapture library cannot be loaded: {why}; reinstall it with: " in said
     assert said.endswith("'perchctl[mocap]'")
     assert caught.value.exit_code == 2
 
@@ -147,7 +147,7 @@ def test_the_frames_between_two_pauses_are_counted(
 
 @pytest.mark.parametrize(("fault", "words"), [
     ("bursts", r"vicon:bursts sends its frames late, in bursts \(12 at once after 0\.1\d s\), and "
-     "late frames are not used; connect it by cable"),
+     "such frames are not used; connect it by cable"),
     ("slow", r"vicon:slow sends a frame only every 0\.1\d s, and such frames are not used; set it"),
 ])  # fmt: skip
 def test_frames_that_come_late_are_not_called_silence(

@@ -62,7 +62,7 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
     age_s = (NOW - at).total_seconds()  # of whole microseconds
     if min(abs(age_s - DAY_S), abs(age_s + compared.CLOCK_ADJUSTMENT_S)) > 1e-3:
         found, _ = ago(seconds, passes).objection_and_advice(NOW) or ("", "")
-        assert (found == "", "yet to" in found) == (
+        assert (found == "", "in the future" in found) == (
             allowed,
             passes and age_s < -compared.CLOCK_ADJUSTMENT_S,
         )
@@ -91,7 +91,7 @@ def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
         path.mkdir()
     else:
         path.write_text(whole[:40] if how == "cut" else whole.replace('Z"', '"'), encoding="utf-8")
-    with pytest.raises(SafetyAbort, match="never compared") as refused:
+    with pytest.raises(SafetyAbort, match="never been compared") as refused:
         require()
     assert "\n" not in str(refused.value)
 
@@ -118,7 +118,7 @@ def test_what_says_nothing_of_the_axes_and_another_dongle_are_no_other_set_up() 
     was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
     same = CONFIG.model_copy(update={"rate_hz": 50.0, "send": "pose", "hold_s": 0.2})
     require(same, "radio://1/80/2M/e7e7e7e701")
-    with pytest.raises(SafetyAbort, match="never compared with this vehicle"):
+    with pytest.raises(SafetyAbort, match="never been compared with this vehicle"):
         require(CONFIG, "radio://0/80/2M/E7E7E7E702")
 
 
@@ -134,7 +134,7 @@ def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
         require()
-    for again in (passed("fine"), skipped("it was not moved")):  # which takes no pass away
+    for again in (passed("fine"), skipped("the vehicle was not moved")):  # which takes no pass away
         assert (
             save_comparison_row(again, CONFIG, URI, datetime.now().astimezone()).verdict
             is Verdict.PASS
@@ -161,7 +161,7 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     assert row.verdict is verdict
     assert "No space left" in row.found
     if removable:
-        with pytest.raises(SafetyAbort, match="never compared"):
+        with pytest.raises(SafetyAbort, match="never been compared"):
             require()
 
 
@@ -184,7 +184,7 @@ def fly(tmp_path: Path, *words: str) -> Result:
 
 
 @pytest.mark.parametrize(("record", "words"), [
-    (None, "was never compared with this vehicle"),
+    (None, "has never been compared with this vehicle"),
     ({"passed": False, "found": SWAPPED}, SWAPPED),
 ])  # fmt: skip
 def test_fly_refuses_before_it_asks_connects_or_logs(

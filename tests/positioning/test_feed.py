@@ -153,10 +153,10 @@ def posed(*position_m: float, q: tuple[float, float, float, float] = LEVEL) -> d
 @pytest.mark.parametrize(("bodies", "late_s", "words"), [
     ({"cf2": BodyPose((3.0, 0.0, 0.0), LEVEL)}, 0.0,
      "motion capture at vicon:lab does not see the rigid body 'cf'; it sees cf2"),
-    (posed(1.2, 0.0, 0.5), STALE_FRAME_S + 0.005, "old when it is read"),
-    (posed(math.nan, 0.0, 0.5), 0.0, "a pose that is none"),
-    (posed(1.0, 0.0, 0.5, q=(1.0, 0.3, 0.0, 0.0)), 0.0, "a pose that is none"),
-    (posed(1.0, 0.0, 0.5, q=(math.nan, 0.0, 0.0, 0.0)), 0.0, "a pose that is none"),
+    (posed(1.2, 0.0, 0.5), STALE_FRAME_S + 0.005, "old on arrival"),
+    (posed(math.nan, 0.0, 0.5), 0.0, "an invalid pose"),
+    (posed(1.0, 0.0, 0.5, q=(1.0, 0.3, 0.0, 0.0)), 0.0, "an invalid pose"),
+    (posed(1.0, 0.0, 0.5, q=(math.nan, 0.0, 0.0, 0.0)), 0.0, "an invalid pose"),
 ])  # fmt: skip
 def test_what_may_not_be_believed_is_not_sent_and_named(
     bodies: dict[str, BodyPose], late_s: float, words: str
@@ -275,7 +275,7 @@ def test_silence_a_source_that_is_gone_or_broken_and_a_thread_that_hangs_are_nam
     assert "for 0.3 s" in (rig.idle(0.3).problem or "")
     rig.capture.trouble = "motion capture at vicon:lab has ended"
     assert rig.idle(0.01).problem == rig.capture.trouble
-    assert "not been passed on" in (rig.feed.status(rig.now_s + 1.0).problem or "")
+    assert "has been passed on for" in (rig.feed.status(rig.now_s + 1.0).problem or "")
     rig.capture.poll = lambda now_s: 1 / 0  # type: ignore[method-assign, assignment, return-value]
     assert "ZeroDivisionError" in (rig.idle(0.2).problem or "")
 

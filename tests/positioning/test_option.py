@@ -41,7 +41,7 @@ def test_a_section_that_cannot_be_meant_is_refused(
 @pytest.mark.parametrize(("words", "by", "said"), [
     (("--positioning", "mocap"), "mocap", "motion capture the simulated room's, body 'crazyflie'"),
     (("-p", "LAB", "--positioning", "deck"), "deck", "the vehicle's own deck"),
-    (("-p", "target_only"), "target", "the target itself"),
+    (("-p", "target_only"), "target", "the target, seen by the camera"),
 ])  # fmt: skip
 def test_the_option_wins_over_the_profile_and_the_plan_says_so(
     words: tuple[str, ...], by: str, said: str, tmp_path: Path
@@ -72,7 +72,7 @@ def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
 
 @pytest.mark.parametrize(("words", "complaints"), [
     (("gps", "--dry-run"), ("'gps' is unknown; allowed are deck, mocap, target",)),
-    (("mocap", *REAL), ("positioning.host", "one of vicon, optitrack, qualisys, vrpn", "body")),
+    (("mocap", *REAL), ("positioning.host", "vicon, optitrack, qualisys or vrpn", "body")),
 ])  # fmt: skip
 def test_other_words_and_a_capture_without_a_computer_are_refused(
     words: tuple[str, ...], complaints: tuple[str, ...]
@@ -86,7 +86,7 @@ def test_other_words_and_a_capture_without_a_computer_are_refused(
     {"rate_hz": 10.0, "latency_s": MOST_CAPTURE_LATENCY_S}, {"hold_s": 0.03},
 ])  # fmt: skip
 def test_a_hold_that_each_perfect_frame_would_reach_is_refused(late: dict[str, float]) -> None:
-    with pytest.raises(ValidationError, match="a position is stale before the next one comes"):
+    with pytest.raises(ValidationError, match="a position is stale before the next one arrives"):
         PositioningConfig(by="mocap", host="lab", **late)
     PositioningConfig(by="mocap", host="lab", **{**late, "hold_s": 0.4})
     with pytest.raises(ValidationError, match="less than or equal to"):

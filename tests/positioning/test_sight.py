@@ -170,12 +170,12 @@ def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
         assert len(sent.places) == 2
     elif off_m > never:
         assert len(sent.places) == 1
-        assert "beside its estimate" in (it.status(t_s + 1.0).problem or "")
+        assert "from its estimate" in (it.status(t_s + 1.0).problem or "")
         assert it.status(t_s).beside_m == pytest.approx(off_m)
 
 
 @pytest.mark.parametrize(("late_s", "sigma_m", "words"), [
-    (OLDEST_S + 0.01, 0.002, "old"), (0.05, 0.2, "unsure"), (0.05, math.nan, "unsure"),
+    (OLDEST_S + 0.01, 0.002, "old"), (0.05, 0.2, "uncertain"), (0.05, math.nan, "uncertain"),
 ])  # fmt: skip
 def test_an_old_vague_or_endless_pose_is_not_sent(
     late_s: float, sigma_m: float, words: str
