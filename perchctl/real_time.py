@@ -111,7 +111,7 @@ def fly(
         summary = log.close(report, miss_m)
     problem = None if summary is None else summary.log_problem
     if problem is not None:
-        warnings.warn(f"the flight's log is incomplete: {problem}", Note, stacklevel=2)
+        warnings.warn(f"the flight log is incomplete: {problem}", Note, stacklevel=2)
     for sentence in report.detached:
         warnings.warn(sentence, Note, stacklevel=2)
     return Flight(report, log.path, miss_m)

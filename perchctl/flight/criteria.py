@@ -68,7 +68,7 @@ _FORBIDDEN = (
     (CRASHED, "reports a crash", "put it upright and restart it"),
     (TUMBLED, "lies upside down", "put it upright"),
     (DECK_FAULT, "reports a deck fault", "check the deck and restart it"),
-    (FLYING, "is flying already", "land it first"),
+    (FLYING, "is already flying", "land it first"),
 )
 
 
@@ -126,7 +126,7 @@ class GroundCriteria:
         if self.telemetry.supervisor & ~KNOWN_SUPERVISOR_BITS:
             return Problem(
                 f"the supervisor reports unknown bits ({raw})",
-                "this firmware is newer than perchctl knows",
+                "the firmware may be newer than this perchctl: update perchctl",
             )
         return None
 
@@ -144,7 +144,7 @@ class GroundCriteria:
         """Problem: the supervisor does not allow flight (yet), and arming would not change that."""
         if self.telemetry.has_bit(CAN_FLY) or self.waits_for_arming:
             return None
-        return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
+        return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart the vehicle")
 
     @property
     def battery_too_low(self) -> Problem | None:
@@ -154,7 +154,8 @@ class GroundCriteria:
             return None
         rests, needed = distinct_texts(rests_v, needed_v, 2)
         return Problem(
-            f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
+            f"the battery rests at {rests} V, but at least {needed} V are needed "
+            "(safety.min_rest_v)",
             "charge it",
         )
 
@@ -166,8 +167,8 @@ class GroundCriteria:
             return None
         rests, most = distinct_texts(rests_v, MOST_CELL_V, 2)
         return Problem(
-            f"the battery rests at {rests} V, and one cell has at most {most} V",
-            "perchctl flies vehicles with a battery of one cell",
+            f"the battery rests at {rests} V, but one cell has at most {most} V",
+            "use a vehicle with a one-cell battery",
         )
 
     @property
@@ -178,15 +179,15 @@ class GroundCriteria:
             return None
         if not is_battery_reading(telemetry.battery_v):
             return Problem(
-                "the vehicle gives no reading of its battery",
-                "restart it; a vehicle that never gives one needs link.unreported: [battery]",
+                "the vehicle reports no battery voltage",
+                "restart it; a vehicle that never reports it needs link.unreported: [battery]",
             )
         if telemetry.battery_behind_s <= READING_AGE_S:
             return None
         return Problem(
-            f"the battery's reading is {telemetry.battery_behind_s:.1f} s old, at most "
-            f"{READING_AGE_S:g} allowed",
-            "restart the vehicle if this lasts",
+            f"the battery voltage is {telemetry.battery_behind_s:.1f} s old, at most "
+            f"{READING_AGE_S:g} s allowed",
+            "restart the vehicle if this persists",
         )
 
     @property
@@ -216,9 +217,9 @@ class GroundCriteria:
     @property
     def estimate_unsettled(self) -> Problem | None:
         """Problem: a variance of the state estimate is too large, unknown or old."""
-        telemetry, advice = self.telemetry, "is there a positioning system?"
+        telemetry, advice = self.telemetry, "check the positioning system"
         if self.profile.positioning.source.is_target:
-            advice = "do the positions arrive, and does the target stay in view?"
+            advice = "check that the positions arrive and that the target stays in view"
         unreported = "variance" in self.profile.link.unreported
         for each in self.variances:
             if each.value is None:
@@ -226,7 +227,7 @@ class GroundCriteria:
                     continue
                 return Problem(
                     f"the vehicle reports no variance of its {each.what}",
-                    "does its Kalman filter run (stabilizer.estimator: 2 under link.parameters)? a "
+                    "run its Kalman filter (stabilizer.estimator: 2 under link.parameters); a "
                     "vehicle that has none needs link.unreported: [variance]",
                 )
             if not each.value <= each.most:
@@ -237,9 +238,9 @@ class GroundCriteria:
                 )
         if not (unreported or telemetry.variance_behind_s <= READING_AGE_S):
             return Problem(
-                f"its variances are {telemetry.variance_behind_s:.1f} s old, at most "
-                f"{READING_AGE_S:g} allowed",
-                "restart the vehicle if this lasts",
+                f"the variances are {telemetry.variance_behind_s:.1f} s old, at most "
+                f"{READING_AGE_S:g} s allowed",
+                "restart the vehicle if this persists",
             )
         return None
 
@@ -249,8 +250,8 @@ class GroundCriteria:
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
-            "if it hangs, take it down and restart it; if the positioning system's zero is "
-            "elsewhere, set safety.ground_z_m",
+            "if it hangs, take it down and restart it; if the positioning system has its "
+            "origin elsewhere, set safety.ground_z_m",
         )
 
     def _off_the_ground(self, z_m: float, found: str, advice: str) -> Problem | None:
@@ -258,7 +259,7 @@ class GroundCriteria:
         if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
             return None
         return Problem(
-            f"{found} {z_m:.2f} m, and the ground is at {safety.ground_z_m:.2f} m", advice
+            f"{found} {z_m:.2f} m, but the ground is at {safety.ground_z_m:.2f} m", advice
         )
 
     @property
@@ -275,7 +276,7 @@ class GroundCriteria:
             return None
         found, allowed = distinct_texts(self.tilt_deg, most_deg, 0)
         return Problem(
-            f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground"
+            f"tilted by {found} deg, at most {allowed} deg allowed", "put it on level ground"
         )
 
     @property
@@ -284,7 +285,7 @@ class GroundCriteria:
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
             return None
-        return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
+        return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "keep it still")
 
     @property
     def stands(self) -> bool:
@@ -302,7 +303,9 @@ class GroundCriteria:
             "positioning: target"
         )
         if decks:
-            advice += f"; if {' or '.join(decks)} measures it, name that one in positioning.decks"
+            advice += (
+                f"; if {' or '.join(decks)} measures the position, name it in positioning.decks"
+            )
         return Problem("no positioning deck", advice)
 
     @staticmethod
@@ -315,8 +318,8 @@ class GroundCriteria:
             return None
         away, needed = distinct_texts(away_m, WITHIN_REACH_M, 2)
         return Problem(
-            f"the target is only {away} m away, at least {needed} m are needed",
-            "the vehicle hangs, or stands too close under it; take it down first",
+            f"the target is only {away} m away, but at least {needed} m are needed",
+            "if the vehicle hangs, take it down first; if not, move it farther from the target",
         )
 
     @staticmethod
@@ -331,7 +334,7 @@ class GroundCriteria:
         """
         if not samples:
             return None
-        newest, advice = samples[-1], "let it stand still; if it did, check its positioning"
+        newest, advice = samples[-1], "keep it still; if it was, check its positioning"
         if profile.positioning.source.is_deck:
             advice += " (light, floor, base stations)"
         window = rest_window(samples)
@@ -340,14 +343,16 @@ class GroundCriteria:
         if not moved_m <= DRIFT_M:
             moved, most = distinct_texts(moved_m, DRIFT_M, 2)
             found = (
-                f"the estimated position moved {moved} m in {lasts_s:.1f} s, at most {most} allowed"
+                f"the estimated position moved {moved} m in {lasts_s:.1f} s, at most {most} m "
+                "allowed"
             )
             return Problem(found, advice)
         mean_mps = math.hypot(*np.mean([s.velocity_mps for s in window], axis=0))
         if not mean_mps <= STANDING_MPS:
             mean, most = distinct_texts(mean_mps, STANDING_MPS, 2)
             found = (
-                f"the estimated speed was {mean} m/s for {lasts_s:.1f} s, at most {most} allowed"
+                f"the estimated speed was {mean} m/s for {lasts_s:.1f} s, "
+                f"at most {most} m/s allowed"
             )
             return Problem(found, advice)
         return None
@@ -359,9 +364,8 @@ class GroundCriteria:
         if moved_m <= WANDERED_M:
             return None
         return Problem(
-            f"by {feed_name(profile)} the vehicle has moved by {moved_m:.2f} m, "
-            f"and it stands still",
-            "let the target hang still, put down what is carried, or correct positioning.body",
+            f"{feed_name(profile)} shows a motion of {moved_m:.2f} m, but the vehicle stands still",
+            "keep the target still, put down what is being carried, or correct positioning.body",
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
@@ -372,15 +376,16 @@ class GroundCriteria:
             return self._unreachable(place)
         if not max(abs(x), abs(y), abs(z)) < ROOM_M:
             return Problem(
-                f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these "
-                f"look like millimetres",
-                "set the unit of its stream to metres",
+                f"the motion capture places the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m, "
+                "which look like millimetres",
+                "set the unit of the capture's stream to metres",
             )
         standing = self._off_the_ground(
             z,
-            "the motion capture has the vehicle at",
-            "swapped axes, another rigid body or zero, or millimetres: perchctl check --lift "
-            "tells; safety.ground_z_m is the height that it has where it stands",
+            "the motion capture places the vehicle at",
+            "its axes may be swapped, its unit millimetres, or its origin or rigid body "
+            "wrong: run perchctl check --lift; if this height is right, set "
+            "safety.ground_z_m to it",
         )
         return up_axis_problem(place, self.telemetry) or standing or self._unreachable(place)
 
@@ -394,8 +399,8 @@ class GroundCriteria:
         if away_m <= fence_m + target.expected_within_m:
             return None
         return Problem(
-            f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
-            f"{y:.2f} m), and the fence is {fence_m:g} m",
+            f"the target is expected {away_m:.1f} m from where the vehicle stands (x "
+            f"{x:.2f}, y {y:.2f} m), but the fence is {fence_m:g} m",
             "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
         )
 
@@ -420,20 +425,22 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     if off_deg <= UP_AXIS_AGREE_DEG:
         return None
     axis = nearest_axis(up)
-    found = f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its attitude"
+    found = (
+        f"the motion capture shows the vehicle tilted by {off_deg:.0f} deg from its own attitude"
+    )
     if axis is not None:
         found = f"swapped axes: up is {axis} in the motion capture"
     return Problem(
         found,
-        "set its world to z up, define the rigid body's axes level, or set "
-        "positioning.body_rpy_deg; perchctl check --lift tells by how much",
+        "set the capture's world to z up, define the rigid body's axes level, or set "
+        "positioning.body_rpy_deg; perchctl check --lift reports by how much",
     )
 
 
 def feed_name(profile: Profile) -> str:
     """Name of the source of external positions in messages."""
     by_target = profile.positioning.source.is_target
-    return "the sight of the target" if by_target else "the motion capture"
+    return "the view of the target" if by_target else "the motion capture"
 
 
 class RestCheck:
@@ -462,7 +469,7 @@ def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
         return None
-    age = f"{status.age_s:.2f} s old" if math.isfinite(status.age_s) else "none was sent yet"
+    age = f"{status.age_s:.2f} s old" if math.isfinite(status.age_s) else "none has been sent yet"
     return Problem(age, "see perchctl check")
 
 
@@ -477,5 +484,5 @@ def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem |
         return None
     return Problem(
         f"they are {away_m:.2f} m and {turned_deg:.0f} deg of heading apart",
-        "do the positions arrive at this vehicle, and is it this rigid body?",
+        "check that the positions arrive at this vehicle and that positioning.body names it",
     )

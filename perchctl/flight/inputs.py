@@ -183,7 +183,7 @@ class FlightInputs:
         is only dark or empty is good."""
         age_s = now_s - self.last_good_frame_s
         if self.frames == 0:
-            return self.camera_problem or "none has come"
+            return self.camera_problem or "none has arrived"
         if not age_s <= self.profile.safety.camera_hold_s:
             return self.camera_problem or f"none for {age_s:.1f} s"
         return None if self.camera_problem == self._note else self.camera_problem
@@ -249,7 +249,10 @@ class FlightInputs:
         too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
-            return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
+            return (
+                f"the picture has {width}x{height} px, but the calibration has "
+                f"{size_px[0]}x{size_px[1]} px"
+            )
         live = self.source.live
         kind = self.perception.health.assess(frame, live)
         if self.is_logged and self.taken.frame is not None:
@@ -264,9 +267,9 @@ class FlightInputs:
         t_s = self.perception.exposure_s(frame)
         age_s = now_s - t_s
         if live and not age_s >= -PICTURE_AHEAD_S:
-            return f"the picture's time, {t_s:.3f} s, is not past"
+            return f"the picture's time, {t_s:.3f} s, is in the future"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
-        return f"the picture is {age_s:.1f} s late" if is_late else None
+        return f"the picture is {age_s:.1f} s old" if is_late else None
 
 
 # --- The target as positioning system, tick by tick ---

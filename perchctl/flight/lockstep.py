@@ -266,7 +266,7 @@ def lockstep_feed(link: MockLink, profile: Profile) -> PositionFeed | None:
     end_s = link.now_s + FIRST_FRAME_S
     while (place := feed.sent_pose()) is None:
         if link.now_s >= end_s:
-            why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
+            why = feed.status(link.now_s).problem or f"nothing arrives from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
         link.advance_to(link.now_s + PositionFeed.PERIOD_S)
     link.settle_estimator(config, place)

@@ -169,7 +169,9 @@ def _wait_until_ready(
         if inputs.perception.is_mirrored:
             raise SafetyAbort(mirrored_note(parts.profile.camera))
         if parts.profile.safety.land_on_log_error and (problem := watchers.problem):
-            raise SafetyAbort(f"flight log: {problem}, and safety.land_on_log_error is set")
+            raise SafetyAbort(
+                f"flight log: {problem}, and safety.land_on_log_error is set: not flying"
+            )
         seen = GroundTurn(
             profile=parts.profile,
             waited_s=now_s - started_s,
@@ -186,8 +188,8 @@ def _wait_until_ready(
         waiting = still_waiting_for(seen)
         if parts.source.finished:
             raise NotFound(
-                f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
-                f"go on, from a camera or a longer recording"
+                f"{parts.source.describe()} ended before take-off: use a camera, or a longer "
+                "recording"
             )
         _end_on_word(parts.operator(), arming)  # given in this turn, it counts before the request
         arming.note_waiting(waiting, now_s, parts.clock.now())
@@ -270,7 +272,7 @@ def _mission(
         notes = watchers.take_notes()
         if obs.log_problem is not None and not log_noted:
             log_noted = True
-            notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
+            notes.insert(0, f"the flight log is incomplete: {obs.log_problem}")
         changed_s = inputs.perception.calibration.changed_s
         if changed_s is not None and changed_s != told_change_s:
             told_change_s = changed_s

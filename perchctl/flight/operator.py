@@ -126,7 +126,7 @@ class OperatorSwitch:
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
         if not self.closing and self.clock() - self._stopped_s >= STOP_HANG_S:
-            raise Interrupted("the stopped flight hung")
+            raise Interrupted("the flight did not end after the motors were cut")
 
     def _decide(self, now_s: float) -> None:
         if self._stopped_s == math.inf and _is_stop(self._presses_s, now_s):
@@ -195,7 +195,7 @@ def _are_even(times_s: Sequence[float]) -> bool:
 LANDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """End or suspend a program elsewhere; a flight they land."""
 _MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight in a shell's background
-_NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
+_NO_SUSPENDING = "Ctrl-Z cannot suspend a flight: landing"
 
 
 @contextlib.contextmanager

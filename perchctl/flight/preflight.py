@@ -50,8 +50,8 @@ def refuse_armed(telemetry: Telemetry | None) -> None:
     it: whoever has, also commands it."""
     if telemetry is not None and is_armed_by_request(telemetry.supervisor):
         raise SafetyAbort(
-            "the vehicle is armed, and perchctl has not armed it: keep away from its propellers, "
-            "and end whatever armed it; not flying"
+            "the vehicle is armed, but not by perchctl: keep away from its propellers, and "
+            "end the program that armed it; not flying"
         )
 
 
@@ -61,7 +61,9 @@ def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) ->
     if profile.positioning.source.is_deck:
         abort_on(GroundCriteria.no_position_source(link.decks(), profile))
     elif profile.positioning.source.is_mocap and not has_feed:
-        raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
+        raise SafetyAbort(
+            "the profile says positioning: mocap, but nothing sends positions: not flying"
+        )
 
 
 def refuse_wrong_positions(
@@ -160,9 +162,9 @@ def still_waiting_for(turn: GroundTurn) -> str:
         others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
         if waited_s <= others_s + limit_s:  # it may have failed while others were waited for
             waited_s = min(waited_s, turn.unseen_s)
-    waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
+    waiting = waiting or _first({"a view of the target, which measures the position": unsent})
     if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
-        waiting = f"the flight loop to keep up (a turn took {turn.took_s:.1f} s)"
+        waiting = f"the flight loop to keep up (a tick took {turn.took_s:.1f} s)"
     if not waiting:
         abort_on(criteria.target_too_near(turn.target))
         return ""
@@ -175,11 +177,11 @@ def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
-        return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "let it stand")
+        return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "keep it still")
     positions_s = [sample.t_s - sample.behind_s for sample in window]
     pause_s = max(after_s - before_s for before_s, after_s in pairwise(positions_s))
     if not pause_s <= profile.safety.telemetry_hold_s:
-        return Problem(f"telemetry paused for {pause_s:.1f} s", "let it stand")
+        return Problem(f"the telemetry paused for {pause_s:.1f} s", "keep it still")
     return GroundCriteria.moving_estimate(samples, profile)
 
 
@@ -253,8 +255,8 @@ class Arming:
             self._was_armed = True
         elif self._was_armed:
             raise SafetyAbort(
-                f"the vehicle was armed, and disarmed itself before its motors were ready "
-                f"({bits}): something may block a propeller; look at it, then restart the vehicle"
+                "the vehicle was armed but disarmed itself before its motors were ready "
+                f"({bits}): a propeller may be blocked; inspect it, then restart the vehicle"
             )
         if now_s - self._began_s > ARMS_WITHIN_S:
             raise TimedOut(
@@ -302,15 +304,15 @@ def view_problem(
         body_m = (*over, z + planner.takeoff_height_m)
         sight = _seen_leaning(body_m, yaw_rad, target, profile, camera)
         if over == (x, y):
-            advice = f"put the vehicle {sight.aside_text} from where it stands, or {advice}"
+            advice = f"put the vehicle {sight.aside_text} of where it stands, or {advice}"
         else:
-            advice = "leave planner.approach_xy_m out, or set it near the target"
+            advice = "remove planner.approach_xy_m, or set it near the target"
         if not sight.has_marker:
             return Problem(
-                f"the target is the positioning system, and from x {over[0]:.2f}, y {over[1]:.2f} "
-                f"m at take-off height the vehicle would not see it: it would be "
-                f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis, and "
-                f"{sight.height_m:.2f} m over the camera",
+                f"the target is the positioning system, but from x {over[0]:.2f}, y "
+                f"{over[1]:.2f} m at take-off height the vehicle would not see it: it would be "
+                f"{math.hypot(*sight.aside_m):.2f} m from the camera's axis and "
+                f"{sight.height_m:.2f} m above the camera",
                 advice,
             )
     return None

@@ -75,8 +75,8 @@ def check_options(options: FlyOptions) -> None:
         check_uri(options.uri)
     elif load_extension(options.uri, "link.uri") and not options.profile.positioning.source.is_deck:
         raise UsageError(
-            f"a link of your own, as {options.uri}, sends no positions: set positioning: deck, "
-            f"not {options.profile.positioning.by}"
+            f"your own link {options.uri} cannot send positions: set positioning: deck, not "
+            f"{options.profile.positioning.by}"
         )
     if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
@@ -92,11 +92,11 @@ def check_options(options: FlyOptions) -> None:
         )
     if not source.live and not options.simulated:
         raise UsageError(
-            f"source {source} is a recording, and {options.uri} a real vehicle: it would "
-            f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
+            f"source {source} is a recording, but {options.uri} is a real vehicle: fly "
+            "sim://, or name a camera with --source"
         )
     if options.seed < 0:
-        raise InvalidValue(f"seed {options.seed} is negative; seeds are 0, 1, 2, ...")
+        raise InvalidValue(f"seed {options.seed} is negative; use 0 or more")
 
 
 def fly_session(
@@ -133,7 +133,7 @@ def fly_session(
         source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
         if not (options.simulated or source.live):
-            raise UsageError(f"{source.describe()} is no live camera: a real vehicle needs one")
+            raise UsageError(f"{source.describe()} is not a live camera: a real vehicle needs one")
         positioning = profile.positioning
         if simulated is not None and simulated.capture is not None:
             system, host = simulated.capture

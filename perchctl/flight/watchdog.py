@@ -278,7 +278,7 @@ def rescue(
             return RestReport(RestState.UNSEEN)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
-        problem: str | None = "the link fails"
+        problem: str | None = "the link raised an error"
         with suppress(Exception):
             problem = link.problem(now_s)
         newest = history.newest

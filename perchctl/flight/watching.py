@@ -121,7 +121,7 @@ class Watchers:
             remarks = [*self._remarks()]
         except Exception as error:
             remarks, self._remarks = [], tuple
-            self._report(f"the remarks on this flight have ended: {error_at(error)}")
+            self._report(f"the notes on this recording have ended: {error_at(error)}")
         with self._lock:
             notes, self._notes = self._notes, []
         return [*remarks, *notes]
@@ -137,7 +137,7 @@ class Watchers:
         took_s = self._now() - began_s
         if took_s > SLOW_WATCHER_S and (name := watcher_name(watcher)) not in self._slow:
             self._slow.add(name)
-            self._report(f"{name} took {took_s:.1f} s: the flight was not steered meanwhile")
+            self._report(f"{name} took {took_s:.1f} s, during which the flight was not controlled")
 
     def _detach(self, watcher: Watcher, error: BaseException) -> None:
         sentence = f"{watcher_name(watcher)} raised {error_at(error)}"
@@ -145,13 +145,13 @@ class Watchers:
             if all(other is not watcher for other in self._active):
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
-            self.detached.append(f"{sentence}: it was detached, and perchctl went on without it")
+            self.detached.append(f"{sentence}: it was detached, and perchctl continued without it")
             if takes_turns(watcher):  # the loop reports it, as any problem of a log
                 self._log_problem = self._log_problem or sentence
                 with suppress(Exception):  # it has raised before
                     watcher.note_detached(sentence)
                 return
-        self._report(f"{sentence}: it is detached, and the flight goes on")
+        self._report(f"{sentence}: it was detached, and the flight continues")
 
     def _report(self, note: str) -> None:
         with self._lock:

@@ -86,7 +86,7 @@ def test_put_where_the_refusal_says_it_flies(
 def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
     near = changed({"planner.approach_xy_m": (0.3, -0.2)}, TARGET)
     assert view_problem(place(0.1, 0.05), FEET, 0.0, near, CAMERA) is None
-    words = r"from x 2\.00, y 0\.00 m .* would not see it.* m aside .*leave .* out"
+    words = r"from x 2\.00, y 0\.00 m .* would not see it.* m from the camera's axis.*remove "
     with pytest.raises(SafetyAbort, match=words):
         fly_lockstep(FAR_APPROACH, 1)
 
@@ -101,16 +101,16 @@ def waits(waited_s: float = 0.0, telemetry: Telemetry = REST, **seen: Any) -> st
     return still_waiting_for(GroundTurn(TARGET, waited_s, **given))
 
 
-BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m beside its estimate")
+BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m from its estimate")
 
 
 @pytest.mark.parametrize(("seen", "words"), [
-    ({}, f"sight of the target.*{UNSEEN}"),
+    ({}, f"view of the target.*{UNSEEN}"),
     # Who carries it, or has no camera, has no use for where the target is.
     ({"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
     ({"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
-    ({"picture_problem": "none has come", "unseen_s": math.inf}, "a good picture"),
-    ({"feed": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
+    ({"picture_problem": "none has arrived", "unseen_s": math.inf}, "a good picture"),
+    ({"feed": BESIDE}, r"view of the target.*0\.40 m from its estimate"),
 ])  # fmt: skip
 def test_what_keeps_a_target_from_being_measured_is_named_first_things_first(
     seen: dict[str, Any], words: str
@@ -125,4 +125,4 @@ def test_a_target_in_view_is_waited_for_no_longer() -> None:
     placed, off = ExternalPosition(FEET), ExternalPosition((0.4, 0.0, 0.0))
     assert waits(feed=FeedStatus(0.05, None, 20, placed, 30.0, placed)) == ""
     told = waits(feed=FeedStatus(0.05, None, 20, off, 30.0, off))
-    assert "the state estimate to agree with the sight of the target" in told
+    assert "the state estimate to agree with the view of the target" in told

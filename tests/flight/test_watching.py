@@ -145,7 +145,7 @@ def test_a_log_that_raises_is_the_profile_s_to_judge(lands: bool) -> None:
     report = fly(replace(rig.parts(), watchers=(breaks, works)))
     assert ("the display raised Broken" in report.reason) is lands
     assert rig.link.said(PositionSetpoint)[-1] > BREAKS_S
-    assert [note for note in notes(works) if "log of this flight is incomplete" in note]
+    assert [note for note in notes(works) if "flight log is incomplete" in note]
     assert breaks.calls == 1
 
 
@@ -235,7 +235,7 @@ def test_remarks_that_raise_end_and_the_flight_does_not() -> None:
     _, works = flown(remarks=remarks)
     assert len(asked) == 61
     assert "the recording is full" in notes(works)
-    assert [note for note in notes(works) if note.startswith("the remarks on this flight")]
+    assert [note for note in notes(works) if note.startswith("the notes on this recording")]
 
 
 def test_a_watcher_that_hangs_is_named_once() -> None:
@@ -251,8 +251,8 @@ def test_a_watcher_that_hangs_is_named_once() -> None:
     slow = Watcher(hang)
     report, works = flown(rig=rig, judges=(slow,))
     assert report.detached == ()
-    (said,) = [note for note in notes(works) if "not steered" in note]
-    assert said == "Watcher took 0.4 s: the flight was not steered meanwhile"
+    (said,) = [note for note in notes(works) if "not controlled" in note]
+    assert said == "Watcher took 0.4 s, during which the flight was not controlled"
     assert len(hung) == 2
 
 
