@@ -48,20 +48,21 @@ def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
-            f"{log.path}: it holds no whole turn of a flight and cannot be replayed; {made_by} "
-            f"wrote it, in version {log.header.get('version')}, and turns are written since 3"
+            f"{log.path}: it holds no complete tick and cannot be replayed; {made_by} wrote "
+            f"it in version {log.header.get('version')}, and a replay needs version 3 or "
+            "later"
         )
     for number, turn in enumerate(log.turns):
         if turn.number != number:
             return log.turns[:number], (
-                f"turn {number} is not in the log, which has lost records: what came after it "
-                f"cannot be replayed"
+                f"tick record {number} is missing from the log, which has lost records: what "
+                "follows it cannot be replayed"
             )
     problem = (log.summary or {}).get("problem")
     if problem:
         return log.turns, (
-            f"the log has lost records ({problem}): turns after its last one may be among them, "
-            f"and cannot be replayed"
+            f"the log has lost records ({problem}): ticks after the last one may be among "
+            "them, and cannot be replayed"
         )
     return log.turns, ""
 

@@ -55,7 +55,7 @@ def write_film(
     cannot be written.
     """
     if not flight.log.records:
-        raise InvalidValue(f"{flight.log.path}: the log holds no ticks, there is nothing to film")
+        raise InvalidValue(f"{flight.log.path}: the log has no ticks, so there is nothing to film")
     period = Fraction(max(2, round(100 / rate_hz)), 100)
     times_s = np.arange(0.0, flight.log.end_s + LAST_PICTURE_S, float(period))
     drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px)
@@ -157,7 +157,7 @@ class _Stage:
         )
         ax.set_ylim(0.0, max(np.nanmax(height_m) + self._gear_m, target_z_m or 0.0) + ABOVE_M)
         ax.set_xticks([0.0])
-        ax.set_xlabel("beside the target [m]")
+        ax.set_xlabel("lateral offset [m]")
         ax.set_ylabel("height [m]")
         if target_z_m is not None:
             ax.axhline(target_z_m, color=GREY, linewidth=1.0)
@@ -192,7 +192,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     known_m = body_m[np.isfinite(body_m).all(axis=1)]
     seen_m = targets_m[np.isfinite(targets_m).all(axis=1)]
     if not known_m.size:
-        raise InvalidValue(f"{log.path}: the log knows no position, there is nothing to film")
+        raise InvalidValue(f"{log.path}: the log has no position, so there is nothing to film")
     start_m = known_m[0]
     target_m = seen_m[-1] if seen_m.size else start_m
     aside_m = start_m[:2] - target_m[:2]

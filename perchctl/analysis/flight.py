@@ -58,9 +58,9 @@ class Measures:
     duration_s: float | None = _number("flight", "s", digits=1)
     attempts: int | None = _number("attempts")
     miss_m: float | None = _number("miss", "mm", 1e3, 1)
-    settled_xy_rms_m: float | None = _number("settled, aside, RMS", "mm", 1e3, 1)
+    settled_xy_rms_m: float | None = _number("settled, lateral, RMS", "mm", 1e3, 1)
     settled_yaw_rms_rad: float | None = _number("settled, heading, RMS", "deg", 180 / np.pi, 2)
-    latency_s: float | None = _number("latency found", "ms", 1e3, 0)
+    latency_s: float | None = _number("latency measured", "ms", 1e3, 0)
     latency_sigma_s: float | None = _number("latency, SD", "ms", 1e3, 1)
     battery_start_v: float | None = _number("battery, first", "V", digits=2)
     battery_min_v: float | None = _number("battery, lowest", "V", digits=2)
@@ -72,8 +72,8 @@ class Measures:
     frame_age_s: float | None = _number("frames, median age", "ms", 1e3, 0)
     frame_gaps: int | None = _number("gaps without a frame")
     frame_gaps_s: float | None = _number("time in such gaps", "s", digits=2)
-    turns: int | None = _number("turns of the loop")
-    late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
+    turns: int | None = _number("ticks of the loop")
+    late_p99_s: float | None = _number("tick late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
     def value_text(self, name: str) -> str:

@@ -67,7 +67,7 @@ def plot_flight(log: FlightLog | FlightAnalysis, path: Path | str) -> None:
     """
     flight = log if isinstance(log, FlightAnalysis) else FlightAnalysis(log)
     if not flight.records:
-        raise InvalidValue(f"{flight.log.path}: the log holds no ticks, there is nothing to plot")
+        raise InvalidValue(f"{flight.log.path}: the log has no ticks, so there is nothing to plot")
     save_figure(flight_figure(flight), Path(path))
 
 
@@ -137,7 +137,7 @@ def _draw_raw_and_filtered(
     ax.plot(log.t_s, filtered, color=BLACK, linewidth=1.1, label="filtered")
     coasting = np.array([record.get("measured") is False for record in log.records])
     unseen = np.where(coasting, filtered, np.nan)
-    ax.plot(log.t_s, unseen, color=VERMILLION, linewidth=2.4, label="unseen, or no frame")
+    ax.plot(log.t_s, unseen, color=VERMILLION, linewidth=2.4, label="not seen, or no frame")
     ax.set_ylabel(label)
 
 
@@ -169,7 +169,9 @@ def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
     """Draw the commanded thrust in percent on a second y axis at the right; return that axis."""
     thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
-    thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
+    thrust_ax.plot(
+        flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right axis"
+    )
     thrust_ax.set_ylim(0.0, 105.0)
     return thrust_ax
 

@@ -25,8 +25,9 @@ from perchctl.record import FlightLog
 from perchctl.vision import Pipeline, make_pipeline
 
 CAUTION = (
-    "after the first difference the world would have answered differently: from there on this is "
-    "what the planner would have said to another flight's telemetry and pictures"
+    "after the first difference the vehicle would have moved differently: from "
+    "there on the replay shows how the planner reacts to telemetry and pictures of "
+    "another flight"
 )
 
 
@@ -75,7 +76,7 @@ class PerceptionReplay:
     @property
     def end_reason(self) -> str:
         """Why the replay ends before the flight does, or empty."""
-        return f"{self.missing}: what came after it cannot be seen again" if self.missing else ""
+        return f"{self.missing}: what follows cannot be replayed" if self.missing else ""
 
     @property
     def is_identical(self) -> bool:
@@ -129,28 +130,28 @@ class Replay:
         found = []
         if made_by != perchctl.__version__:
             found.append(
-                f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may "
-                f"be what has been changed on purpose since"
+                f"perchctl {made_by} flew it, and this is {perchctl.__version__}: a difference "
+                "may be a deliberate change since then"
             )
         if elsewhere:
-            found.append(
-                f"it was flown with {elsewhere}: numbers may differ in their last bits because of "
-                f"that"
-            )
+            found.append(f"it was flown with {elsewhere}: numbers may differ in their last bits")
         if self.uncompared:
             found.append(
-                f"the perchctl that flew it did not record {', '.join(self.uncompared)}: these are "
-                f"not compared, and the planner is given their default"
+                f"the perchctl that flew it did not record {', '.join(self.uncompared)}: these "
+                "are not compared, and the planner gets their defaults"
             )
         if self.log.truncated:
-            found.append("the log ends in the flight, without its summary: replayed is its rest")
+            found.append(
+                "the log ends during the flight, without its summary: only what it holds was "
+                "replayed"
+            )
         ended = "" if self.seen is None else self.seen.end_reason
         found += [note for note in (self.gap_text, ended) if note]
         if self.changed_keys and not self.is_identical:
             found.append(CAUTION)
         for each in self.decisions:
             if each.error is not None:
-                found.append(f"the planner breaks down on turn {each.turn.number}: {each.error}")
+                found.append(f"the planner failed at tick record {each.turn.number}: {each.error}")
         return found
 
     def record(self) -> dict[str, Any]:
@@ -183,18 +184,18 @@ class Replay:
         lines = [f"changed:   {', '.join(self.changed_keys)}"] if self.changed_keys else []
         text = "all with the same commands"
         if self.differences:
-            text = f"{len(self.differences)} decided otherwise"
-        lines.append(f"planner:   {self.ticks} turns, {text}")
+            text = f"{len(self.differences)} with another decision"
+        lines.append(f"planner:   {self.ticks} ticks, {text}")
         lines += [f"first:     {each.text}" for each in self.differences[:1]]
         if (seen := self.seen) is None:
             return lines
         text = f"{seen.frames} frames"
         if seen.end_reason:
-            text = f"seen up to frame {seen.frames} of {seen.frames_flown}"
+            text = f"replayed up to frame {seen.frames} of {seen.frames_flown}"
         if seen.differences:
-            text += f", {len(seen.differences)} turns see something else"
+            text += f", {len(seen.differences)} ticks with other poses"
         elif seen.frames:
-            text += ", all with the same poses, to the bit"
+            text += ", all with bit-identical poses"
         lines.append(f"pictures:  {text}")
         return lines + [f"first:     {each.text}" for each in seen.differences[:1]]
 

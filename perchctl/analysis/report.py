@@ -32,7 +32,7 @@ UNFINISHED = "unfinished"
 TITLES = {
     "perched": "Perched",
     "landed": "Landed",
-    "aborted": "Broken off",
+    "aborted": "Aborted",
     "failed": "Failed",
     UNFINISHED: "Unfinished: the log has no end",
 }
@@ -118,7 +118,7 @@ class ReportedFlight:
     def start_text(self) -> str:
         """When the flight began, in UTC; a simulated flight in lockstep has no date."""
         started = self.flight.log.header.get("started_utc")
-        return utc_text(started) if started else "without a date"
+        return utc_text(started) if started else "no date"
 
     @property
     def log_defects(self) -> list[str]:
@@ -126,16 +126,16 @@ class ReportedFlight:
         end, log = self.flight.summary, self.flight.log
         found = []
         if not log.records:
-            found.append("The log holds no turn of a flight: there is nothing to tell.")
+            found.append("The log has no ticks: there is no flight to report.")
         if log.summary is None:
             found.append(
-                "The log ends without its summary: the program was killed, or lost its disk or its "
-                "power. What is told here ends with its last record."
+                "The log ends without its summary: the program was killed, or lost its disk or "
+                "power. This report ends with the last record."
             )
         if log.ignored_bytes:
-            found.append(f"Its last {log.ignored_bytes} bytes could not be read and are left out.")
+            found.append(f"Its last {log.ignored_bytes} bytes are unreadable and were ignored.")
         if end.lost_records:
-            why = end.log_problem or "no reason is known"
+            why = end.log_problem or "the reason is unknown"
             found.append(f"The log lacks {count_text(end.lost_records, 'record')}: {why}.")
         elif end.log_problem:
             found.append(f"The log may lack its last records: {end.log_problem}.")

@@ -119,7 +119,9 @@ class _Given:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
-                    raise _PictureIsAnother(f"the picture of frame {seen.index} is another one")
+                    raise _PictureIsAnother(
+                        f"the recorded picture of frame {seen.index} differs from the one flown"
+                    )
                 return image
             if index > seen.index:
                 break

@@ -52,7 +52,7 @@ def show_text(flight: FlightAnalysis) -> str:
     for head, rows in (
         ("phase     why", [(stay, stay.phase, _why(stay)) for stay in phases]),
         ("held in   because", [(hold, hold.phase, hold.reason) for hold in flight.position_holds]),
-        ("sent by   in the loop's place", [(go, go.by, go.text) for go in flight.takeovers]),
+        ("sent by   instead of the loop", [(go, go.by, go.text) for go in flight.takeovers]),
     ):
         if rows:
             lines += ["", f"  at [s]  for [s]  {head}"]
@@ -79,12 +79,12 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
         name, _, text = line.partition(":")
         yield from _named(name, text.strip())
     if log.summary is None:
-        cause = "its end: the program was killed, or the disk failed"
+        cause = "its end: the program may have been killed, or the disk have failed"
         if not log.phases:
-            cause = "nothing: it never took off, or its program was killed before"
+            cause = "nothing: it never took off, or the program was killed before"
         yield from _named("log lost", cause)
     if log.ignored_bytes:
-        yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
+        yield from _named("log lost", f"its end, {log.ignored_bytes} unreadable bytes")
 
 
 def _origin(log: FlightLog) -> str:
@@ -94,7 +94,7 @@ def _origin(log: FlightLog) -> str:
         log.setup_text,
         _positions_text(log),
         f"{header.get('uri', '?')} with {header.get('source', '?')}",
-        "" if not started else f"begun {utc_text(started)}",
+        "" if not started else f"started {utc_text(started)}",
         f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
     ]
     return ", ".join(part for part in parts if part)
@@ -116,26 +116,26 @@ _MEASURES = (
     (
         "settled",
         "settled_xy_rms_m",
-        "{settled_xy_rms_m} mm aside and {settled_yaw_rms_rad} deg RMS in the last second before "
-        "the contact",
+        "{settled_xy_rms_m} mm lateral and {settled_yaw_rms_rad} deg heading error "
+        "(RMS) in the last second before contact",
     ),
     (
         "frames",
         "frames",
-        "{frames}, {frames_unseen} without the target; {frame_rate_hz} Hz, {frame_age_s} ms old; "
-        "gaps: {frame_gaps}, {frame_gaps_s} s together",
+        "{frames}, {frames_unseen} without the target; {frame_rate_hz} Hz, "
+        "{frame_age_s} ms old; {frame_gaps} gaps of {frame_gaps_s} s in total",
     ),
     (
         "battery",
         "battery_min_v",
-        "{battery_min_v} V at its lowest; {battery_start_v} V at the start, {battery_end_v} V at "
-        "the end",
+        "{battery_min_v} V at the lowest; {battery_start_v} V at the start, "
+        "{battery_end_v} V at the end",
     ),
     (
         "loop",
         "turns",
-        "{turns} turns, late by {late_p99_s} ms, telemetry {telemetry_age_p99_s} ms old (99 % at "
-        "most)",
+        "{turns} ticks; 99 % of them at most {late_p99_s} ms late, with telemetry "
+        "at most {telemetry_age_p99_s} ms old",
     ),
 )
 """Of a line: its name, the figure without which it is left out, and the line."""
@@ -178,12 +178,11 @@ def newest_logs(folder: Path, limit: int | None = None) -> list[Path]:
     """The folder's flight logs (``flight_*.jsonl``, ``.jsonl.gz``), at most `limit`, sorted
     by the time of their last record, newest first. Errors: NotFound."""
     if not folder.is_dir():
-        raise NotFound(f"there is no folder {folder} with flight logs: name a log, or its folder")
+        raise NotFound(f"folder {folder} does not exist: name a flight log, or its folder")
     paths = [*folder.glob("flight_*.jsonl"), *folder.glob("flight_*.jsonl.gz")]
     if not paths:
         raise NotFound(
-            f"the folder {folder} holds no flight log (flight_*.jsonl): name a log, or another "
-            f"folder"
+            f"folder {folder} holds no flight log (flight_*.jsonl): name a log, or another folder"
         )
     return sorted(paths, key=_age_key, reverse=True)[:limit]
 

@@ -16,7 +16,7 @@ FLYING = frozenset(phase.value for phase in Phase if phase.is_flying)
 TOOK_OVER = {
     "watchdog": "The watchdog took over",
     "rescue": "The rescue took over, after an error",
-    "reconnect": "The link was opened once more",
+    "reconnect": "The link was reopened",
 }
 ACTIONS = {
     "APPROACH": "it took off",
@@ -29,7 +29,7 @@ ACTIONS = {
     "RECOVER": "it backed off",
     "LANDING": "it landed",
 }
-ENDS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was broken off"}
+ENDS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
 SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH"})
 """Phases whose sentence tells where the target was as they began."""
 MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
@@ -92,12 +92,12 @@ def _where(flight: FlightAnalysis, t_s: float) -> str:
 
 
 def _loss(loss: TargetLoss) -> Sentence:
-    for_s = f"for {loss.duration_s:.1f} s" if loss.is_regained else "and not seen again"
+    for_s = f"for {loss.duration_s:.1f} s" if loss.is_regained else "and not found again"
     if loss.frames_without_target:
         count = count_text(loss.frames_without_target, "frame")
         text = f"The target was lost {for_s}: {count} without it"
     else:
-        text = f"No picture that could be used came {for_s if loss.is_regained else 'any more'}"
+        text = f"No usable picture arrived {for_s if loss.is_regained else 'any more'}"
     return Sentence(loss.start_s, text, "warn")
 
 
@@ -131,7 +131,7 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
         height_m = flight.value_at(end_s, "z_m") - flight.value_at(0.0, "z_m")
         if phases and phases[-1].phase in FLYING | {"LANDING"} and math.isfinite(height_m):
             text += f" at {length_text(height_m)}"
-        text += ": how the flight ended is not known, its program was ended"
+        text += ": how the flight ended is unknown, as the log has no summary"
         yield Sentence(end_s, text, "bad")
     if end.locked:
         text = "The supervisor locked the vehicle: inspect and restart it"

@@ -200,7 +200,7 @@ def live_page(
         return
     page = LivePage(camera, title, on_land, on_cut)
     report(
-        f"live page{' with buttons to land and to cut the motors' if on_cut else ''}: {page.url}"
+        f"live page{' (with buttons to land and to cut the motors)' if on_cut else ''}: {page.url}"
     )
     try:
         yield page

@@ -162,7 +162,7 @@ class FlightPanel:
                     self._closing.wait(PANEL_PERIOD_S)  # in lockstep the loop's time runs faster
                 self._draw_once()
         except Exception as error:
-            self.failure = f"the display fell silent: {error.__class__.__name__}: {error}"
+            self.failure = f"the display failed: {error.__class__.__name__}: {error}"
 
     def _draw_once(self) -> None:
         while self._lines:

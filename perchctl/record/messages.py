@@ -60,7 +60,7 @@ _TYPES = {
 }
 TICK_SCHEMA = {
     "type": "object",
-    "title": "One turn of the flight loop, as the flight log has it",
+    "title": "One tick of the flight loop, as in the flight log",
     "properties": {
         key: {
             "type": _TYPES.get(key, "number"),

@@ -181,7 +181,7 @@ class FlightLog:
         """The ticks as CSV: a line of names, then a line each tick, with times from 0; a
         missing value is empty. Errors: InvalidValue for a log without ticks."""
         if not self.records:
-            raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
+            raise InvalidValue(f"{self.path}: the log has no ticks, so there is nothing to export")
         text = StringIO()
         table = csv.DictWriter(text, FIELDS, extrasaction="ignore", lineterminator="\n")
         table.writeheader()
@@ -245,7 +245,7 @@ class FlightLog:
         values = self.header.get("profile")
         for sentence in Profile.constant_key_errors(values) if isinstance(values, dict) else ():
             said = sentence.removesuffix("; remove it")
-            warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
+            warnings.warn(f"an older perchctl flew this flight: {said}", Note, stacklevel=2)
         try:
             return Profile.model_validate(values, extra="ignore")
         except ValidationError as error:
@@ -291,7 +291,7 @@ class FlightLog:
         if not isinstance(was, dict):
             return ""
         return ", ".join(
-            f"{key} {was[key]} there and {here[key]} here"
+            f"{key} {was[key]} (here {here[key]})"
             for key in here
             if key in was and was[key] != here[key]
         )
@@ -327,8 +327,8 @@ def read_log(path: Path | str) -> FlightLog:
             continue
         if bad is not None:
             raise InvalidValue(
-                f"{path}: line {bad[0]}: not a record of a flight log ({bad[1]}), and records "
-                f"follow it: the file is damaged, take the original"
+                f"{path}: line {bad[0]}: not a record of a flight log ({bad[1]}), but records "
+                "follow it: the file is damaged, use the original"
             )
         good.append(record)
     summary = next((r for r in good if r["kind"] == "summary"), None)
@@ -355,7 +355,7 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
         raise
     except (TypeError, ValueError, LookupError, AttributeError) as error:
         raise InvalidValue(
-            f"{path}: it holds a value that no flight writes ({error}): take the original"
+            f"{path}: it has a value that no flight writes ({error}): use the original"
         ) from error
 
 
@@ -386,15 +386,16 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl, or cut off in its header (it is "
+            f"{path}: line 1: not a perchctl flight log, or truncated in its header (it is "
             f"{file_kind(path)}); logs are the .jsonl files in the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
         raise InvalidValue(
-            f"{path}: line 1: schema version {version!r}, this perchctl reads 1 to "
+            f"{path}: line 1: schema version {version!r}, but this perchctl reads 1 to "
             f"{SCHEMA_VERSION}; the log was written by perchctl "
-            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}: update it"
+            f"{header.get('perchctl', 'of unknown version')}, and this is {__version__}: "
+            "update perchctl"
         )
     return header
 

@@ -80,9 +80,7 @@ def _records(path: Path) -> Iterator[McapRecord]:
     try:
         stream = path.open("rb")
     except FileNotFoundError:
-        raise NotFound(
-            f"recording {path} does not exist: a flight is recorded with --record"
-        ) from None
+        raise NotFound(f"recording {path} does not exist: fly with --record to make one") from None
     except OSError as error:
         raise NotFound(f"recording {path} cannot be read: {error.strerror}") from None
     with stream:
@@ -95,5 +93,5 @@ def _records(path: Path) -> Iterator[McapRecord]:
         except (InvalidMagic, *_TORN) as error:
             if is_empty:
                 raise InvalidValue(
-                    f"{path} is no recording: it does not begin as an MCAP file does"
+                    f"{path} is not a recording: it does not begin like an MCAP file"
                 ) from error

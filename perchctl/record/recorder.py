@@ -103,8 +103,8 @@ class Recorder:
             return create_file(path, live, lambda stream: cls(path, stream, header, profile, live))
         except OSError as error:
             raise InvalidValue(
-                f"{path}: the recording cannot be begun ({error.strerror or error}): free the "
-                f"place, or fly with --no-record"
+                f"{path}: the recording cannot be created ({error.strerror or error}): check "
+                "its disk and folder, or fly with --no-record"
             ) from None
 
     def write_frame(self, frame: Frame) -> None:
@@ -127,7 +127,7 @@ class Recorder:
             self._hand_over()
             self._closed = True
             if self._writer.finish(partial(self._attempt, self._finish), RECORDING_CLOSE_TIMEOUT_S):
-                self._remember("the disk does not answer: the recording lacks its end")
+                self._remember("the disk does not respond: the end of the recording is missing")
         kept = self._flushed_pictures
         return RecordingEnd(self.path.name, kept, self._pictures - kept, self.problem)
 
@@ -194,9 +194,9 @@ class Recorder:
         self._flushed_pictures = self._written_pictures
         free_bytes = self._stream.free_bytes()
         if self._written_bytes > self._most_bytes:
-            self._end(f"it is full: log.max_mb in the profile is {self._most_bytes / 1e6:g}")
+            self._end(f"it reached log.max_mb of the profile, {self._most_bytes / 1e6:g}")
         elif free_bytes < RESERVE_BYTES:
-            self._end(f"its disk's last {free_bytes / 1e6:.0f} MB are left to the log")
+            self._end(f"the last {free_bytes / 1e6:.0f} MB of the disk are reserved for the log")
         if self._over:
             self._finish()
 
@@ -209,7 +209,7 @@ class Recorder:
 
     def _end(self, why: str) -> None:
         self._over = True
-        self._remember(f"the recording has ended ({why}): the flight and its log go on")
+        self._remember(f"the recording has ended ({why}): the flight and its log continue")
 
     def _ns(self, t_s: float) -> int:
         """A time on the loop's clock as nanoseconds since 1970, where a flight in lockstep

@@ -126,7 +126,10 @@ class FlightSummary:
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"
         if self.simulated and self.is_profile_suspect:
-            lines.append("note:      camera and positions were simulated: change no real profile")
+            lines.append(
+                "note:      camera and positions were simulated: do not change the profile of "
+                "a real vehicle"
+            )
         if self.miss_m is not None:
             lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
         if self.contact is not None:
@@ -134,10 +137,10 @@ class FlightSummary:
         attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         lines.append(f"flight:    {self.duration_s:.1f} s, {attempts}")
         if self.battery_min_v is not None:
-            lines.append(f"battery:   {self.battery_min_v:.2f} V at its lowest")
+            lines.append(f"battery:   {self.battery_min_v:.2f} V at the lowest")
         if self.findings is not None:  # with 95 % intervals
             lines.append(f"latency:   {self.findings.latency_text}")
-            lines.append(f"mounting:  turned by {self.findings.turn_text} (x, y, z)")
+            lines.append(f"mounting:  rotated by {self.findings.turn_text} (x, y, z)")
             lines += [f"advice:    {sentence}" for sentence in self.findings.advice]
         if self.locked:
             lines.append("vehicle:   locked by its supervisor: inspect and restart it")
@@ -148,7 +151,7 @@ class FlightSummary:
         if self.lost_records:
             lines.append(f"log lost:  {self.lost_records} records ({self.log_problem})")
         elif self.log_problem is not None:
-            lines.append(f"log lost:  perhaps its last records ({self.log_problem})")
+            lines.append(f"log lost:  possibly the last records ({self.log_problem})")
         if self.recording is not None:
             lines.append(f"recording: {self.recording.text}")
         if log_path is not None:

@@ -37,7 +37,7 @@ FSYNC_PERIOD_S = 1.0
 LOG_CLOSE_TIMEOUT_S = 3.0
 MOST_WAITING = 3000
 """Records that may wait for the disk, half a minute of a flight at 50 Hz; more are dropped."""
-NO_ANSWER = "the disk does not answer: the flight log lacks its end"
+NO_ANSWER = "the disk does not respond: the end of the flight log is missing"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
 Truth = tuple[tuple[float, float, float], float]
@@ -111,8 +111,8 @@ class LogWatcher:
             raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
-                f"{path}: the flight log cannot be created ({error.strerror or error}): free the "
-                f"place, or name another folder with --log-dir, or in the profile (log.directory)"
+                f"{path}: the flight log cannot be created ({error.strerror or error}): check "
+                "its disk and folder, or name another folder with --log-dir or log.directory"
             ) from None
 
     @classmethod
@@ -318,7 +318,9 @@ class LogWatcher:
 
     def _remember_unencodable(self, error: Exception) -> None:
         why = str(error) or type(error).__name__
-        self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
+        self.unencodable = (
+            self.unencodable or f"a record cannot be encoded for the flight log: {why}"
+        )
 
 
 def sent_line(sent: SentCommand) -> bytes:

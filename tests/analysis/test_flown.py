@@ -46,7 +46,7 @@ def flown(outcome: str, folder: Path) -> tuple[ReportedFlight, float | None]:
 
 def test_snow_is_told_with_its_true_times(tmp_path: Path) -> None:
     flight, begin_s = flown("perched", tmp_path)
-    (lost,) = [s for s in flight.story if "lost for" in s.text or "No picture" in s.text]
+    (lost,) = [s for s in flight.story if "lost for" in s.text or "No usable picture" in s.text]
     assert lost.t_s == pytest.approx(begin_s, abs=0.15)
     found = re.search(r"for (\d\.\d) s", lost.text)
     assert found is not None

@@ -134,7 +134,7 @@ def test_a_log_without_a_tick_says_so() -> None:
     log = made(summary=None)
     log.records.clear()
     words = Page(report_html([ReportedFlight(FlightAnalysis(log))])).words
-    assert "The log holds no turn of a flight" in words
+    assert "The log has no ticks" in words
     assert "Unfinished: the log has no end" in words
 
 

@@ -71,7 +71,7 @@ def cut(record: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "t_s", "grade", "text"),
     [
-        (nothing, GONE_S[0], "warn", "No picture that could be used came for 0.5 s"),
+        (nothing, GONE_S[0], "warn", "No usable picture arrived for 0.5 s"),
         (blank_frames, GONE_S[0], "warn", "was lost for 0.5 s: 12 frames without it"),
         (nothing, 15.2, "step", "The motors were stopped"),
         (backed_off, 9.0, "warn", "Target lost in ascent: it backed off"),

@@ -213,7 +213,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, view=True) == 50
     said = capsys.readouterr().err
-    assert "perchctl: the display fell silent: ZeroDivisionError" in said
+    assert "perchctl: the display failed: ZeroDivisionError" in said
     assert "perchctl: a callback was detached" in said
     card = last_state["card"]
     assert card["outcome"] == "LANDED"

@@ -134,7 +134,7 @@ def test_a_display_that_fails_falls_silent_once() -> None:
     reporter = FlightPanel(Failing())
     reporter.event(entered(0.0, Phase.SEARCH, "x"))
     until(lambda: reporter.failure)
-    assert reporter.failure == "the display fell silent: BrokenPipeError: gone"
+    assert reporter.failure == "the display failed: BrokenPipeError: gone"
     reporter.event(entered(1.0, Phase.ALIGN, "y"))
     reporter.tick(tick())
     reporter.close()

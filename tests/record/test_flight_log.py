@@ -153,7 +153,7 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     assert ended is not None
     read = FlightSummary.from_log(read_log(log.path))
     for summary in (ended, read):
-        assert ("change no real profile" in summary.text()) is (uri == "sim://")
+        assert ("do not change the profile" in summary.text()) is (uri == "sim://")
     assert ("set camera.latency_s" in read.text()) is (uri != "sim://")
 
 

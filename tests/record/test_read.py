@@ -77,7 +77,7 @@ def with_line(at: int, line: bytes) -> Callable[[bytes], bytes]:
     return damaged
 
 
-NO_LOG = "line 1: not a flight log"
+NO_LOG = "line 1: not a perchctl flight log"
 DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "empty": (b"", (NO_LOG, "logs are the .jsonl files")),
     "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), (NO_LOG, "it is a picture")),
@@ -86,14 +86,14 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "list": (b"[1]\n", (NO_LOG,)),
     "torn gzip": (b"\x1f\x8b\x08\x00" + b"\xff" * 50, (NO_LOG,)),
     "packed other": (gzip.compress(b"\x00\x01" * 900, mtime=0), (NO_LOG,)),
-    "cut header": (lambda good: good[:700], (NO_LOG, "cut off in its header")),
+    "cut header": (lambda good: good[:700], (NO_LOG, "truncated in its header")),
     "newer": (
         lambda good: good.replace(b'"version":5', b'"version":9').replace(
             __version__.encode(), b"9.1", 1
         ),
-        ("schema version 9, this perchctl reads 1 to 5", "perchctl 9.1", "update it"),
+        ("schema version 9, but this perchctl reads 1 to 5", "perchctl 9.1", "update perchctl"),
     ),
-    "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
+    "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "use the original")),
     "no time": (with_line(4, b'{"kind":"tick"}'), ("line 4", "t_s must be")),
     "endless": (with_line(4, b'{"kind":"tick","t_s":1e999}'), ("line 4", "t_s must be")),
     "nested": (with_line(4, b"[" * 100_000), ("line 4", "nested too deep")),
@@ -139,5 +139,5 @@ def test_what_is_damaged_or_no_log_is_one_sentence(kind: str, tmp_path: Path) ->
 
 def test_what_is_no_text_is_not_read_whole() -> None:
     """It would never end."""
-    with pytest.raises(InvalidValue, match="not a flight log"):
+    with pytest.raises(InvalidValue, match="not a perchctl flight log"):
         read_log("/dev/zero")

@@ -45,8 +45,8 @@ def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
     ("change", "said", "whole"),
     [
         ({"room": 110_000}, "No space left on device", False),
-        ({"free": recording_module.RESERVE_BYTES - 1}, "are left to the log", True),
-        ({"max_mb": 0.15}, "log.max_mb in the profile is 0.15", True),
+        ({"free": recording_module.RESERVE_BYTES - 1}, "are reserved for the log", True),
+        ({"max_mb": 0.15}, "log.max_mb of the profile, 0.15", True),
         ({"tick": {"t_s": 1.9, "phase": object()}}, "TypeError", False),
     ],
 )
@@ -64,7 +64,7 @@ def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
     recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
     end = recorder.close()
     assert said in (end.recording_problem or "")
-    assert "the flight and its log go on" in (end.recording_problem or "")
+    assert "the flight and its log continue" in (end.recording_problem or "")
     assert end.pictures + end.pictures_missing == len(flight.frames)
     assert 0 < end.pictures < 120
     assert disk.closed
@@ -83,7 +83,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_flight(tmp_path: P
     with pytest.raises(InvalidValue):
         recorded.recorder(there)
     assert there.read_bytes() == b"another flight's"
-    with full_disk(0), pytest.raises(InvalidValue, match="cannot be begun"):
+    with full_disk(0), pytest.raises(InvalidValue, match="cannot be created"):
         recorded.recorder(tmp_path / "g.mcap")
     assert not (tmp_path / "g.mcap").exists()
 
@@ -212,7 +212,7 @@ def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
         end = closed(log).recording
         assert watch.took_s < 5.0
     assert end is not None
-    assert "does not answer" in (end.recording_problem or "")
+    assert "does not respond" in (end.recording_problem or "")
     assert end.pictures_missing == 10 - end.pictures
     assert read_log(log.path).summary is not None
     hung.gate.set()

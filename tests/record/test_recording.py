@@ -52,7 +52,7 @@ def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="does not exist"):
         next(recorded_pictures(tmp_path / "flight.jsonl"))
     (tmp_path / "flight.mcap").write_bytes(b"GIF89a and more")
-    with pytest.raises(InvalidValue, match="no recording"):
+    with pytest.raises(InvalidValue, match="not a recording"):
         next(recorded_pictures(tmp_path / "flight.jsonl"))
 
 

@@ -150,7 +150,7 @@ def test_of_a_killed_flight_what_is_there_is_replayed(tmp_path: Path, name: str)
     found = replay(read_log(path))
     assert found.is_identical
     assert found.ticks > 100
-    assert any("ends in the flight" in note for note in found.notes)
+    assert any("ends during the flight" in note for note in found.notes)
 
 
 def test_a_turn_that_was_not_sent_is_no_tick(logs: Logs) -> None:
@@ -169,7 +169,7 @@ def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Pat
     found = replay(read_log(log_of(tmp_path, [*lines[:200], *lines[205:]])))
     assert found.is_identical
     assert found.ticks < 200
-    assert any("is not in the log" in note for note in found.notes)
+    assert any("is missing from the log" in note for note in found.notes)
     lines[0] = altered(lines[0], perchctl="0.0.9")
     other = replay(read_log(log_of(tmp_path, lines[:100])))
     assert any(f"0.0.9 flew it, and this is {perchctl.__version__}" in n for n in other.notes)
@@ -181,7 +181,7 @@ def test_a_log_without_whole_turns_cannot_be_replayed(tmp_path: Path, version: i
     header = altered(lines_of()[0], version=version, perchctl="0.1.0")
     log = read_log(log_of(tmp_path, [header]))
     assert log.turns == []
-    with pytest.raises(InvalidValue, match=rf"perchctl 0\.1\.0 wrote it, in version {version}"):
+    with pytest.raises(InvalidValue, match=rf"perchctl 0\.1\.0 wrote it in version {version}"):
         replay(log)
 
 
@@ -256,8 +256,8 @@ def test_the_command_says_so_and_leaves_with_0(tmp_path: Path) -> None:
     said = run("log", "replay", str(path), "--set", "planner.takeoff_height_m=0.6")
     assert said.code == 0
     assert "all with the same commands" in said.stdout
-    assert "pictures:  seen up to frame 0 of" in said.stdout
-    for word in ("f.mcap", "ends in the flight", "nothing was changed"):
+    assert "pictures:  replayed up to frame 0 of" in said.stdout
+    for word in ("f.mcap", "ends during the flight", "no key differs"):
         assert word in said.stderr
     record = json.loads(run("log", "replay", str(path), "--no-pictures", "--json").stdout)
     assert (record["differences"], record["first_difference"], record["changed"]) == (0, None, [])
@@ -271,7 +271,7 @@ def test_the_command_leaves_with_its_own_code_where_something_differs(tmp_path: 
     assert said.code == ReplayDiffers.exit_code == 61
     assert 61 in EXIT_CODES
     assert 'phase was "PERCH", the replay has "ASCEND"' in said.stdout
-    assert "world would have answered differently" in said.stderr
+    assert "vehicle would have moved differently" in said.stderr
 
 
 def test_a_fault_of_the_planner_is_not_the_file_s(
@@ -291,7 +291,7 @@ def test_a_fault_of_the_planner_is_not_the_file_s(
     assert found["first_difference"]["replayed"] == "ValueError"
     assert (found["ticks"], found["differences"]) == (1, 1)
     monkeypatch.setattr("perchctl.analysis.plot_flight", fails)
-    assert "unforeseen ValueError: by the test" in run("log", "plot", str(path)).complaint
+    assert "unexpected ValueError: by the test" in run("log", "plot", str(path)).complaint
 
 
 def test_a_damaged_turn_is_the_file_s(tmp_path: Path) -> None:
