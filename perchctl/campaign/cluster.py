@@ -92,8 +92,8 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
         )
     if difference := _differences[requirements.campaign_id]:
         raise InvalidValue(
-            f"worker {worker.address} on {platform.node()} has {difference}: make it the same "
-            f"there, and start it again"
+            f"worker {worker.address} on {platform.node()} has {difference}: make it the "
+            "same there, and restart the worker"
         )
     fn, args, named = pickle.loads(pickled_call)
     return fn(*args, **named)
@@ -153,7 +153,7 @@ def _connected(address: str) -> Client:
     except Exception as error:
         problem = ConnectionFailed(
             f"no dask scheduler answers at {address} within {SCHEDULER_TIMEOUT_S:.0f} s "
-            f"({type(error).__name__}): start dask scheduler there, or mend the address"
+            f"({type(error).__name__}): start a dask scheduler there, or correct the address"
         )
     gc.collect()  # a client that did not connect is closed as long as its loop runs
     raise problem

@@ -81,7 +81,7 @@ FEWEST_PAIRS = 20
 """Fewer pairs get no interval, since only the mean of many is nearly normal."""
 _ROUNDING_RATIO = 1e-9
 """Values whose relative difference is below this differ by rounding only."""
-NOT_PROVEN = "no difference proven"
+NOT_PROVEN = "no significant difference"
 FIGURES = {
     "miss_m": ("miss [mm]", "mm", 1e3),
     "time_s": ("flight time [s]", "s", 1.0),
@@ -154,7 +154,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     """The comparison `found` as a table with verdicts; `names`: how A and B are called."""
     flights, success = found["flights"], found["success"]
-    rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
+    rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B - A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
     only = f"only A {success['only_a']}, only B {success['only_b']}"
     verdict = _verdict(success["better"])
@@ -162,8 +162,8 @@ def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     rows += [_figure_row(key, found[key]) for key in FIGURES if key in found]
     lines = [*align_columns(rows), ""]
     together = (
-        f"the {len(rows) - 1} answers hold together at {100 * LEVEL:.0f} %: intervals of "
-        f"differences and p are widened for it"
+        f"all {len(rows) - 1} comparisons hold jointly at {100 * LEVEL:.0f} %: the "
+        "intervals of differences and p are corrected for it"
     )
     return "\n".join([*lines, together])
 
@@ -175,7 +175,7 @@ def _figure_row(key: str, found: Mapping[str, Any]) -> tuple[str, ...]:
     a, b, difference = (scale * found[each] for each in ("a", "b", "difference"))
     shown = (name, f"{a:.2f}", f"{b:.2f}")
     if found["interval"] is None:
-        few = f"{NOT_PROVEN}: {found['pairs']} pairs, {FEWEST_PAIRS} are needed"
+        few = f"{NOT_PROVEN}: {found['pairs']} pairs, but {FEWEST_PAIRS} are needed"
         return *shown, f"{difference:+.2f}", few
     low, high = (scale * bound for bound in found["interval"])
     verdict = _verdict(found["better"], f" by {abs(difference):.2f} {unit}")
@@ -227,7 +227,7 @@ class Sweep:
             rows.append((yaml_scalar(cell["value"]), rate, *misses, note))
         lines = [*align_columns(rows), "", f"best: {yaml_scalar(record['best'])}"]
         if record["best_against_own"] is not None:
-            lines += [f"picked out of {len(rows) - 1}, which is counted:"]
+            lines += [f"selected from {len(rows) - 1} values, which the statistics account for:"]
             lines += [comparison_text(("own", "best"), record["best_against_own"])]
         return "\n".join(lines)
 

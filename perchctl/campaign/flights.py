@@ -170,7 +170,7 @@ def simulate(
     for value in (*seeds, jobs):
         require_type("a seed, or jobs,", value, int)
     if min([*seeds, jobs - 1]) < 0:
-        raise InvalidValue(f"seeds begin at 0, jobs at 1; found {seeds}, {jobs}")
+        raise InvalidValue(f"seeds must be at least 0 and jobs at least 1; found {seeds}, {jobs}")
     one = partial(fly_in_folder, profile, None if log_dir is None else Path(log_dir), False)
     with contextlib.ExitStack() as stack:
         if executor is None and jobs > 1:
@@ -185,23 +185,23 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            "a flight's process was killed from outside: where memory is short, fly fewer at a "
-            "time (--jobs); --resume goes on with what --out holds"
+            "the process of a flight was killed; if memory is short, fly fewer at a time "
+            "(--jobs); --resume continues the file of --out"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(
-            "the scheduler of --cluster does not answer any more: start it again, and go on with "
-            "what was written to --out by --resume"
+            "the scheduler of --cluster no longer answers: restart it, and continue the "
+            "file of --out with --resume"
         ) from error
     except ImportError as error:
         raise InvalidValue(
-            f"a worker cannot load what flies ({type(error).__name__}: {error}): install this "
-            f"computer's perchctl there, with the extras sim and cluster"
+            f"a worker cannot load the flight ({type(error).__name__}: {error}): install "
+            "this version of perchctl there, with the extras sim and cluster"
         ) from error
     except Exception as error:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
         raise PerchError(
-            f"unforeseen {type(error).__name__} in the flight of seed {seed}: {error} "
-            f"(PERCHCTL_DEBUG=1 shows where; please report it)"
+            f"unexpected {type(error).__name__} in the flight of seed {seed}: {error} "
+            "(PERCHCTL_DEBUG=1 shows where; please report it)"
         ) from error

@@ -74,8 +74,8 @@ def campaign_results(
         return
     if out.is_file() and not (force or resume):
         raise InvalidValue(
-            f"{out} exists already; add --resume to go on with it, --force to replace it, or name "
-            f"another"
+            f"{out} already exists; add --resume to continue it, --force to replace it, or "
+            "name another file"
         )
     check_writable(out, force=True)
     header = campaign_header(profile, faults)
@@ -166,16 +166,15 @@ def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dic
         others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
         if others:
             raise InvalidValue(
-                f"{path} was flown with another {' and another '.join(others)}: take the same, or "
-                f"name another file"
+                f"{path} was flown with another {' and another '.join(others)}: use the same, "
+                "or name another file"
             )
         if any(flight.pop("kind") != "flight" for flight in flights):
-            raise ValueError("a line of it is no flight")
+            raise ValueError("a line is not a flight")
         results = [from_exact_json(result_type, flight) for flight in flights]
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
-            f"{path}: not the lines of a campaign's results ({error}): take the original, or name "
-            f"a new file"
+            f"{path}: not the results of a campaign ({error}): use the original, or name a new file"
         ) from None
     for result in results:
         earlier.setdefault(result.seed, result)

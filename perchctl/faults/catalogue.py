@@ -269,8 +269,8 @@ class Fault:
 FAULTS: tuple[Fault, ...] = (
     # The link.
     Fault("downlink-silent", "no telemetry", radio_effect(down="all")),
-    Fault("uplink-silent", "no command arrives", NO_UPLINK),
-    Fault("link-silent", "both ways silent", radio_effect(up=True, down="all")),
+    Fault("uplink-silent", "no command reaches the vehicle", NO_UPLINK),
+    Fault("link-silent", "no packet in either direction", radio_effect(up=True, down="all")),
     Fault(
         "landing-lost",
         "the operator lands, but 1 or 2 landing orders are lost",
@@ -306,17 +306,21 @@ FAULTS: tuple[Fault, ...] = (
     ),
     # The camera.
     Fault("camera-silent", "no picture", camera_effect("silent")),
-    Fault("camera-frozen", "the same picture again and again", camera_effect("frozen")),
+    Fault("camera-frozen", "the same picture over and over", camera_effect("frozen")),
     Fault("camera-snow", "a receiver's snow", camera_effect("snow")),
     Fault("camera-dark", "a nearly black picture", camera_effect("dark")),
     Fault("camera-lossy", "20 % of the pictures lost", camera_effect("lossy")),
-    Fault("target-covered", "something hides the target", COVERED),
+    Fault("target-covered", "the target is hidden", COVERED),
     Fault(
         "camera-late",
         "pictures 50 to 600 ms late that look fresh",
         effect(e.camera_fault, kind="late", for_s=duration_s(1.0), late_s=log_uniform(0.05, 0.6)),
     ),
-    Fault("camera-out-of-order", "in pairs, the newer one first", camera_effect("out-of-order")),
+    Fault(
+        "camera-out-of-order",
+        "pictures in pairs, the newer one first",
+        camera_effect("out-of-order"),
+    ),
     Fault(
         "camera-mirrored",
         "mirrored pictures from the start",
@@ -326,12 +330,12 @@ FAULTS: tuple[Fault, ...] = (
     # The state estimate.
     Fault(
         "estimate-jumps",
-        "steps sideways by 0.1 to 2 m",
+        "position steps sideways by 0.1 to 2 m",
         effect(e.estimate_error, step_m=_jump_xy, for_s=duration_s()),
     ),
     Fault(
         "height-jumps",
-        "steps in height by 0.1 to 1 m",
+        "height steps by 0.1 to 1 m",
         effect(
             e.estimate_error,
             step_m=(0.0, 0.0, random_sign(log_uniform(0.1, 1.0))),
@@ -340,7 +344,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "heading-jumps",
-        "turns by 10 to 180 deg",
+        "heading steps by 10 to 180 deg",
         effect(
             e.estimate_error,
             turn_deg=random_sign(log_uniform(10.0, 180.0)),
@@ -349,7 +353,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "estimate-drifts",
-        "slides by 3 to 30 cm/s",
+        "position drifts at 3 to 30 cm/s",
         effect(e.estimate_error, drift_mps=_drift, for_s=duration_s(2.0)),
     ),
     Fault(
@@ -364,14 +368,14 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "external-occluded",
-        "the body is hidden",
+        "the rigid body is hidden",
         effect(e.external_positions, how="occluded", for_s=either(0.5, 0.3, duration_s(0.5))),
     ),
-    Fault("external-swapped", "another body takes its name", mocap_effect("swapped")),
+    Fault("external-swapped", "another body takes the vehicle's name", mocap_effect("swapped")),
     Fault("external-scaled", "positions in millimetres", mocap_effect("millimetres")),
     Fault(
         "external-late",
-        "positions come 50 to 150 ms later than they say",
+        "positions arrive 50 to 150 ms later than they claim",
         effect(
             e.external_positions, how="late", late_s=log_uniform(0.05, 0.15), for_s=duration_s(1.0)
         ),
@@ -379,54 +383,63 @@ FAULTS: tuple[Fault, ...] = (
     # Power and motors.
     Fault(
         "battery-sags",
-        "loses 0.2 to 0.6 V at 10 to 100 mV/s",
+        "voltage falls by 0.2 to 0.6 V at 10 to 100 mV/s",
         effect(e.battery_sags, rate_vps=log_uniform(0.01, 0.1), by_v=uniform(0.2, 0.6)),
     ),
-    Fault("battery-reading-frozen", "its reading stands still", frozen_logs("pm.vbat")),
-    Fault("battery-low", "its reading is low", either(0.5, LOW_VOLTAGE, LOW_STATE)),
-    Fault("motor-weak", "one motor gives 15 % less", effect(e.thrust_changed, to=_one_weak_motor)),
+    Fault("battery-reading-frozen", "the voltage reading is frozen", frozen_logs("pm.vbat")),
+    Fault("battery-low", "the battery reads low", either(0.5, LOW_VOLTAGE, LOW_STATE)),
+    Fault(
+        "motor-weak", "one motor has 15 % less thrust", effect(e.thrust_changed, to=_one_weak_motor)
+    ),
     # What pushes.
     Fault("kick", "a blow of 0.2 to 1 m/s", KICK),
-    Fault("gust", "5 to 20 % of the weight, for 0.5 to 1 s", GUST),
+    Fault("gust", "a gust of 5 to 20 % of the weight, for 0.5 to 1 s", GUST),
     # The magnet.
-    Fault("no-magnet", "nothing holds", effect(e.magnet_holds, of_weight=0.0), AT_CONTACT),
-    Fault("weak-magnet", "carries 0.2 to 1.1 of the weight", WEAK_MAGNET, AT_CONTACT),
+    Fault(
+        "no-magnet", "the magnet does not hold", effect(e.magnet_holds, of_weight=0.0), AT_CONTACT
+    ),
+    Fault("weak-magnet", "the magnet carries 0.2 to 1.1 of the weight", WEAK_MAGNET, AT_CONTACT),
     Fault(
         "magnet-lets-go",
-        "lets go 1 to 25 s after the contact",
+        "the magnet lets go 1 to 25 s after contact",
         effect(e.magnet_lets_go, after_s=log_uniform(1.0, 25.0)),
         AT_CONTACT,
     ),
     # The room and the target.
     Fault(
         "ceiling-beside-its-plane",
-        "the target lies 2 to 20 cm above or below it",
+        "the target is 2 to 20 cm above or below the ceiling",
         effect(e.room, target_above_ceiling_m=random_sign(log_uniform(0.02, 0.2))),
         FROM_THE_START,
     ),
     Fault(
         "ceiling-unusual",
-        "at 1.1 to 1.6 m or at 2.7 to 3.4 m",
+        "ceiling at 1.1 to 1.6 m or at 2.7 to 3.4 m",
         effect(e.room, ceiling_z_m=either(0.5, uniform(1.1, 1.6), uniform(2.7, 3.4))),
         FROM_THE_START,
     ),
     Fault("bare-ceiling", "no target", effect(e.room, no_target=True), FROM_THE_START),
     Fault(
         "low-bare-ceiling",
-        "no target, at 0.35 to 1.3 m",
+        "no target, ceiling at 0.35 to 1.3 m",
         effect(e.room, ceiling_z_m=uniform(0.35, 1.3), no_target=True),
         FROM_THE_START,
     ),
-    Fault("target-moves", "by 0.3 m", effect(e.target_moves, by_m=_a_step_aside), TARGET_SEEN),
+    Fault(
+        "target-moves",
+        "the target moves by 0.3 m",
+        effect(e.target_moves, by_m=_a_step_aside),
+        TARGET_SEEN,
+    ),
     Fault(
         "second-target",
-        "the same sheet 0.35 to 1.2 m away",
+        "a second target 0.35 to 1.2 m away",
         effect(e.room, neighbours=_beside),
         FROM_THE_START,
     ),
     Fault(
         "camera-turned",
-        "mounted 90, 180 or -90 deg off",
+        "camera mounted 90, 180 or -90 deg off",
         effect(e.room, T_body_cam_true=_turned_camera),
         FROM_THE_START,
     ),
@@ -444,40 +457,40 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("hang-up", "the terminal is closed", effect(e.operator, presses_s=(0.0,), hang_up=True)),
     # The program.
-    Fault("killed", "killed at once", effect(e.killed)),
+    Fault("killed", "perchctl is killed", effect(e.killed)),
     Fault(
-        "suspended", "suspended for 0.3 to 5 s", effect(e.suspended, for_s=log_uniform(0.3, 5.0))
+        "suspended",
+        "perchctl is suspended for 0.3 to 5 s",
+        effect(e.suspended, for_s=log_uniform(0.3, 5.0)),
     ),
-    Fault("hung", "the loop is stuck", HUNG),
+    Fault("hung", "the loop hangs", HUNG),
     Fault(
         "slow",
-        "turns take 0.1 to 0.4 s",
+        "ticks take 0.1 to 0.4 s",
         effect(e.slow, tick_s=uniform(0.1, 0.4), for_s=duration_s(0.5)),
     ),
     Fault("disk-full", "the log cannot be written", effect(e.disk_full, for_s=duration_s())),
     # Readings that stand still.
-    Fault("position-frozen", "position, velocity stand still", frozen_logs(*STATE)),
+    Fault("position-frozen", "position and velocity are frozen", frozen_logs(*STATE)),
     Fault(
         "attitude-frozen",
-        "roll, pitch and yaw stand still",
+        "roll, pitch and yaw are frozen",
         frozen_logs("stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw"),
     ),
     Fault(
         "acceleration-frozen",
-        "the acceleration stands still",
+        "the acceleration is frozen",
         frozen_logs("acc.x", "acc.y", "acc.z"),
     ),
-    Fault("thrust-frozen", "the thrust stands still", frozen_logs("stabilizer.thrust")),
-    Fault(
-        "supervisor-frozen", "the supervisor's word stands still", frozen_logs("supervisor.info")
-    ),
+    Fault("thrust-frozen", "the thrust is frozen", frozen_logs("stabilizer.thrust")),
+    Fault("supervisor-frozen", "the supervisor's state is frozen", frozen_logs("supervisor.info")),
     # What nothing announces.
     Fault(
         "thrust-changed",
-        "hovers with up to 8 % more or less",
+        "hover thrust up to 8 % higher or lower",
         effect(e.thrust_changed, to=_another_thrust),
     ),
-    Fault("external-mirrored", "positions come mirrored", mocap_effect("mirrored")),
+    Fault("external-mirrored", "positions are mirrored", mocap_effect("mirrored")),
     Fault("exception", "an exception ends the loop", effect(e.raises)),
     Fault(
         "operator-hammers",
@@ -499,22 +512,22 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "weak-magnet-uplink",
-        "carries 0.2 to 1.1 of the weight; no command arrives",
+        "the magnet carries 0.2 to 1.1 of the weight; no command reaches the vehicle",
         (WEAK_MAGNET, NO_UPLINK),
         (P.PERCH, P.COMPLETE),
     ),
     Fault(
         "hung-and-packet-lost",
-        "the loop is stuck, and 1 or 2 of the watchdog's packets are lost",
+        "the loop hangs, and 1 or 2 of the watchdog's packets are lost",
         _hung_and_packet_lost,
     ),
     # What stays.
     Fault(
         "latency-falls",
-        "pictures come 100 to 200 ms sooner than before",
+        "pictures arrive 100 to 200 ms sooner than before",
         effect(e.camera_fault, kind="sooner", for_s=e.FOR_EVER, late_s=uniform(0.1, 0.2)),
     ),
-    Fault("brown-out", "the vehicle starts again", effect(e.reboots, boots_s=uniform(0.5, 1.5))),
+    Fault("brown-out", "the vehicle restarts", effect(e.reboots, boots_s=uniform(0.5, 1.5))),
     Fault(
         "deck-silent",
         "the deck's positions end",
@@ -549,9 +562,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
     found = []
     for name in (part.strip() for part in names.split(",")):
         if name not in BY_NAME:
-            raise UsageError(
-                f"fault {name!r} is unknown; `--faults list` shows the {len(FAULTS)} there are"
-            )
+            raise UsageError(f"fault {name!r} is unknown; `--faults list` lists all {len(FAULTS)}")
         found.append(BY_NAME[name])
     return tuple(found)
 

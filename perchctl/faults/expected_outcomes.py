@@ -77,7 +77,7 @@ def _sagged_too_fast(facts: Facts) -> float | None:
 EXPECTED_OUTCOMES = (
     ExpectedOutcome(
         "started again",
-        "a vehicle that starts again in the air has no motors",
+        "a vehicle that restarts in the air has no thrust",
         lambda facts: facts.rebooted_s,
         (*FALL, "strayed"),
     ),
@@ -96,13 +96,13 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "the operator's word",
-        "cutting the motors on the operator's order locks",
+        "cutting the motors as the operator ordered locks the vehicle",
         lambda facts: facts.stop_s,
         CUT_DOWN,
     ),
     ExpectedOutcome(
         "let go after the flight",
-        "the vehicle hung for as long as perchctl watches it",
+        "the vehicle hung for as long as perchctl monitors it",
         _let_go_later,
     ),
     ExpectedOutcome(

@@ -18,16 +18,16 @@ Claim = str
 off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors off."""
 Flag = str
 FLAGS: dict[Flag, str] = {
-    "crashed": "perchctl ended by an exception that no fault planted",
-    "fell": "fell, touched down above 0.8 m/s, or slipped too deep",
-    "slid": "touched down above 0.5 m/s sideways",
-    "flies_on": "motors on in the air where it should have come down",
-    "endless": "no end within 240 s",
-    "stop_not_obeyed": "motors on 0.5 s after the order to cut them",
-    "pressed": "pushed against ceiling or floor for more than 4 s",
+    "crashed": "perchctl ended with an exception that no fault injected",
+    "fell": "fell, touched down faster than 0.8 m/s, or slipped too far down",
+    "slid": "touched down faster than 0.5 m/s sideways",
+    "flies_on": "motors on in the air when it should have come down",
+    "endless": "did not end within 240 s",
+    "stop_not_obeyed": "motors still on 0.5 s after the order to cut them",
+    "pressed": "pressed against ceiling or floor for more than 4 s",
     "strayed": "more than 1 m from where it should be, or too high",
-    "lied": "perchctl said at the end what is not true",
-    "locked_needlessly": "locked, and had not crashed, tumbled or tilted",
+    "lied": "perchctl reported a false state at the end",
+    "locked_needlessly": "locked without a crash, tumble or excess tilt",
 }
 """What can go wrong, the gravest first, and what it means."""
 

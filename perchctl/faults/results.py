@@ -14,11 +14,11 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
 
 ENDS = {
-    "perched": "the magnet holds it, and its motors are off",
-    "landed": "it stands, and its motors are off",
+    "perched": "hangs on the magnet with its motors off",
+    "landed": "stands with its motors off",
     "aborted": "stopped by the operator, by the vehicle or for safety",
-    "refused": "it never took off",
-    "failed": "an exception ended the flight, after the rescue",
+    "refused": "never took off",
+    "failed": "an exception ended the flight after the rescue",
     "gone": "the program ended before its flight",
 }
 """How a flight can end, and what it means."""
@@ -75,8 +75,8 @@ class FaultResult(CampaignFlight):
 WORST_CASES = 20
 SHARES = {
     "wrong": "with a flag that counts",
-    "not_known": "perchctl says: it hangs or stands",
-    "unconfirmed": "perchctl says: no landing was seen",
+    "not_known": "perchctl reports: it hangs or stands",
+    "unconfirmed": "perchctl reports: no landing was seen",
 }
 """The counts that are given as shares of all flights, and what they mean."""
 
@@ -127,10 +127,10 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     for name, count in _counts(results).items():
         lines.append(f"{rate_text(count, len(results)):<29}{_explained(name, SHARES[name])}")
     meanings = {
-        "flights": "all that were flown",
+        "flights": "all flights",
         **ENDS,
         **FLAGS,
-        "unavoidable": "with a flag that physics or the firmware excuse",
+        "unavoidable": "with a flag that physics or the firmware excuses",
     }
     lines += [f"{figures[name]:>6}  {_explained(name, text)}" for name, text in meanings.items()]
     for each in EXPECTED_OUTCOMES:

@@ -110,7 +110,7 @@ class SimProcess:
         try:
             answer = self._channel.recv() if self._channel.poll(ANSWER_TIMEOUT_S) else None
         except (EOFError, OSError):
-            answer = "its process is gone"
+            answer = "its process has ended"
         if answer is None:
             self.stop()
             raise TimedOut(f"the simulated vehicle did not answer within {ANSWER_TIMEOUT_S:.0f} s")

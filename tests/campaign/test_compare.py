@@ -66,7 +66,7 @@ def test_a_difference_below_the_spread_of_the_seeds_is_found_by_pairs() -> None:
 def test_a_profile_and_its_copy_are_identical() -> None:
     found = compare_pairs([(a, replace(a, cpu_s=3.0)) for a, _ in spread(60)])
     assert better(found) == set()
-    assert text(found).count("no difference proven") == 4
+    assert text(found).count("no significant difference") == 4
 
 
 def test_chance_alone_is_seldom_a_difference() -> None:
@@ -105,7 +105,7 @@ def test_few_flights_prove_nothing() -> None:
     few = compare_pairs(spread(FEWEST_PAIRS - 1, by_m=0.5))
     assert few["miss_m"]["interval"] is None
     assert better(few) == set()
-    assert f"{FEWEST_PAIRS - 1} pairs, {FEWEST_PAIRS} are needed" in text(few)
+    assert f"{FEWEST_PAIRS - 1} pairs, but {FEWEST_PAIRS} are needed" in text(few)
     none = compare_pairs([(LANDED, LANDED)])
     assert none["miss_m"]["difference"] is None
     assert "-" in text(none)
@@ -189,7 +189,7 @@ def test_the_best_is_proven_or_not() -> None:
     assert record["cells"][0]["miss_m"]["median"] == pytest.approx(0.0013)
     assert "B is better by 2.00 mm" in asked.text(record)
     few = sweep("0.02")
-    assert "no difference proven" in few.text(few.record(flown(4, 0.001, 0.003)))
+    assert "no significant difference" in few.text(few.record(flown(4, 0.001, 0.003)))
     assert few.text(few.record([]))
     same = few.record(flown(20, 0.002, 0.002))  # of equal cells the profile's own is the best
     assert (same["best"], same["best_against_own"]) == (0.04, None)
@@ -207,4 +207,4 @@ def test_chance_among_many_cells_is_no_proof() -> None:
     record = asked.record(results)
     assert record["cells"][12]["good"] == 2
     assert record["best"] != 0.04
-    assert "no difference proven" in asked.text(record)
+    assert "no significant difference" in asked.text(record)

@@ -149,8 +149,8 @@ def test_a_second_press_ends_the_program_at_once() -> None:
 @pytest.mark.parametrize(
     ("fly", "words"),
     [
-        (fails_later, "unforeseen ZeroDivisionError in the flight of seed 1: no such luck"),
-        (is_killed_later, "was killed from outside: "),
+        (fails_later, "unexpected ZeroDivisionError in the flight of seed 1: no such luck"),
+        (is_killed_later, "was killed; "),
     ],
 )
 def test_a_flight_that_fails_loses_none_of_the_others(

@@ -59,7 +59,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "out.jsonl"
     written(path, 0)
     before = path.read_bytes()
-    with pytest.raises(InvalidValue, match="exists already; add --resume to go on with it"):
+    with pytest.raises(InvalidValue, match="already exists; add --resume to continue it"):
         written(path)
     assert path.read_bytes() == before
     assert written(path, force=True) == written(path, resume=True) == []
@@ -98,7 +98,7 @@ def test_what_is_no_such_file_is_left_alone(
     lines[line - 1] = lines[line - 1].replace(old, new, 1)
     for content in (b"".join(lines), b"my notes"):
         path.write_bytes(content)
-        with pytest.raises(InvalidValue, match="not the lines of a campaign's results"):
+        with pytest.raises(InvalidValue, match="not the results of a campaign"):
             written(path, resume=True)
         assert path.read_bytes() == content
 
