@@ -46,7 +46,9 @@ class Section(BaseModel):
         """Refuse YAML's yes, no, on and off, which pydantic would read as 1 and 0."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if _takes_numbers(kind) and _holds_switch(value):
-            raise ValueError("found true or false, as YAML reads yes, no, on, off; write a number")
+            raise ValueError(
+                "found true or false (YAML reads yes, no, on and off so); write a number"
+            )
         return value
 
 
@@ -120,7 +122,7 @@ def split_constant_keys(
             if value == (list(constant) if isinstance(constant, tuple) else constant):
                 notes.append(f"{now}; remove it")
             else:
-                lost.append(f"{now}, and {value} here; remove it")
+                lost.append(f"{now}, but {value} here; remove it")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
             result[key], more, gone = split_constant_keys(value, kind, f"{path}{key}.")
             notes, lost = notes + more, lost + gone

@@ -82,14 +82,13 @@ def writable_profile(name: str) -> Path:
     path = find_profile(name).resolve()
     if path.is_relative_to(data_folder("profiles").resolve()):
         raise InvalidValue(
-            f"{path} is shipped with perchctl and is not written to: copy it (cp {path} "
+            f"{path} is shipped with perchctl, so it is not changed: copy it (cp {path} "
             f"my_{path.name}), and name the copy (-p my_{path.name})"
         )
     check_writable(path, force=True)
     if not os.access(path, os.W_OK):
         raise InvalidValue(
-            f"{path} is read-only and is not written to: allow it (chmod u+w {path}), or name a "
-            f"copy (-p)"
+            f"{path} is read-only: make it writable (chmod u+w {path}), or name a copy (-p)"
         )
     return path
 
@@ -103,7 +102,7 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
             them, or the file cannot be written. The file is then unchanged.
     """
     listed = ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
-    by_hand = f"write them yourself: {listed}"
+    by_hand = f"write the values by hand: {listed}"
     try:
         old, mode = path.read_bytes().decode(), file_mode(path)
         new = replace_values(old, values)
@@ -114,8 +113,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
         check_profile(path, new)
     except PerchError as error:
         raise InvalidValue(
-            f"with these numbers the profile would not load, and it is left as it was: {error}; "
-            f"mend what does not fit, then {by_hand}"
+            "with these numbers the profile would be invalid, so it was not changed: "
+            f"{error}; correct that, then {by_hand}"
         ) from None
     numbers = itertools.chain([""], map(str, itertools.count(2)))
     names = (path.with_name(f"{path.name}.bak{number}") for number in numbers)
@@ -146,7 +145,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
             place = place.setdefault(section, CommentedMap())
             plain = plain.setdefault(section, {})
             if not isinstance(place, dict):
-                raise ValueError(f"{section} holds no keys and values")
+                raise ValueError(f"{section} has no keys and values")
         old = place.get(key)
         if isinstance(old, list) and isinstance(value, tuple) and len(old) == len(value):
             for index, number in enumerate(new):  # one by one: their comments stay
@@ -158,7 +157,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     yaml.dump(document, stream)
     written = stream.getvalue()
     if _values_of(written) != wanted:  # as where an anchor's value is another key's, too
-        raise ValueError("the numbers do not fit into this file's layout")
+        raise ValueError("the values cannot be written into this file's layout")
     return written
 
 
@@ -170,7 +169,7 @@ def _as_null(representer: Any, nothing: None) -> Any:
 def _values_of(text: str) -> dict[str, Any]:
     values = parse_yaml(text)
     if not isinstance(values, dict):
-        raise ValueError("holds no keys and values")
+        raise ValueError("has no keys and values")
     return values
 
 

@@ -159,6 +159,9 @@ def json_schema() -> dict[str, Any]:
             unit = key_unit(name)
             if unit and "description" in field:
                 field["description"] += f" ({unit})"
-    extends = {"type": "string", "description": "name or path of the profile that has the rest"}
+    extends = {
+        "type": "string",
+        "description": "name or path of the profile that supplies all other keys",
+    }
     schema["properties"] = {"extends": extends, **schema["properties"]}
     return {"title": "perchctl profile", **schema}

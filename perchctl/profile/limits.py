@@ -64,22 +64,22 @@ def _read(found: re.Match[str]) -> str:
 
 _IMPOSSIBLE = {
     "planner.search.max_height_m <= safety.max_height_m": (
-        "the search would climb to where it has to land"
+        "the search would climb to where the vehicle has to land"
     ),
     "planner.takeoff_height_m <= planner.search.max_height_m": (
-        "the take-off would end above where the search ends"
+        "the take-off would end above the search's highest point"
     ),
     f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
-    " < planner.approach_timeout_s": ("the take-off takes longer than it is waited for"),
-    "camera.latency_s < safety.max_frame_age_s": "every picture would be too old to measure by",
+    " < planner.approach_timeout_s": ("the take-off takes longer than its timeout"),
+    "camera.latency_s < safety.max_frame_age_s": "every picture would be too old to use",
     f"link.telemetry_period_s < {SafetyConfig.proof_age_s:g}": (
         "telemetry would be too old to prove a contact or a landing"
     ),
     "link.telemetry_period_s < safety.telemetry_hold_s": (
-        "telemetry would always be old, and the vehicle held"
+        "telemetry would always be too old, so the vehicle would always hold"
     ),
     "link.telemetry_period_s < safety.telemetry_land_s": (
-        "telemetry would always be old, and the vehicle landed"
+        "telemetry would always be too old, so the vehicle would land"
     ),
 }
 """A relation, and what happens to every flight with a profile that breaks it."""
@@ -88,55 +88,60 @@ _DOUBTFUL = {
     "heights": {
         # A climb passes its setpoint by 0.1 m (docs/firmware.md, "Position take-off").
         "0.1 + planner.search.max_height_m <= safety.max_height_m": (
-            "a climb overshoots by as much, and lands for it"
+            "a climb overshoots by 0.1 m, which would make the vehicle land"
         ),
         "safety.ground_tolerance_m <= 0.45": (
             "a vehicle that hangs would be taken for one on the ground"
         ),
     },
     "fence": {
-        "0.3 <= safety.fence_radius_m": "a draught carries it so far",
+        "0.3 <= safety.fence_radius_m": "a draught carries the vehicle that far",
     },
     "battery limits": {
-        "safety.min_load_v < safety.min_rest_v": "it would land as soon as it lifts",
+        "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
         # What a full battery has left under a light vehicle (docs/firmware.md, "Thrust to PWM").
         "safety.min_load_v < 3.7": (
-            "hovering takes a full battery down to it: it would land as soon as it lifts"
+            "hovering takes even a full battery down to it, so the vehicle would land as "
+            "soon as it takes off"
         ),
-        "safety.min_rest_v < 4.35": "no battery rests so high: no flight would begin",
+        "safety.min_rest_v < 4.35": "no battery rests at such a voltage, so no flight would begin",
     },
     "time limits": {
         f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
         f" + {EstimateConfig.dwell_s + AlignConfig.dwell_s:g} + planner.ascend.settle_dwell_s"
         " + planner.perch.contact_dwell_s < planner.perching_time_s": (
-            "the perching time is over before a contact"
+            "the perching time ends before a contact is possible"
         ),
         "planner.search.attempts * planner.search.wait_s < planner.perching_time_s": (
-            "the perching time is over before the search"
+            "the perching time ends before the search does"
         ),
         f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
         " < planner.landing.timeout_s": (
-            "from there it is not down by setpoints when half of that is over, and is left to "
-            "its own landing"
+            "from there a descent takes more than half of the timeout, after which the "
+            "firmware lands the vehicle"
         ),
-        "safety.camera_hold_s < safety.camera_land_s": "it lands before it was held",
-        "safety.telemetry_hold_s < safety.telemetry_land_s": "it lands before it was held",
+        "safety.camera_hold_s < safety.camera_land_s": "the vehicle would land before it holds",
+        "safety.telemetry_hold_s < safety.telemetry_land_s": (
+            "the vehicle would land before it holds"
+        ),
     },
     "thresholds": {
         f"planner.align.xy_m <= {AscendConfig.cone_base_m:g}": (
-            "near the target it goes back and forth between ALIGN and ASCEND"
+            "near the target the vehicle would alternate between ALIGN and ASCEND"
         ),
         "planner.perch.contact_z_m < planner.ascend.standoff_m": (
-            "where it settles it is as near as at a contact already"
+            "the vehicle would settle as close to the target as at contact"
         ),
         f"{AscendConfig.near_speed_mps:g} <= planner.ascend.speed_mps": (
-            "it climbs faster near the target than far from it"
+            "the vehicle would climb faster near the target than far from it"
         ),
         # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
-        "40200 <= planner.perch.thrust": "so little raw thrust does not press",
-        "20 <= safety.max_tilt_deg": "a gust tilts it so far, and cuts the motors",
+        "40200 <= planner.perch.thrust": "so little raw thrust does not press against the target",
+        "20 <= safety.max_tilt_deg": (
+            "a gust can tilt the vehicle that far, which would cut the motors"
+        ),
         f"link.telemetry_period_s <= {SafetyConfig.proof_age_s / 2:g}": (
-            "one lost packet, and nothing is proven"
+            "a single lost packet would make telemetry too old for any evidence"
         ),
     },
 }

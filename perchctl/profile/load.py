@@ -118,7 +118,7 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
     except ValidationError as error:
         if (kind := file_kind(path)) == "a camera calibration":
             raise InvalidValue(
-                f"{path} is {kind}, no profile: name it in a profile's camera.calibration"
+                f"{path} is {kind}, not a profile: name it in a profile's camera.calibration"
             ) from None
         raise InvalidValue(_one_sentence(path, error)) from None
 
@@ -133,8 +133,8 @@ def _read_weights(name: str) -> WeightsConfig:
     path = given if given.is_file() else data_file("weights", name)
     if path is None:
         raise NotFound(
-            f"merge.weights_file: {name} does not exist; perchctl fit-weights makes it, or remove "
-            f"the key"
+            f"merge.weights_file: {name} does not exist; make it with perchctl fit-weights, "
+            "or remove the key"
         )
     weights = read_yaml(path).get("weights")
     held = weights if isinstance(weights, dict) else {}
@@ -174,8 +174,8 @@ def find_mask(name: str) -> Path:
     path = Path(name)
     if not path.is_file():
         raise NotFound(
-            f"camera.mask: {name} does not exist; "
-            f"perchctl calibrate mask SOURCE -o {path.name} makes one, or remove the key"
+            f"camera.mask: {name} does not exist; make one with perchctl calibrate mask "
+            f"SOURCE -o {path.name}, or remove the key"
         )
     return path
 
@@ -191,7 +191,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     if (width, height) != size_px:
         raise InvalidValue(
             f"camera.mask: {path} has {width}x{height} px, but the calibration was made at "
-            f"{size_px[0]}x{size_px[1]} px: the mask must be of the camera's own pictures"
+            f"{size_px[0]}x{size_px[1]} px: make the mask from this camera's pictures"
         )
     covered = np.asarray(image > _WHITE)
     share = float(covered.mean())
@@ -199,12 +199,12 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_MASKED_SHARE, 0)
         raise InvalidValue(
             f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
-            f"allowed: white is what the vehicle covers, black is free"
+            "allowed: white marks what the vehicle covers, black is free"
         )
     if share == 0.0:
         raise InvalidValue(
-            f"camera.mask: {path} covers nothing: white is what the vehicle covers; "
-            f"remove the key if that is nothing"
+            f"camera.mask: {path} covers nothing: white marks what the vehicle covers; "
+            "remove the key if the vehicle covers nothing"
         )
     return covered
 
@@ -219,12 +219,12 @@ def _choices() -> str:
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
     """Return what the file at `path` holds itself, on top of what it extends."""
     if path in seen:
-        raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
+        raise InvalidValue(f"{path}: extends: the chain of profiles refers back to itself")
     values = _without_constants(own, path)
     if not values:
         raise InvalidValue(
-            f"{path}: the profile is empty, and would fly what nobody chose: begin with a line "
-            f"such as extends: sim, and give the keys that differ"
+            f"{path}: the profile is empty: begin with a line such as extends: sim, and add "
+            "the keys that differ"
         )
     for section, key, kind in _NAMED_FILES:
         _place_beside(values, path, section, key, kind)
@@ -284,7 +284,7 @@ def _values_of(text: str, path: Path) -> dict[str, Any]:
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise InvalidValue(f"{path}: must hold keys and values, found {type(values).__name__}")
+        raise InvalidValue(f"{path}: must have keys and values, found {type(values).__name__}")
     return values
 
 

@@ -23,8 +23,12 @@ def _known_system(system: str) -> str:
         return system
     known, colon, _host = system.partition(":")
     if colon and known.lower() in SYSTEMS:
-        raise ValueError(f"{system!r} is {known.lower()} and a host: write system and host apart")
-    raise ValueError(f"{system!r} is none of {', '.join(SYSTEMS)}, nor my_module:MySource")
+        raise ValueError(
+            f"{system!r} is {known.lower()} and a host: write system and host as two keys"
+        )
+    raise ValueError(
+        f"{system!r} is unknown; allowed are {', '.join(SYSTEMS)}, or my_module:MySource"
+    )
 
 
 SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
@@ -160,7 +164,7 @@ class PositioningConfig(Section):
         given = self.model_fields_set - {"decks"}
         if self.by == "deck" and (self.host if "by" in given else given):
             raise ValueError(
-                "keys of a motion capture are given, but by is deck: write by: mocap, or only "
+                "there are keys for motion capture, but by is deck: write by: mocap, or only "
                 "positioning: deck"
             )
         return self
@@ -169,9 +173,9 @@ class PositioningConfig(Section):
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(
-                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and "
-                f"a period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: "
-                f"else a position is stale before the next one comes"
+                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) "
+                f"and a period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to "
+                "spare: otherwise a position is stale before the next one arrives"
             )
         if self.land_s <= self.hold_s:
             raise ValueError(

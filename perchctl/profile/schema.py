@@ -67,7 +67,9 @@ class LinkConfig(Section):
         """Refuse parameters that turn motors at once: they are set before anybody was asked."""
         for name in parameters:
             if name.startswith(MOTOR_PARAMETERS):
-                raise ValueError(f"{name} turns motors before you are asked: leave it out")
+                raise ValueError(
+                    f"{name} would turn motors before you confirm the flight: remove it"
+                )
         return parameters
 
 
@@ -126,7 +128,7 @@ class Profile(Section):
                     raise InvalidValue(f"{dotted}: {name} is {what}")
                 inner = inner[name]
             if isinstance(inner.get(key), dict) and dotted != "link.parameters":
-                raise InvalidValue(f"{dotted} is a section: give its keys one by one")
+                raise InvalidValue(f"{dotted} is a section: set its keys one by one")
             inner[key] = value
         try:
             _, notes, lost = split_constant_keys(values, Profile)
@@ -184,13 +186,13 @@ def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, s
         text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
     elif first["type"] == "model_type":
         found = clip_text(repr(first["input"]))
-        text = f"must hold keys and values, found {found}; give some, or remove it"
+        text = f"must have keys and values, found {found}; add some, or remove it"
     else:
         found = clip_text(repr(first["input"]))
         text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
         names = [part for part in first["loc"] if isinstance(part, str)]
         if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
-            text += " (metres: were millimetres or centimetres meant?)"
+            text += " (the unit is metres, not millimetres or centimetres)"
     return key, text
 
 

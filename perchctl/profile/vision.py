@@ -54,7 +54,7 @@ def check_marker_id(dictionary: str, marker_id: int) -> None:
     """Raises ValueError when the id is outside its dictionary."""
     count = dictionary_size(dictionary)
     if marker_id >= count:
-        raise ValueError(f"id {marker_id} is outside {dictionary}, which holds 0..{count - 1}")
+        raise ValueError(f"id {marker_id} is not in {dictionary}, which has ids 0 to {count - 1}")
 
 
 # --- The keys ---
@@ -158,8 +158,8 @@ class CameraConfig(Section):
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
         raise ValueError(
-            f"found {latency_s!r}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), or the "
-            f"word measured, to have each flight measure it"
+            f"found {latency_s!r}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), or "
+            "the word measured to have each flight measure it"
         )
 
     @property
@@ -238,8 +238,8 @@ class TargetConfig(Section):
         given = self.model_fields_set
         if "expected_within_m" in given and "expected_xy_m" not in given:
             raise ValueError(
-                "expected_within_m is given without expected_xy_m, the place it is around: give "
-                "that too, or remove it"
+                "expected_within_m is set, but expected_xy_m is not: set that too, or remove "
+                "expected_within_m"
             )
         return self
 
@@ -249,8 +249,8 @@ class TargetConfig(Section):
         if have_same_pattern(large.dictionary, large.id, small.dictionary, small.id):
             both = dict.fromkeys(f"{m.dictionary}/{m.id}" for m in (large, small))
             raise ValueError(
-                f"large and small are the same marker, {' and '.join(both)}, which cannot be told "
-                f"apart: give one of them another id"
+                f"large and small are the same marker, {' and '.join(both)}, and cannot be "
+                "distinguished: give one of them another id"
             )
         return self
 

@@ -154,8 +154,8 @@ WRONG: dict[str, tuple[str, str]] = {
 
 
 MISTYPED = WRONG | {
-    "camera.latency_s": ("0.08", "too small for ms"),
-    "camera.mount.position_m": ("0.03 0 0.01", "too small for mm"),
+    "camera.latency_s": ("0.08", "too small: enter numbers in ms"),
+    "camera.mount.position_m": ("0.03 0 0.01", "too small: enter numbers in mm"),
     "vehicle.gear_body_m": ("0 0 400", "0.4"),
     "target.large.side_m": ("15 cm", "numbers in mm"),
     "target.small.side_m": ("80", "less than half"),

@@ -88,7 +88,7 @@ def test_what_cannot_be_written_says_the_numbers(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     text = "camera: 7\n"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidValue, match=r"mine.yaml: .*write them.*camera.latency_s: 0.09$"):
+    with pytest.raises(InvalidValue, match=r"mine.yaml: .*by hand.*camera.latency_s: 0.09$"):
         write_profile_values(path, {"camera.latency_s": 0.09})
     assert path.read_text(encoding="utf-8") == text
     assert [p.name for p in tmp_path.iterdir()] == ["mine.yaml"]
@@ -107,7 +107,7 @@ def test_a_profile_that_would_not_load_is_left_as_it_was(
     assert load_profile(str(path)).camera.latency_s < 0.15
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     (dotted,) = values
-    with pytest.raises(InvalidValue, match=rf"would not load.*{fault}.*write them.*{dotted}: "):
+    with pytest.raises(InvalidValue, match=rf"would be invalid.*{fault}.*by hand.*{dotted}: "):
         write_profile_values(path, values)
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 

@@ -65,9 +65,9 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("planer: {}", ["planer", "unknown", "extends", "planner"]),
         ("kalman: {alfa: 0.85}", ["kalman.alfa", "unknown", "alpha"]),
         ("target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
-         ["target.large", "997", "0..99"]),
+         ["target.large", "997", "0 to 99"]),
         ("target: {large: {dictionary: DICT_4X4_1000, id: 1000, side_m: 0.15}}",
-         ["0..999"]),
+         ["0 to 999"]),
         ("target: {large: {dictionary: DICT_9X9, id: 1, side_m: 0.15}}",
          ["DICT_9X9", "unknown", "DICT_4X4_1000"]),
         ("target: {large: {dictionary: DICT_4X4_1000, id: 997, side_m: 150}}",
@@ -76,7 +76,8 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("kalman: {alpha: .nan}", ["kalman.alpha", "finite"]),
         ("simulation: {ceiling_z_m: [2.6, 1.8]}", ["simulation.ceiling_z_m", "2.6", "1.8"]),
         ("planner: {search: {max_height_m: 9}}", ["planner.search.max_height_m"]),
-        ("vehicle: {gear_body_m: [0, 0, 3]}", ["vehicle.gear_body_m.2", "0.3, found 3 (metres"]),
+        ("vehicle: {gear_body_m: [0, 0, 3]}",
+         ["vehicle.gear_body_m.2", "0.3, found 3 (the unit is metres"]),
         ("vehicle: {gear_body_m: 0.03}", ["gear_body_m: input should be a valid tuple"]),
         ("vehicle: {gear_body_m: [0, 0.1]}", ["gear_body_m.2: field required, found [0, 0.1]"]),
         ("planner: {approach_xy_m: [1, 2, 3]}", ["approach_xy_m: tuple", "at most 2 items"]),
@@ -98,28 +99,28 @@ def _refusal(tmp_path: Path, text: str) -> str:
          "small: {dictionary: DICT_4X4_250, id: 5, side_m: 0.025}}",
          ["target", "the same marker", "DICT_4X4_50/5 and DICT_4X4_250/5", "another id"]),
         ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep one"]),
-        ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 is there twice"]),
+        ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 appears twice"]),
         ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
         ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
         ("link: {parameters: {a.b: on}}", ["link.parameters", "a number"]),
         *(
-            (f"link: {{parameters: {{{name}: 1}}}}", ["link.parameters", name, "turns motors"])
+            (f"link: {{parameters: {{{name}: 1}}}}", ["link.parameters", name, "would turn motors"])
             for name in ("motorPowerSet.enable", "health.startPropTest", "health.startBatTest")
         ),
         ("", ["empty", "extends: sim"]),
         ("# only a remark\n", ["empty"]),
-        ("camera:\nkalman: {}", ["camera", "must hold keys", "None"]),
+        ("camera:\nkalman: {}", ["camera", "must have keys", "None"]),
         ("date: 2024-13-45", ["month"]),
         pytest.param("[" * 3000, ["nested too deeply"], marks=pytest.mark.long),
         ("- a list", ["keys and values"]),
         ("kalman: {alpha: 0.85", ["line", "YAML"]),
         (
             "target: {expected_xy_m: [400, -1200]}\n",
-            ["target.expected_xy_m", "50", "metres: were millimetres or centimetres meant?"],
+            ["target.expected_xy_m", "50", "the unit is metres, not millimetres or centimetres"],
         ),
         (
             "target: {expected_within_m: 0.2}\n",
-            ["target", "expected_within_m is given without expected_xy_m"],
+            ["target", "expected_within_m is set, but expected_xy_m is not"],
         ),
     ],
 )  # fmt: skip
@@ -170,7 +171,7 @@ def test_extends_takes_the_rest_from_another_profile_but_not_in_a_circle(tmp_pat
     assert mine.name == "mine"
     (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
     (tmp_path / "b.yaml").write_text("extends: a.yaml\n")
-    with pytest.raises(InvalidValue, match="comes back"):
+    with pytest.raises(InvalidValue, match="refers back"):
         load_profile(str(tmp_path / "a.yaml"))
 
 
@@ -189,8 +190,8 @@ def test_a_key_that_is_a_constant_is_named(tmp_path: Path, text: str, words: str
 
 
 @pytest.mark.parametrize(("key", "value", "words"), [
-    ("planner.ascend.near_m", "0.5", r"near_m.*0\.35.*and 0\.5 here"),
-    ("simulation.capture_delay_s", "0.02", r"capture_delay_s.*0\.01.*and 0\.02 here"),
+    ("planner.ascend.near_m", "0.5", r"near_m.*0\.35.*but 0\.5 here"),
+    ("simulation.capture_delay_s", "0.02", r"capture_delay_s.*0\.01.*but 0\.02 here"),
 ])  # fmt: skip
 def test_another_value_of_a_constant_is_refused(
     tmp_path: Path, key: str, value: str, words: str
