@@ -90,7 +90,7 @@ MOST_NAMES = {
     "faults": 6,
     "fleet": 20,
     "flight": 19,
-    "link": 16,
+    "link": 18,
     "record": 12,
     "mission": 34,
     "perception": 5,
