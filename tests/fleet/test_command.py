@@ -58,7 +58,7 @@ def test_one_bad_uri_of_many_is_one_sentence(clash: Path) -> None:
     clash.write_text(CLASH.replace("name: east", "name: east, uri: 'radio://x'"), encoding="utf-8")
     done = run("fleet", str(clash))
     assert (done.code, done.stdout) == (30, "")
-    assert done.complaint.startswith(f"{clash}: vehicle east: URI 'radio://x' is not one of a")
+    assert done.complaint.startswith(f"{clash}: vehicle east: 'radio://x' is not the URI of a")
 
 
 def test_convert_writes_a_file_that_says_what_it_lacks(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_interchangeable_targets_go_to_the_nearest_with_their_markers(tmp_path: 
 
 
 RADIO = ", uri: radio://0/80/2M/E7E7E7E7{0}, source: 'camera:{1}'"
-BAD_URI = "URI 'radio://0/80/3M/E7' is not one of a vehicle; examples: sim://"
+BAD_URI = "'radio://0/80/3M/E7' is not the URI of a vehicle; examples: sim://"
 REFUSED = [
     (two(top="odrer: together"), "odrer: this key is unknown; did you mean order?"),
     (two(top="order: two"), "order: found 'two'; allowed are one-at-a-time, together, or"),
@@ -181,7 +181,7 @@ REFUSED = [
     ),
     (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
     ("extends: sim\n", "has no vehicles, so it is no fleet file: list them under vehicles"),
-    (two(first=", name: west"), "line 4: key name is there twice, first in line 4: keep one"),
+    (two(first=", name: west"), "line 4: key name appears twice, first in line 4: keep one"),
 ]
 
 

@@ -501,7 +501,7 @@ def test_the_driver_is_cflibs_for_its_own_uris_only() -> None:
     (["udp://127.0.0.1:1"], "not a radio's URI"),
     ([FOUR[0], "radio://1/80/2M/E7E7E7E702"], "one dongle"),
     ([FOUR[0], "radio://0/80/2M/e7e7e7e701?rate_limit=50"], "are one vehicle"),
-    ([FOUR[0], "radio://0/80/2M/XX"], "is not one of a vehicle"),
+    ([FOUR[0], "radio://0/80/2M/XX"], "is not the URI of a vehicle"),
 ])  # fmt: skip
 def test_uris_that_one_dongle_cannot_serve_are_refused(given: list[str], words: str) -> None:
     hub.check_uris([FOUR[0], "radio://0/80"])  # of the usual rate and address
