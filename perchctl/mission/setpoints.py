@@ -2,13 +2,17 @@
 limits.
 
 The firmware flies to a setpoint p with a cascade of PID controllers. On top of it, for the
-reference r, the vehicle's position x (height z) and its velocity v:
+reference r, the vehicle's position x (height z), its velocity v, and the acceleration a that it
+leans into:
 
-    p = r + integral + near * limit(LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v)     lateral
+    p = r + integral + near * limit(LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
+                                    - LEAN_DAMPING_S2 a)                                   lateral
     p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                         vertical
 
 The integral removes the offset that a steady wind leaves; `near` grows from 0 to 1 as the target
-comes closer.
+comes closer. The lateral correction is state feedback on the whole chain from setpoint to position:
+a setpoint acts through the attitude, so the lean of now is the velocity of a tenth of a second
+later. With it, the gains can be higher without oscillation.
 """
 
 from __future__ import annotations
@@ -31,10 +35,15 @@ HEIGHT_DAMPING_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
 MAX_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
-LATERAL_ERROR_GAIN = 1.0
-"""Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate."""
-LATERAL_DAMPING_S = 0.3
-"""Damping of the lateral correction by the lateral velocity, s."""
+LATERAL_ERROR_GAIN = 1.5
+"""Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate.
+Smaller: the thrust's fluctuation moves the vehicle further."""
+LATERAL_DAMPING_S = 0.6
+"""Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
+velocity moves the vehicle. Smaller: it oscillates."""
+LEAN_DAMPING_S2 = 0.06
+"""Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
+the vehicle answers an error late. Smaller: it oscillates with these gains."""
 LATERAL_FEEDBACK_START_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_RANGE_M = 0.4
@@ -199,8 +208,10 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
     if gain == 0.0:
         return 0.0, 0.0
     (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps
-    dx = gain * (LATERAL_ERROR_GAIN * (reference.x_m - x) - LATERAL_DAMPING_S * vx)
-    dy = gain * (LATERAL_ERROR_GAIN * (reference.y_m - y) - LATERAL_DAMPING_S * vy)
+    ax, ay = c.belief.lean_acceleration_mps2
+    dx = LATERAL_ERROR_GAIN * (reference.x_m - x) - LATERAL_DAMPING_S * vx - LEAN_DAMPING_S2 * ax
+    dy = LATERAL_ERROR_GAIN * (reference.y_m - y) - LATERAL_DAMPING_S * vy - LEAN_DAMPING_S2 * ay
+    dx, dy = gain * dx, gain * dy
     size = math.hypot(dx, dy)
     part = 1.0 if size <= MAX_LATERAL_CORRECTION_M else MAX_LATERAL_CORRECTION_M / size
     return part * dx, part * dy

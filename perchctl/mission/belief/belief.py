@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from perchctl.geometry import Array
+from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver, SentOrders
@@ -97,6 +97,8 @@ class Belief:
     #: vehicle's velocity from pictures alone
     target_motion: TargetMotion = field(default_factory=TargetMotion)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
+    #: level part of the thrust's direction, world axes: mean over `LEAN_TIME_CONSTANT_S`
+    mean_lean: tuple[float, float] = (0.0, 0.0)
     contact_z_m: float | None = None  #: height of the body where the magnet may hold it
     contact: ContactOffset | None = None  #: offset at the last contact
     in_reach_since_s: float | None = None  #: time since which the gear is within the magnet's reach
@@ -325,6 +327,25 @@ class Belief:
             bias_x_mps, bias_y_mps = self.reckoning.velocity_bias_mps
             vx_mps, vy_mps = vx_mps - bias_x_mps, vy_mps - bias_y_mps
         return vx_mps, vy_mps, vz_mps
+
+    @cached_property
+    def lean(self) -> tuple[float, float]:
+        """Level part (x, y) of the direction of thrust in world axes: the sine of the tilt, towards
+        where the vehicle leans."""
+        tel = self.obs.telemetry
+        level_x = math.sin(tel.pitch_rad) * math.cos(tel.roll_rad)
+        level_y = -math.sin(tel.roll_rad)
+        cos_yaw, sin_yaw = math.cos(tel.yaw_rad), math.sin(tel.yaw_rad)
+        return cos_yaw * level_x - sin_yaw * level_y, sin_yaw * level_x + cos_yaw * level_y
+
+    @cached_property
+    def lean_acceleration_mps2(self) -> tuple[float, float]:
+        """Lateral acceleration (x, y) in world axes, m/s^2, of a hovering vehicle that leans away
+        from its mean lean. The mean balances wind, an unbalanced vehicle and an error of the
+        estimated attitude, and accelerates nothing; a change of the wind is wrong by as much until
+        the mean has followed."""
+        (x, y), (mean_x, mean_y) = self.lean, self.mean_lean
+        return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
     @cached_property
     def speed_mps(self) -> float:

@@ -68,6 +68,9 @@ MAX_THRUST_MISMATCH_FRACTION = 0.12
 """Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
 KEEPALIVE_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
+LEAN_TIME_CONSTANT_S = 1.0
+"""Time constant of the mean lean, s. Larger: a vehicle that enters a gust leaves its axis. Smaller:
+the damping by the lean is lost."""
 SPREAD_DECAY_FACTOR = 0.9
 """Share of the target's spread that remains after each frame."""
 
@@ -405,7 +408,15 @@ def _update_estimators(b: Belief) -> Belief:
             b.battery_fit, obs.telemetry, obs.battery_age_s, dt_s, mah
         ),
         mounting=b.mounting if held else _update_mounting(b),
+        mean_lean=_filter_lean(b, sample_s),
     )
+
+
+def _filter_lean(b: Belief, sample_s: float) -> tuple[float, float]:
+    """Return the mean lean after a sample that covers `sample_s`."""
+    gain = 1.0 - math.exp(-sample_s / LEAN_TIME_CONSTANT_S)
+    (x, y), (mean_x, mean_y) = b.lean, b.mean_lean
+    return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)
 
 
 def _update_mounting(b: Belief) -> MountingMonitor:
