@@ -241,7 +241,7 @@ CASES: dict[str, Case] = {
         state={"battery_fit": replace(FINE_BATTERY, rest_v=3.77)},
     ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
-    "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen()),
+    "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen(), 0.6),
     "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),
     "ascend-timeout": Case(P.ASCEND, P.RECOVER, seen(), state={"entered_s": -50.0}),
     "settled": Case(P.ASCEND, P.PERCH, seen(STANDOFF_Z_M), 0.5, z_m=STANDOFF_Z_M),

@@ -22,6 +22,10 @@ MAX_SETPOINT_LEAD_M = 0.15
 far ahead of a weak vehicle."""
 MIN_CLIMB_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
+MAX_LOST_S = 1.5
+"""Time since the last sighting of the target after which an ascent is given up, s, while a
+positioning system keeps the vehicle in its place meanwhile. Larger: a target that has moved, or is
+covered, is waited for. Smaller: a burst of lost pictures ends an attempt that would succeed."""
 
 
 def cone_radius_m(c: Context) -> float:
@@ -49,6 +53,14 @@ def _is_settled(c: Context) -> bool:
         and abs(target.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.belief.speed_mps <= ascend.settle_speed_mps
     )
+
+
+def _is_target_lost(c: Context) -> bool:
+    """True if the target has been out of view for too long. If the target itself is the positioning
+    system, every moment without it is too long, since the position drifts."""
+    b = c.belief
+    patience_s = 0.0 if b.is_target_positioned else MAX_LOST_S
+    return not b.target.is_tracked and b.target.age_s > patience_s
 
 
 NEAR_STANDOFF = Condition[Context](
@@ -96,7 +108,7 @@ ASCEND = PhaseDefinition(
         back_off_row(
             "ascend-lost",
             {Phase.ASCEND},
-            lambda c: not c.belief.target.is_tracked,
+            _is_target_lost,
             "target lost in ascent",
         ),
         Transition(
