@@ -627,5 +627,5 @@ def test_what_cannot_be_corners_is_refused(found: Any, monkeypatch: pytest.Monke
     assert seen.markers["large"].sigma_px == own_detector.SIGMA_PX
     assert np.abs(errors_of(seen, truth)[:3]).max() < 0.01
     monkeypatch.setattr(own_detector, "corners", lambda image: found)
-    with pytest.raises(InvalidValue, match=r"allowed are large and small, each \(4, 2\)"):
+    with pytest.raises(InvalidValue, match=r"corners of large and small, each \(4, 2\)"):
         next(track([image], own, CAMERA))

@@ -66,7 +66,7 @@ from perchctl.vision.types import (
     to_grey,
 )
 
-SEVERAL_TARGETS_TEXT = "more than one target in view: the one that was tracked is followed"
+SEVERAL_TARGETS_TEXT = "more than one target in view: perchctl keeps following the tracked one"
 
 
 class Detector(Protocol):
@@ -229,8 +229,8 @@ def _own_detections(frame: Frame, detect: Detector) -> Detections:
                 found[name] = Detection(name, corners_px, sigma_px, refined=True)
     except Exception as error:
         raise InvalidValue(
-            f"detector.own gave {error_at(error)}; allowed are large and small, each "
-            f"(4, 2) px, or with a sigma of 0.001 to 1000 px"
+            f"detector.own failed: {error_at(error)}; it must return the corners of large and "
+            f"small, each (4, 2) px, or a tuple of corners and a sigma of 0.001 to 1000 px"
         ) from error
     return Detections(frame.index, frame.t_s, found.get("large"), found.get("small"))
 

@@ -80,7 +80,7 @@ def refusal_text(
     if away_m <= place.max_distance_m:
         return None
     return (
-        f"a target {away_m:.2f} m from target.expected_xy_m is not followed "
+        f"a target {away_m:.2f} m from target.expected_xy_m is ignored "
         f"(target.expected_within_m is {place.max_distance_m:g} m)"
     )
 

@@ -157,7 +157,7 @@ ESTABLISHED_FRAMES = 5
 
 _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
-    "the target is where it was expected before the last pose, which may have been wrong"
+    "the target is where it was expected before the last pose: that pose may have been wrong"
 )
 _GATE_CHI2 = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
 _MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
@@ -231,7 +231,7 @@ def judge_pose(
         )
     seen = _update_rival(rival if theirs else None, sight, fit, constants)
     if _is_rival_accepted(lock, seen, sight):
-        text = f"target taken up anew, {fit.distance_m:.2f} m from where it was expected"
+        text = f"target reacquired {fit.distance_m:.2f} m from its expected position"
         return GateVerdict(accepted=True, restarts_track=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
@@ -390,10 +390,10 @@ def _update_rival(
     has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(fit.S[3, 3])
     where = f"{fit.distance_m:.2f} m away from it"
     if turned_rad > _MIN_REPORTED_ROTATION_RAD:
-        where += f" and turned by {math.degrees(turned_rad):.0f} deg"
+        where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
     if has_different_range:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
-        where += ", or of another size"
+        where += ", or it has another size"
     return RivalTrack(
         track=start_track(sight.measured, sight.t_s, constants),
         in_world=sight.in_world,

@@ -71,7 +71,7 @@ def check_camera_matrix(K: Array) -> None:
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
         if abs(K[0, 1]) > MAX_SKEW_PX:
             raise InvalidValue(
-                f"the camera matrix has a skew of {K[0, 1]:g} px (row 1, column 2), at most "
+                f"the camera matrix has a skew of {K[0, 1]:g} px (row 1, column 2), but at most "
                 f"{MAX_SKEW_PX:g} px is allowed: calibrate without skew (OpenCV's CALIB_FIX_SKEW, "
                 f"--fisheye-fix-skew of ROS)"
             )
@@ -114,7 +114,9 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
     """Return a contiguous 8-bit grey picture, (height, width), from an array in grey, BGR or BGRA
     with 8 or 16 bits. Raises InvalidValue for anything else."""
     if image is None:
-        raise InvalidValue("the picture is None: cv2.imread returns it for what is no picture")
+        raise InvalidValue(
+            "the picture is None: cv2.imread returns None if it cannot read a file as a picture"
+        )
     shape: tuple[int, ...] = getattr(image, "shape", ())
     kind = getattr(image, "dtype", None)
     is_picture = len(shape) == 2 or (len(shape) == 3 and shape[2] in (1, 3, 4))

@@ -312,4 +312,4 @@ def test_beside_another_vehicle_it_perches_on_its_own_target(seed: int, tmp_path
     xy = np.stack([log.column("tx_m"), log.column("ty_m")], axis=1)
     seen = xy[np.isfinite(xy[:, 0])]
     assert np.linalg.norm(seen - scenario.target_xy_m, axis=1).max() < APART_M / 4
-    assert not any("taken up anew" in (r["lock_note"] or "") for r in log.records)
+    assert not any("reacquired" in (r["lock_note"] or "") for r in log.records)

@@ -201,7 +201,7 @@ def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> Non
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2
     assert all(measured(outputs[first:]))
-    assert outputs[first].lock_note.startswith("target taken up anew, 0.3")
+    assert outputs[first].lock_note.startswith("target reacquired 0.3")
     target = outputs[first].target
     assert np.linalg.norm(target.e_m[:2]) > 0.2
 

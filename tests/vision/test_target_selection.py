@@ -151,7 +151,7 @@ def test_another_s_is_refused_with_the_reason_until_the_own_comes_into_view() ->
         assert output.detections.large is not None
         assert output.target is None
         assert output.refused
-        assert "0.50 m from target.expected_xy_m is not followed" in output.lock_note
+        assert "0.50 m from target.expected_xy_m is ignored" in output.lock_note
     outputs = list(flown.along(beyond_m, between_both(0.5), BOTH_READ_M, 20))
     assert place(outputs[-1]) == pytest.approx(OWN_M, abs=0.02)
     assert not outputs[-1].refused
@@ -186,11 +186,11 @@ def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
         pass
     flown.neighbour = ALONE if taken else ALIKE
     notes = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(42)]
-    assert any("taken up anew" in note for note in notes) is taken
+    assert any("reacquired" in note for note in notes) is taken
     assert any(note.startswith("not the tracked target") for note in notes)
     if not taken:  # an estimate that jumped would have it elsewhere: not for ever
         later = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(30)]
-        assert any("taken up anew" in note for note in later)
+        assert any("reacquired" in note for note in later)
 
 
 def test_a_marker_without_a_pose_yet_is_refused_only_by_a_known_place() -> None:
