@@ -112,12 +112,12 @@ def battery_shortfall_text(c: Context) -> str:
     """Return the remaining time, and the times that an attempt, the landing and the reserve
     take."""
     seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, predict_durations_s(c)
-    has = "what the battery has left is not known"
+    has = "the remaining battery time is unknown"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
     return (
         f"{has}; an attempt takes {attempt_s:.0f} s, the landing {landing_s:.0f} s, "
-        f"the reserve is {c.safety.energy_reserve_s:g} s"
+        f"and the reserve is {c.safety.energy_reserve_s:g} s"
     )
 
 

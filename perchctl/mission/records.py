@@ -62,7 +62,7 @@ class Event:
             events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
-                text = f"no battery reading: landing after {grace_s:.0f} s at most"
+                text = f"no battery reading: landing within {grace_s:.0f} s"
                 events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
         if state.phase is not before.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity

@@ -89,14 +89,14 @@ class Findings:
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
         if set_here and _is_significant(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
             advice.append(
-                f"latency {found.latency_text}, profile says {camera.start_latency_s * 1e3:.0f}: "
-                f"set camera.latency_s to {max(0.0, latency_s):.3f}"
+                f"the latency is {found.latency_text}, not {camera.start_latency_s * 1e3:.0f} ms "
+                f"as in the profile: set camera.latency_s to {max(0.0, latency_s):.3f}"
             )
         turns = zip(found.rotation_deg, found.rotation_sigma_deg, strict=True)
         if any(_is_significant(turn, ROTATION_GATE_DEG, sigma) for turn, sigma in turns):
             advice.append(
-                f"the camera is turned by {found.turn_text} from what the profile says: measure it "
-                f"with `perchctl calibrate mount`"
+                f"the camera is rotated by {found.turn_text} relative to the profile: measure the "
+                f"mounting with `perchctl calibrate mount`"
             )
         return replace(found, advice=tuple(advice))
 

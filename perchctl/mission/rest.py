@@ -27,11 +27,11 @@ table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems 
 class RestState(Enum):
     """The rest state of a vehicle with its motors off, in words without a full stop."""
 
-    HANGS = "the vehicle hangs on the magnet, its motors are off"
+    HANGS = "the vehicle hangs on the magnet with its motors off"
     HELD = "something holds the vehicle away from the target; the motors are off"
-    STANDS = "the vehicle stands on the floor, its motors are off"
-    UNKNOWN = "the motors are off; it is not known whether the vehicle hangs or stands"
-    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"
+    STANDS = "the vehicle stands on the floor with its motors off"
+    UNKNOWN = "the motors are off; it is unknown whether the vehicle hangs or stands"
+    UNSEEN = "how the flight ended could not be confirmed: keep away from the vehicle"
 
 
 def find_rest_state(c: Context) -> RestState:

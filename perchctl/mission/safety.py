@@ -147,19 +147,22 @@ def divergence_reason(c: Context) -> str:
     b = c.belief
     if _is_oscillating(c):
         return (
-            f"it swings up and down, now at {-b.climb_mps:.1f} m/s: are the positions of the "
-            f"motion capture late?"
+            f"vertical oscillation, sinking at {-b.climb_mps:.1f} m/s: motion-capture positions "
+            f"may be delayed"
         )
     cause = (
-        "swapped axes in the motion capture, positions that are late, or a body that is turned in "
-        "it; perchctl check --lift tells"
+        "the motion capture may have swapped axes, delayed positions or a rotated rigid body; run "
+        "perchctl check --lift"
     )
     if b.is_target_positioned:
-        cause = "does camera.mount have the camera turned as it is?"
-    return (
-        f"position control leads astray, {_setpoint_deviation_m(c):.2f} m aside "
-        f"at a height of {b.height_m:.2f} m: {cause}"
-    )
+        cause = (
+            "the camera's rotation in camera.mount may be wrong; measure it with "
+            "`perchctl calibrate mount`"
+        )
+    found = f"the vehicle drifted {_setpoint_deviation_m(c):.2f} m from its setpoint"
+    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S:
+        found = "the estimated velocity contradicts the accelerometer"
+    return f"{found} at a height of {b.height_m:.2f} m: {cause}"
 
 
 def is_position_lost(c: Context) -> bool:
@@ -192,16 +195,18 @@ def latency_reason(c: Context) -> str:
     found = f"the pictures are {1e3 * (assumed_s + b.mismatch.later_s):.0f} ms old"
     if not b.is_telemetry_fresh:  # with late telemetry, pictures in time seem late
         return (
-            f"pictures and telemetry do not fit each other, by {1e3 * b.mismatch.later_s:.0f} ms; "
-            f"the telemetry is {b.telemetry_age_s:.1f} s old"
+            f"the times of pictures and telemetry disagree by {1e3 * b.mismatch.later_s:.0f} ms; "
+            f"the newest telemetry is {b.telemetry_age_s:.1f} s old"
         )
     if isinstance(camera.latency_s, str):
         least_s, most_s = USED_LATENCY_S
         return (
-            f"{found}; a measured latency (camera.latency_s) can be {1e3 * least_s:.0f} to "
-            f"{1e3 * most_s:.0f} ms: find what delays them"
+            f"{found}, but only a latency of {1e3 * least_s:.0f} to {1e3 * most_s:.0f} ms can be "
+            f"measured in flight (camera.latency_s): find what delays the pictures"
         )
-    return f"{found}, not {1e3 * assumed_s:.0f} as camera.latency_s says: find what delays them"
+    return (
+        f"{found}, but camera.latency_s is {1e3 * assumed_s:.0f} ms: find what delays the pictures"
+    )
 
 
 def is_mounting_wrong(c: Context) -> bool:
@@ -219,15 +224,15 @@ def mounting_reason(c: Context) -> str:
         turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.rotation_rad) / 10.0)
         turn_deg = 180 if turn_deg == -180 else turn_deg
         text = (
-            f"camera seems turned by about {turn_deg} deg from what the profile says: the target "
-            f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
-            f"{turn_deg} to the last of camera.mount.rpy_deg"
+            f"the camera seems to be rotated by about {turn_deg} deg relative to the profile: the "
+            f"target moves with the vehicle; measure the mounting with `perchctl calibrate mount`, "
+            f"or add {turn_deg} to the last value of camera.mount.rpy_deg"
         )
         capture = not turn_rad and c.profile.positioning.source.is_mocap
-        return f"{text}; or swapped axes in the motion capture" if capture else text
+        return f"{text}; or the motion capture may have swapped axes" if capture else text
     return (
-        f"the target seems to lie {-b.target.error_z_m:.1f} m below the vehicle: camera.mount does "
-        f"not look up"
+        f"the target appears {-b.target.error_z_m:.1f} m below the vehicle: camera.mount does not "
+        f"point the camera up"
     )
 
 
@@ -326,7 +331,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "heading-lost",
         PRE_CONTACT_PHASES,
         lambda c: c.belief.heading_lost,
-        "the estimated heading jumped: down level, by thrust alone",
+        "the estimated heading jumped: descending level by thrust alone",
     ),
     land_row(
         "position-astray",
@@ -339,7 +344,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "position-lost",
         FREE_AIR_PHASES | {Phase.PERCH},
         is_position_lost,
-        lambda c: f"{position_loss_text(c.belief)}; down level, by thrust alone",
+        lambda c: f"{position_loss_text(c.belief)}; descending level by thrust alone",
     ),
     land_row(
         "estimator-jump",
@@ -348,13 +353,13 @@ SAFETY_ROWS: tuple[Transition, ...] = (
             c.belief.first_jump_s is not None
             and c.t_s - c.belief.first_jump_s >= c.safety.jump_hold_s
         ),
-        "the state estimate jumped: landing where it is",
+        "the state estimate jumped: landing at the current position",
     ),
     land_row(
         "estimate-unsure",
         FREE_AIR_PHASES,
         lambda c: c.held_s(VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
-        lambda c: f"{variance_text(c.belief)}: is the positioning system gone?",
+        lambda c: f"{variance_text(c.belief)}: the positioning system may have failed",
     ),
     land_row(
         "battery-low",
@@ -366,7 +371,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "battery-unknown",
         PRE_CONTACT_PHASES,
         lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
-        "the battery's reading stands still",
+        "the battery reading is no longer updated",
     ),
     land_row(
         "latency",
@@ -405,8 +410,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "markers-disagree",
         CAMERA_GUIDED_PHASES,
         lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
-        "large and small marker contradict each other: check the printed sizes in the "
-        "profile and the camera's calibration",
+        "the two markers contradict each other: check the printed sizes and the calibration",
     ),
     land_row(
         "log-lost",
@@ -418,7 +422,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "time-over",
         PRE_CONTACT_PHASES,
         lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
-        "the perching time is over",
+        "the perching time has run out",
         Outcome.ATTEMPTS_USED_UP,
     ),
     # --- the magnet may catch early ---
@@ -427,13 +431,13 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_ATTACH_PHASES,
         is_held_by_target,
         Phase.COMPLETE,
-        "hanging on the magnet already",
+        "already hanging on the magnet",
     ),
     land_row(
         "held",
         MAGNET_ATTACH_PHASES,
         is_held_elsewhere,
-        "something holds it where the target is not",
+        "something holds the vehicle away from the target",
         claims=Claim.HELD_BY_OTHER,
     ),
     land_row(
@@ -441,8 +445,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_ATTACH_PHASES,
         lambda c: c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S,
         lambda c: (
-            f"it hangs at the target's height, {newest_contact_offset(c.belief).text}: "
-            f"that may be its magnet"
+            f"the vehicle hangs at the target's height, {newest_contact_offset(c.belief).text}: "
+            f"the target's magnet may hold it"
         ),
         claims=Claim.HANGS,
     ),
@@ -452,7 +456,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         {Phase.APPROACH},
         lambda c: is_blocked(c) or is_press_thrust_insufficient(c),
         lambda c: (
-            f"pressed at {c.belief.height_m:.2f} m: something is above, or the thrust is weak"
+            f"cannot climb above {c.belief.height_m:.2f} m: an obstacle is above, or the thrust is "
+            f"too low"
         ),
     ),
     back_off_row(
@@ -460,8 +465,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_ATTACH_PHASES,
         is_blocked_off_target,
         lambda c: (
-            f"pressed against something at {c.belief.height_m:.2f} m"
-            + ("" if c.belief.hover_thrust else ", or the thrust is weak")
+            f"pressing against an obstacle at {c.belief.height_m:.2f} m"
+            + ("" if c.belief.hover_thrust else ", or the thrust is too low")
         ),
         claims=Claim.BLOCKED,
     ),
@@ -469,8 +474,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "too-weak",
         CAMERA_GUIDED_PHASES,
         is_press_thrust_insufficient,
-        "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
-        "something is above",
+        "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or an "
+        "obstacle is above",
     ),
 )
 """The safety rows in their order. Your own rows follow them and precede the exits of the phases."""

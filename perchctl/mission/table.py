@@ -110,10 +110,10 @@ def add_rows(
                 )
                 raise InvalidValue(
                     f"row {row.name!r} leads from {phase.name} to {row.to.name} "
-                    f"({row.severity.name}); allowed there are {', '.join(may) or 'none'}"
+                    f"({row.severity.name}); allowed from {phase.name}: {', '.join(may) or 'none'}"
                 )
         if row.stop is not None or row.outcome is not None or row.claims:
-            raise InvalidValue(f"row {row.name!r} may have no stop, no outcome and no claims")
+            raise InvalidValue(f"row {row.name!r} must not set stop, outcome or claims")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = (
             _wrap_row_function(row.name, row.when),

@@ -50,7 +50,7 @@ def blank_frames(record: dict[str, Any]) -> None:
 
 def backed_off(record: dict[str, Any]) -> None:
     if 9.0 <= flown_s(record) < 10.0:
-        record |= {"phase": "RECOVER", "reason": "target lost in ascent"}
+        record |= {"phase": "RECOVER", "reason": "target lost during the ascent"}
 
 
 def held(record: dict[str, Any]) -> None:
@@ -74,7 +74,7 @@ def cut(record: dict[str, Any]) -> None:
         (nothing, GONE_S[0], "warn", "No usable picture arrived for 0.5 s"),
         (blank_frames, GONE_S[0], "warn", "was lost for 0.5 s: 12 frames without it"),
         (nothing, 15.2, "step", "The motors were stopped"),
-        (backed_off, 9.0, "warn", "Target lost in ascent: it backed off"),
+        (backed_off, 9.0, "warn", "Target lost during the ascent: it backed off"),
         (held, 7.0, "warn", "Held in place for 0.8 s: no picture for 0.8 s"),
         (cut, 9.0, "step", "The motors were stopped"),
         (cut, 16.0, "bad", "cut and locked"),

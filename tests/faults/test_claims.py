@@ -47,7 +47,7 @@ def test_a_row_claims_what_its_sentence_says(name: str) -> None:
     if isinstance(row.reason, str):
         said = {
             "locked": "locked", "tilted": "tilted", "motors cut": "motors off",
-            "something holds it": "held off the target",
+            "something holds the vehicle": "held off the target",
         }  # fmt: skip
         for word, claim in said.items():
             assert (word in row.reason) <= (claim in claims), row.reason

@@ -137,7 +137,7 @@ def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> 
     assert said.kind is EventKind.NOTE
     assert (said.rest is RestState.UNSEEN) is not heard
     assert "Broken in flight" in said.reason
-    assert ("motors are off" in said.reason) is heard
+    assert ("motors off" in said.reason) is heard
     assert ("could not be confirmed" in said.reason) is not heard
 
 
@@ -295,7 +295,7 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
 @pytest.mark.parametrize(("changed", "words"), [
     (lambda s: None if s.t_s > 2.0 else s,
      ["the newest telemetry is 1.0 s old", "not confirmed in time: the newest telemetry is"]),
-    pytest.param(lambda s: replace(s, thrust=50000.0), ["not confirmed in time: by its telemetry"],
+    pytest.param(lambda s: replace(s, thrust=50000.0), ["not confirmed in time: telemetry"],
                  marks=pytest.mark.long),
 ], ids=["silent", "flies on"])  # fmt: skip
 def test_a_landing_that_nobody_saw_is_no_landing(

@@ -209,7 +209,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
     assert (state.row == "too-little-left") is gated
     assert gated or phase is not Phase.ALIGN or state.row == "aligned"
     if gated and energy.rest_v is None:
-        assert "not known" in state.reason
+        assert "unknown" in state.reason
         assert state.battery.left_s is None
 
 

@@ -36,7 +36,11 @@ CAMERA = CameraConfig(latency_s=0.06)
 @pytest.mark.parametrize(
     ("seen", "camera", "words"),
     [
-        (_seen(0.032), CAMERA, "latency 92 +- 6 ms, profile says 60: set camera.latency_s"),
+        (
+            _seen(0.032),
+            CAMERA,
+            "latency is 92 +- 6 ms, not 60 ms as in the profile: set camera.latency_s",
+        ),
         (_seen(0.018), CAMERA, ""),
         (_seen(0.04, 0.0105), CAMERA, ""),  # too unsure
         (_seen(0.05), CameraConfig(latency_s="measured"), ""),

@@ -156,7 +156,7 @@ def test_a_turned_mounting_lands_and_says_so(deg: int) -> None:
     it = Follows(deg)
     state = fly(state_in(Phase.ALIGN), it, 4.0, one_phase=True).state
     assert (state.phase, state.row, state.outcome) == (Phase.LANDING, "mounting", Outcome.SAFETY)
-    assert f"turned by about {deg} deg" in state.reason
+    assert f"rotated by about {deg} deg" in state.reason
     assert max(it.far_m) < 0.17
 
 
@@ -179,4 +179,4 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
 
     state = fly(state_in(Phase.ALIGN), look, 0.58).state
     assert state.row == "mounting"
-    assert "camera.mount does not look up" in state.reason
+    assert "camera.mount does not point the camera up" in state.reason

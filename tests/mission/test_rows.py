@@ -356,9 +356,9 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
     row = first_transition(context, TABLE)
     assert row is not None
     text = row.reason_text(context)
-    assert text.startswith("not steady 6 s after the attempt: it moves at 0.30 m/s, it is 0.31 m")
+    assert text.startswith("not steady 6 s after the attempt: moving at 0.30 m/s, 0.31 m")
     hangs = context_at(remembering(state, contact_z_m=z_m), sample, PROFILE)
-    assert row.reason_text(hangs).endswith("it has not come away from its contact")
+    assert row.reason_text(hangs).endswith("still at its contact")
 
 
 # --- severity ------------------------------------------------------------------------------

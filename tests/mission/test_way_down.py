@@ -214,7 +214,7 @@ def test_the_supervisors_word_has_no_age(bit: int) -> None:
     [
         (0.0, Phase.PERCHED, "hanging"),
         (0.08, Phase.PERCHED, "hanging"),  # as far as an old estimate may have drifted
-        (0.2, Phase.ABORTED, "something holds it"),
+        (0.2, Phase.ABORTED, "something holds the vehicle"),
         (0.6, Phase.LANDED, "motors off"),  # a height that stood still above the floor
     ],
 )

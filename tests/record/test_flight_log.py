@@ -139,7 +139,7 @@ def test_the_recording_is_found_by_the_log_the_packed_log_and_itself(name: str) 
 def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -> None:
     """As it ends, and as its log is read: the simulated camera is the scenario's."""
     landing = Event(
-        1.0, EventKind.PHASE, "camera seems turned", Phase.LANDING, "mounting",
+        1.0, EventKind.PHASE, "the camera seems to be rotated", Phase.LANDING, "mounting",
         claims=Claim.PROFILE_SUSPECT,
     )  # fmt: skip
     found = Findings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
@@ -147,7 +147,14 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     log.event(landing)
     ended = log.close(
         FlightReport(
-            Phase.LANDED, Outcome.SAFETY, "camera seems turned", 0, 9.0, False, (landing,), found
+            Phase.LANDED,
+            Outcome.SAFETY,
+            "the camera seems to be rotated",
+            0,
+            9.0,
+            False,
+            (landing,),
+            found,
         )
     )
     assert ended is not None

@@ -355,14 +355,14 @@ FULL_WEIGHT_HANGS = Condition(
 """The whole weight hangs: the motors stand still, and nothing slips."""
 HANGING = Condition("hanging", _is_hanging, depends_on=Dependency.POSITION)
 """Something holds the vehicle up, off the floor."""
-MOTORS_STOPPED = Condition("down", _has_stopped_motors, depends_on=Dependency.TELEMETRY)
+MOTORS_STOPPED = Condition("motors stopped", _has_stopped_motors, depends_on=Dependency.TELEMETRY)
 """The motors are off."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=Dependency.POSITION)
 """The vehicle stands on the floor."""
 BLOCKED = Condition("blocked", _is_blocked)
 """The vehicle presses against an obstacle below its setpoint."""
 SUPPORTED_BY_IMU = Condition(
-    "carried or pressed, by feel",
+    "supported, by accelerometer and thrust",
     _is_supported_by_imu,
     is_phase_independent=True,
     depends_on=Dependency.TELEMETRY,

@@ -17,7 +17,7 @@ MAX_VELOCITY_DISAGREEMENT_MPS = 0.15
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
 TARGET_BELOW_M = 0.3
 """Distance below the vehicle that excludes a target on the ceiling, m."""
-NO_CORRECTION_TEXT = "the estimate's variance only grows; is the positioning system gone?"
+NO_CORRECTION_TEXT = "the estimate's variance keeps growing; the positioning system may have failed"
 
 
 def _has_velocity_disagreement(b: Belief) -> bool:
@@ -41,12 +41,12 @@ def _is_battery_low(b: Belief) -> bool:
 TILTED = Condition("tilted", _is_tilted, is_phase_independent=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
 LATERAL_BLOW = Condition[Belief](
-    "knocked aside",
+    "lateral blow",
     lambda b: b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_DRAUGHT_SPEED_MPS,
 )
 """The vehicle moves laterally faster than any draught moves it."""
 VARIANCE_TOO_LARGE = Condition[Belief](
-    "unsure", lambda b: b.is_variance_too_large, is_phase_independent=True
+    "variance too large", lambda b: b.is_variance_too_large, is_phase_independent=True
 )
 """The variance of the state estimate is too large for position control."""
 TARGET_BELOW = Condition[Belief](
@@ -56,7 +56,7 @@ TARGET_BELOW = Condition[Belief](
 BATTERY_LOW = Condition("battery low", _is_battery_low, is_phase_independent=True)
 """The battery is low under load."""
 VELOCITY_DISAGREES = Condition(
-    "moves otherwise than its positions", _has_velocity_disagreement, is_phase_independent=True
+    "velocity disagrees", _has_velocity_disagreement, is_phase_independent=True
 )
 """The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (
@@ -79,11 +79,11 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     if not maneuver.is_camera_guided:
         return ""
     if b.telemetry_age_s > safety.telemetry_hold_s:
-        return f"telemetry is {b.telemetry_age_s:.1f} s old"
+        return f"the newest telemetry is {b.telemetry_age_s:.1f} s old"
     if b.first_jump_s is not None:
         return "the state estimate jumped"
     if b.is_variance_too_large:
-        return f"the state estimate is unsure ({variance_text(b)})"
+        return f"the state estimate is uncertain ({variance_text(b)})"
     if b.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {b.obs.loop_late_s:.1f} s late"
     if maneuver.needs_pictures and b.obs.camera_age_s > safety.camera_hold_s:
@@ -94,13 +94,13 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 def position_loss_text(b: Belief) -> str:
     """Return for how long no external position was sent, and why."""
     if b.is_displaced:
-        return "pushed aside while the target was not seen"
+        return "pushed sideways while the target was out of view"
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
         why = why or NO_CORRECTION_TEXT
     if b.obs.position_beside_m > 0.0:
-        why = f"by the target the vehicle is {b.obs.position_beside_m:.2f} m beside its estimate"
-    text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
+        why = f"the target shows the vehicle {b.obs.position_beside_m:.2f} m from its estimate"
+    text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
     return f"{text}: {why}" if why else text
 
 
@@ -113,7 +113,7 @@ def variance_text(b: Belief) -> str:
         what = "height" if b.profile.positioning.source.is_deck else "position"
         variance, most, unit = b.position_variance_m2, safety.flight_variance_m2, "m^2"
     if math.isinf(variance):
-        return f"the {what}'s variance is not known"
+        return f"the {what}'s variance is unknown"
     return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"
 
 

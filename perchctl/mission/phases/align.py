@@ -55,14 +55,14 @@ ALIGN = PhaseDefinition(
             {Phase.ALIGN},
             lambda c: not c.belief.target.is_tracked,
             Phase.SEARCH,
-            "target lost in alignment",
+            "target lost during the alignment",
             Severity.HOLD,
         ),
         back_off_row(
             "align-timeout",
             {Phase.ALIGN},
             lambda c: c.in_phase_s - c.state.waited_s > c.planner.align.timeout_s,
-            "alignment took too long",
+            "the alignment took too long",
         ),
         land_row(
             "too-little-left",

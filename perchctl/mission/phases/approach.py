@@ -68,7 +68,7 @@ APPROACH = PhaseDefinition(
             "approach-timeout",
             {Phase.APPROACH},
             lambda c: c.in_phase_s > c.planner.approach_timeout_s,
-            lambda c: f"take-off reached only {c.belief.height_m:.2f} m",
+            lambda c: f"the take-off reached only {c.belief.height_m:.2f} m",
         ),
     ),
 )

@@ -109,7 +109,7 @@ ASCEND = PhaseDefinition(
             "ascend-lost",
             {Phase.ASCEND},
             _is_target_lost,
-            "target lost in ascent",
+            "target lost during the ascent",
         ),
         Transition(
             "outside-cone",
@@ -126,7 +126,7 @@ ASCEND = PhaseDefinition(
                 c.in_phase_s > c.planner.ascend.timeout_s
                 or c.held_s(NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
             ),
-            "does not settle under the target",
+            "did not settle under the target",
         ),
         Transition(
             "settled",

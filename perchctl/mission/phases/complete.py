@@ -78,7 +78,7 @@ COMPLETE = PhaseDefinition(
             lambda c: (
                 c.state.stopped_s is None and c.in_phase_s > c.planner.complete.release_timeout_s
             ),
-            "the thrust could not be released",
+            "the release was not completed in time",
             claims=Claim.STILL_ATTACHED,
         ),
         Transition(
@@ -93,13 +93,15 @@ COMPLETE = PhaseDefinition(
             "fell-unseen",
             {Phase.COMPLETE},
             is_release_monitored,
-            "it is not known to hang where it did",
+            "it is unknown whether the vehicle still hangs",
         ),
         land_row(
             "not-stopped",
             {Phase.COMPLETE},
             lambda c: time_since_stop_s(c) > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S,
-            lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
+            lambda c: (
+                f"motors stopped, but telemetry still reports a thrust of {c.telemetry.thrust:.0f}"
+            ),
         ),
     ),
 )

@@ -43,7 +43,7 @@ ESTIMATE = PhaseDefinition(
                 or c.in_phase_s > c.planner.estimate.timeout_s
             ),
             Phase.SEARCH,
-            "the target's pose does not settle",
+            "target lost, or its pose did not settle",
             Severity.HOLD,
         ),
         Transition(

@@ -48,11 +48,14 @@ def unconfirmed_reason(c: Context) -> str:
     if age_s > FRESH_S:
         cause = f"the newest telemetry is {age_s:.1f} s old"
     elif c.telemetry.has_bit(FLYING) or c.telemetry.thrust >= 1:
-        cause = "by its telemetry the vehicle still flies"
+        cause = "telemetry still shows the vehicle flying"
     elif age_s > proof_age_s:
-        cause = f"the telemetry is {age_s:.2f} s old, and at most {proof_age_s:g} s old is proof"
+        cause = (
+            f"the newest telemetry is {age_s:.2f} s old, too old to confirm a landing (at most "
+            f"{proof_age_s:g} s)"
+        )
     else:
-        cause = "by its telemetry the vehicle does not rest yet"
+        cause = "telemetry does not yet show the vehicle at rest"
     return f"the landing was not confirmed in time: {cause}"
 
 
@@ -85,21 +88,21 @@ LANDING = PhaseDefinition(
                 + (
                     ""
                     if c.belief.dead_reckoned_s is None
-                    else "; it was felt to come down to the floor"
+                    else "; the height was dead-reckoned during the descent"
                 )
             ),
         ),
         give_up_row(
             "held-elsewhere",
             make_rest_predicate(RestState.HELD),
-            "motors off; something holds it where its estimate has no target: look before you "
-            "touch it",
+            "motors off; something holds the vehicle away from the target: look before you touch "
+            "it",
         ),
         give_up_row(
             "hangs-or-stands",
             lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_LOOK_DURATION_S,
-            "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
-            "whether it hangs or stands: look before you touch it",
+            "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
+            "whether the vehicle hangs or stands: look before you touch it",
         ),
         give_up_row(
             "landing-timeout",

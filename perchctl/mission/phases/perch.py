@@ -62,7 +62,7 @@ def contact_reason(c: Context) -> str:
     """Return what proves the contact, and its offset."""
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
-        by = f"acceleration and thrust, {position_loss_text(c.belief)}"
+        by = f"acceleration and thrust ({position_loss_text(c.belief)})"
     return f"contact proven by {by}; {contact_offset(c.belief).text}"
 
 
@@ -86,14 +86,14 @@ PERCH = PhaseDefinition(
             {Phase.PERCH},
             lambda c: c.belief.is_target_positioned and c.belief.position_age_s > MAX_BLIND_PRESS_S,
             lambda c: (
-                f"no contact {c.belief.position_age_s:.1f} s after the last sight of the target"
+                f"no contact {c.belief.position_age_s:.1f} s after the last sighting of the target"
             ),
         ),
         back_off_row(
             "knocked-aside",
             {Phase.PERCH},
             lambda c: c.held_s(LATERAL_BLOW) >= LATERAL_BLOW_DWELL_S,
-            "pushed aside under the target",
+            "pushed sideways under the target",
         ),
         back_off_row(
             # The timeout includes the loop's lateness, since the next tick may be as late as this
@@ -101,7 +101,7 @@ PERCH = PhaseDefinition(
             "no-contact",
             {Phase.PERCH},
             lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,
-            "no proof of contact",
+            "contact not proven in time",
         ),
     ),
 )

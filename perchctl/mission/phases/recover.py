@@ -125,13 +125,13 @@ def has_recovered(c: Context) -> bool:
 def unsteady_reason(c: Context) -> str:
     """Return which observations kept the vehicle from being steady; their cause is unknown."""
     b, setpoint = c.belief, c.state.setpoint
-    seen = [f"it moves at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
+    seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:
         x_m, y_m, _ = c.telemetry.position_m
         lateral_offset_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
-        seen.append(f"it is {lateral_offset_m:.2f} m beside its setpoint")
+        seen.append(f"{lateral_offset_m:.2f} m from its setpoint")
     if b.contact_z_m is not None:
-        seen.append("it has not come away from its contact")
+        seen.append("still at its contact")
     text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
     return f"{text}: {', '.join(seen)}" if seen else text
 
@@ -157,7 +157,7 @@ RECOVER = PhaseDefinition(
             {Phase.RECOVER},
             has_recovered,
             Phase.ESTIMATE,
-            "steady again, trying once more",
+            "steady again: starting another attempt",
         ),
         land_row(
             "recover-timeout",
