@@ -8,6 +8,7 @@ allowed and what to do, in one sentence.
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from decimal import Decimal
 
 MOST_DECIMALS = 9
@@ -24,13 +25,30 @@ def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]
     return texts
 
 
+@dataclass(frozen=True)
+class Problem:
+    """A problem. `found`: the reading and its limit; `advice`: what to do."""
+
+    found: str
+    advice: str
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.found}: {self.advice}"
+
+
 class PerchError(Exception):
-    """Base of all reported failures; the process ends with its `exit_code`."""
+    """Base of all reported failures; the process ends with its `exit_code`.
+
+    The message is `found`, followed by `advice`, which says what to do, if it is known separately.
+    """
 
     exit_code = 1
     meaning = "other failure"
-    advice = ""
-    """The end of the message that says what to do, where it is known apart."""
+
+    def __init__(self, found: str = "", advice: str = "", *, separator: str = "; ") -> None:
+        super().__init__(f"{found}{separator}{advice}" if advice else found)
+        self.found, self.advice = found, advice
 
 
 class UsageError(PerchError):

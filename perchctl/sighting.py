@@ -21,7 +21,7 @@ from perchctl.camera import (
     FrameSource,
     WrappedSource,
     check_size,
-    mirrored_note,
+    mirrored_problem,
     open_camera,
     parse_source,
     unmirror_frame,
@@ -255,7 +255,7 @@ class Tracker:
         if output.detections.markers and not output.poses:
             yield _NO_POSE
         if output.detections.mirrored:
-            yield mirrored_note(self._config)
+            yield mirrored_problem(self._config).sentence
         if output.disagreeing_frames >= self._disagreement_frames:
             yield _DISAGREE
 

@@ -11,7 +11,7 @@ from .source import FrameSource as FrameSource
 from .source import NewestSlot as NewestSlot
 from .source import WrappedSource as WrappedSource
 from .source import check_size as check_size
-from .source import mirrored_note as mirrored_note
+from .source import mirrored_problem as mirrored_problem
 from .source import profile_record as profile_record
 from .source import unmirror_frame as unmirror_frame
 from .source import without_password as without_password

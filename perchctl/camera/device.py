@@ -16,6 +16,7 @@ from perchctl.camera.source import Clock, LiveSource, describe_error
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 
+PLUG_IN = "plug in the receiver or camera"
 LOST_AFTER_FAILURES = 25
 READ_RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
@@ -29,13 +30,14 @@ def open_video_capture(
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
-        raise NotFound(f"camera:{number} was not found; {_there(find_cameras())}")
+        raise NotFound(f"camera:{number} was not found; {_there(find_cameras())}", PLUG_IN)
     capture = cv2.VideoCapture(number, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
     if not capture.isOpened():
         capture.release()
         raise NotFound(
-            f"camera:{number} exists but cannot be opened; close other programs that use "
-            f"it, and check your permission to open /dev/video{number}"
+            f"camera:{number} exists but cannot be opened",
+            f"close other programs that use it, and check your permission to open "
+            f"/dev/video{number}",
         )
     configure_capture(capture, size_px, config)
     return capture
@@ -93,7 +95,9 @@ class DeviceSource(LiveSource):
                     self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1
                 if failures >= LOST_AFTER_FAILURES:
-                    raise NotFound(f"{self._name} {why}; plug it in again, or name another camera")
+                    raise NotFound(
+                        f"{self._name} {why}", "plug it in again, or name another camera"
+                    )
                 self._stop.wait(self.retry_s)
             return "closed"
         finally:
@@ -174,13 +178,11 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
         return fitting[0].number
     if fitting:
         raise InvalidValue(
-            f"camera:{wanted} matches {len(fitting)} cameras: "
-            f"{', '.join(map(str, fitting))}; write more of the name, the path, or the "
-            "number"
+            f"camera:{wanted} matches {len(fitting)} cameras: {', '.join(map(str, fitting))}",
+            "write more of the name, the path, or the number",
         )
-    raise NotFound(f"camera:{wanted} was not found; {_there(known)}")
+    raise NotFound(f"camera:{wanted} was not found; {_there(known)}", PLUG_IN)
 
 
 def _there(known: list[ConnectedCamera]) -> str:
-    there = f"there are {', '.join(map(str, known))}" if known else "this computer has no camera"
-    return f"{there}; plug in the receiver or camera"
+    return f"there are {', '.join(map(str, known))}" if known else "this computer has no camera"

@@ -38,7 +38,7 @@ class RecordedSource:
         self._ahead = self._read()  # one picture ahead, so that size and end are known in time
         if self._ahead is None:
             raise InvalidValue(
-                f"{name} holds no readable frame; check that it is a picture or video file"
+                f"{name} holds no readable frame", "check that it is a picture or video file"
             )
         image = self._ahead[0]
         self.size_px = (image.shape[1], image.shape[0])
@@ -131,7 +131,7 @@ class ImagesSource(RecordedSource):
         try:
             return decode_picture(path.read_bytes()), t_s
         except (OSError, ValueError) as error:
-            raise InvalidValue(f"{path} cannot be used ({error}); remove or replace it") from None
+            raise InvalidValue(f"{path} cannot be used ({error})", "remove or replace it") from None
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:

@@ -211,7 +211,7 @@ class RtspSource(LiveSource):
             name = type(error).__name__
             reason = str(_REASONS.get(name) or getattr(error, "strerror", None) or name)
             if name in _FINAL:
-                raise NotFound(f"{self._name}: {reason}") from None
+                raise NotFound(f"{self._name}: {reason}", _ADVICE.get(name, "")) from None
             return reason
 
     def _read(self, stream: Any) -> str:
@@ -256,10 +256,10 @@ _FINAL = (
 )
 """PyAV's errors that another attempt would not mend, by name."""
 _REASONS = {
-    "HTTPUnauthorizedError": "it rejects this user name and password (401); write them as in "
-    "rtsp://NAME:PASSWORD@HOST/PATH",
+    "HTTPUnauthorizedError": "it rejects this user name and password (401)",
     "OSError": "the host cannot be reached, or its name cannot be resolved",
     "ExitError": "no answer in time, or no video in the stream",
     "InvalidDataError": "no answer in time, or not an RTSP answer",
 }
 """In the place of FFmpeg's own, which say less."""
+_ADVICE = {"HTTPUnauthorizedError": "write them as in rtsp://NAME:PASSWORD@HOST/PATH"}

@@ -89,12 +89,12 @@ def parse_source(text: str) -> SourceName:
         return SourceName(scheme, place)
     if name.scheme:
         raise InvalidValue(
-            f"camera source {shown!r} is unknown; allowed are {REAL}, sim:, or my_module:MyCamera "
-            f"with my_module in {Path.cwd()}"
+            f"camera source {shown!r} is unknown",
+            f"allowed are {REAL}, sim:, or my_module:MyCamera with my_module in {Path.cwd()}",
         )
     raise NotFound(
-        f"{shown} does not exist; a source is a video, a picture, a folder of pictures, "
-        f"or one of {REAL}"
+        f"{shown} does not exist",
+        f"a source is a video, a picture, a folder of pictures, or one of {REAL}",
     )
 
 
@@ -108,8 +108,8 @@ def _check_address(name: SourceName) -> None:
     if not is_right:
         raise InvalidValue(
             f"camera source {str(name)!r} has no valid host and port, as in "
-            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535; in a user "
-            "name or password write @ as %40, : as %3A and / as %2F"
+            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535",
+            "in a user name or password write @ as %40, : as %3A and / as %2F",
         )
 
 
@@ -180,8 +180,8 @@ def _live(
     if name.scheme in STREAMS:
         return STREAMS[name.scheme](name.spec, latency_s, clock)
     raise InvalidValue(
-        f"camera source {str(name)!r} is not a camera or file; allowed are {REAL}, and "
-        "sim: with the link sim://"
+        f"camera source {str(name)!r} is not a camera or file",
+        f"allowed are {REAL}, and sim: with the link sim://",
     )
 
 

@@ -14,7 +14,7 @@ from urllib.error import URLError
 import numpy as np
 
 from perchctl.camera.health import Grey, same_bytes
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, Problem, TimedOut
 from perchctl.extensions import error_at
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame, to_grey
@@ -106,8 +106,8 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
         return
     raise InvalidValue(
         f"{source} delivers frames of {size_px[0]}x{size_px[1]} px, but the calibration was made "
-        f"at {camera.size_px[0]}x{camera.size_px[1]} px; set the camera to that size or "
-        f"calibrate it at this one"
+        f"at {camera.size_px[0]}x{camera.size_px[1]} px",
+        "set the camera to that size or calibrate it at this one",
     )
 
 
@@ -184,9 +184,8 @@ class LiveSource:
         """The error of a source that has given no frame within `timeout_s`."""
         finding, advice = self._finding_and_advice()
         late = f"{self._name}: no first frame within {timeout_s:g} s"
-        error = TimedOut(": ".join(filter(None, (late, finding, advice))))
-        error.advice = advice
-        return error
+        found = f"{late}: {finding}" if finding else late
+        return TimedOut(found, advice, separator=": ")
 
     def _finding_and_advice(self) -> tuple[str, str]:
         """What has been seen since the last picture, and what to do about it."""
@@ -243,10 +242,9 @@ class LiveSource:
                 self._found = (reason, self.unreached_advice if is_unreached else "")
             failed = 0 if self._arrived > before else failed + 1
             if failed >= self.max_failures:
-                why = ": ".join(filter(None, self._finding_and_advice()))
-                self._fail(
-                    TimedOut(f"{self._name} delivered no picture in {failed} attempts: {why}")
-                )
+                finding, advice = self._finding_and_advice()
+                found = f"{self._name} delivered no picture in {failed} attempts: {finding}"
+                self._fail(TimedOut(found, advice, separator=": "))
                 return
             self._stop.wait(self.reconnect_wait_s)
 
@@ -408,12 +406,12 @@ class GuardedSource:
         self._source.close()
 
 
-def mirrored_note(config: CameraConfig) -> str:
-    """A sentence: the picture is mirrored, and how to correct the profile with `config`."""
+def mirrored_problem(config: CameraConfig) -> Problem:
+    """The problem that the picture is mirrored, and how to correct the profile with `config`."""
     advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror it, so remove camera.mirrored from the profile"
-    return f"the picture is mirrored: {advice}"
+    return Problem("the picture is mirrored", advice)
 
 
 def unmirror_frame(frame: Frame) -> Frame:

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from perchctl.camera import VERDICT_TEXTS, mirrored_note
+from perchctl.camera import mirrored_problem
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
@@ -59,24 +59,20 @@ _RESTART, _NETWORK = (
 """For sources of any other kind."""
 _LIGHT = "add light, lengthen the exposure, or take off the lens cap"
 _ADVICE = {
-    VERDICT_TEXTS["frozen"]: _RESTART,
-    VERDICT_TEXTS["snow"]: "set the receiver to the camera's channel, and switch the camera on",
-    VERDICT_TEXTS["uniform"]: "uncover the lens, and switch the camera on",
-    VERDICT_TEXTS["dark"]: _LIGHT,
+    "frozen": _RESTART,
+    "snow": "set the receiver to the camera's channel, and switch the camera on",
+    "uniform": "uncover the lens, and switch the camera on",
+    "dark": _LIGHT,
 }
 
 
-def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
-    """The rows of a camera that fails: the first failed, the others skipped."""
-    found, semicolon, advice = str(error).rpartition("; ")
-    if error.advice:
-        found, advice = str(error).removesuffix(f": {error.advice}"), error.advice
-    elif not semicolon:
-        found, advice = str(error), "see docs/check.md"
-        if found.startswith("camera:"):
-            advice = "see docs/check.md; perchctl check --cameras lists the cameras"
+def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list[Row]:
+    """The rows of a camera `source` that fails: the first failed, the others skipped."""
+    advice = error.advice or "see docs/check.md"
+    if not error.advice and source.startswith("camera:"):
+        advice += "; perchctl check --cameras lists the cameras"
     names = ("size", *picture_row_names(profile))
-    return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture arrives")]
+    return [Row("camera", *failed(error.found, advice)), *skipped_rows(names, "no picture arrives")]
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
@@ -153,13 +149,14 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good pictures{repeated}")
-    if (note := mirrored_note(profile.camera)) in rehearsal.problems:
-        found, _, advice = note.partition(": ")
-        return failed(found, advice)
-    text, count = rehearsal.problems.most_common(1)[0]
+    if any(problem.kind == "mirrored" for problem in rehearsal.problems):
+        mirrored = mirrored_problem(profile.camera)
+        return failed(mirrored.found, mirrored.advice)
+    problem, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
-    found = f"{count} of {rehearsal.pictures}: {text}"
-    return limits_finding(share, 0.05, 0.5, found, _ADVICE.get(text, "see docs/check.md"))
+    found = f"{count} of {rehearsal.pictures}: {problem.text}"
+    advice = _ADVICE.get(problem.kind or "", "see docs/check.md")
+    return limits_finding(share, 0.05, 0.5, found, advice)
 
 
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -188,12 +185,10 @@ def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _print(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    verdict = rehearsal.print_verdict
-    if verdict is None:
+    if rehearsal.prints is None:
         return skipped("both markers must be in view", "hold the vehicle closer to the target")
-    wrong, text = verdict
-    found, _, advice = text.partition("; ")
-    return failed(found, advice) if wrong else passed(found)
+    verdict = rehearsal.prints.verdict()
+    return failed(verdict.found, verdict.advice) if verdict.is_wrong else passed(verdict.found)
 
 
 PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {

@@ -30,6 +30,15 @@ TakeTelemetry = Callable[[], list[Telemetry]]
 """Gives what came since the last time."""
 
 
+@dataclass(frozen=True)
+class PictureProblem:
+    """What is wrong with a picture. `kind`: what `FrameHealth` calls it, or ``mirrored``; None for
+    any other problem."""
+
+    text: str
+    kind: str | None = None
+
+
 @dataclass(eq=False)
 class Rehearsal:
     """Result of a rehearsal.
@@ -45,7 +54,7 @@ class Rehearsal:
         target: the final estimate; None if the target was not in view.
         target_places: time and place of the target, m, in each picture that measured it since the
             vehicle came to rest.
-        print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
+        prints: the comparison of both markers; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
         scheme: the kind of source, as ``camera``, which the advice depends on.
     """
@@ -56,7 +65,7 @@ class Rehearsal:
     processing_s: list[float] = field(default_factory=list)
     tick_delays_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
-    problems: Counter[str] = field(default_factory=Counter)
+    problems: Counter[PictureProblem] = field(default_factory=Counter)
     newest_outputs: list[tuple[Frame, PipelineOutput]] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
@@ -64,7 +73,7 @@ class Rehearsal:
     silent_s: float = 0.0
     target: TargetEstimate | None = None
     target_places: list[tuple[float, Array]] = field(default_factory=list)
-    print_verdict: tuple[bool, str] | None = None
+    prints: PrintCheck | None = None
     blur_px: float | None = None
     scheme: str = ""
 
@@ -142,7 +151,7 @@ def rehearse(
     done.silent_s = end_s - (done.arrivals[-1][1] if done.arrivals else start_s)
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
-    done.print_verdict = prints.error_and_text() if prints.has_enough_frames else None
+    done.prints = prints if prints.has_enough_frames else None
     done.blur_px = _blur_px(done.newest_outputs, pipeline)
     return done
 
@@ -161,7 +170,7 @@ def _note(
     done.pictures += 1
     done.arrivals.append((frame.index, frame.t_arrival_s))
     if senses.camera_problem is not None:
-        done.problems[senses.camera_problem] += 1
+        done.problems[PictureProblem(senses.camera_problem, senses.problem_kind)] += 1
     output = senses.output
     newest = senses.history.newest
     stands = newest is not None and GroundCriteria(newest, senses.profile).stands

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, ParamSpec
 
-from perchctl.flight import Problem
+from perchctl.errors import Problem
 
 
 class Verdict(StrEnum):

@@ -82,7 +82,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
             source = open_camera(spec, time.monotonic, asked, size_px=size_px)
             scheme = parse_source(options.source).scheme
         except PerchError as error:
-            yield from camera.failed_camera_rows(error, options.profile)
+            yield from camera.failed_camera_rows(error, options.source, options.profile)
         else:
             stack.callback(source.close)
             yield Row("camera", *passed(f"{shown} delivers pictures"))

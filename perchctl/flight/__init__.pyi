@@ -1,6 +1,5 @@
 from .clock import WallClock as WallClock
 from .criteria import GroundCriteria as GroundCriteria
-from .criteria import Problem as Problem
 from .inputs import FlightInputs as FlightInputs
 from .lockstep import fly_lockstep as fly_lockstep
 from .lockstep import lockstep_feed as lockstep_feed

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.errors import distinct_texts
+from perchctl.errors import Problem, distinct_texts
 from perchctl.geometry import (
     nearest_axis,
     rotation_from_quaternion,
@@ -70,18 +70,6 @@ _FORBIDDEN = (
     (DECK_FAULT, "reports a deck fault", "check the deck and restart it"),
     (FLYING, "is already flying", "land it first"),
 )
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A problem on the ground. `found`: the reading and its limit; `advice`: what to do."""
-
-    found: str
-    advice: str
-
-    @property
-    def sentence(self) -> str:
-        return f"{self.found}: {self.advice}"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
+from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_problem
 from perchctl.mission import (
     ExternalPositions,
     FrameRecord,
@@ -38,6 +38,9 @@ from perchctl.vision import (
     TargetEstimate,
 )
 
+DOUBTFUL_KINDS = ("dark", "uniform")
+"""Kinds of pictures that are searched all the same: a dark target may still be seen, and a bare
+ceiling looks like an empty screen."""
 HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
 
 
@@ -90,7 +93,10 @@ class FlightInputs:
     repeated: bool = False  # this tick's frame is the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
+    # What `FrameHealth` calls the picture that is the camera's problem, or mirrored; None: another.
+    problem_kind: str | None = None
     frames: int = 0
+    _frame_kind: str = "ok"  # of the newest frame
     _note: str | None = None
 
     def __post_init__(self) -> None:
@@ -148,15 +154,19 @@ class FlightInputs:
             if problem is None and self.source.finished:
                 problem = f"{self.source.describe()}{self.ENDED_TEXT}"
             if problem is not None:
-                self.camera_problem = problem
+                self.camera_problem, self.problem_kind = problem, None
             return
         if self.frames == 0:  # a source of another size; a single such picture is only torn
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
+        self._frame_kind = "ok"
         rejection = problem or self._rejection(frame, now_s)
-        self.repeated = rejection == VERDICT_TEXTS["repeated"]
+        self.repeated = self._frame_kind == "repeated"
+        is_doubtful = self._frame_kind in DOUBTFUL_KINDS
         if rejection is not None:
             if not self.repeated:  # else nothing is new, the camera's problem neither
                 self.camera_problem = rejection
+                is_unusable = self._frame_kind != "ok" and not is_doubtful
+                self.problem_kind = self._frame_kind if is_unusable else None
             return
         self.last_good_frame_s = now_s
         self.frames += 1
@@ -166,8 +176,11 @@ class FlightInputs:
                     positioning.add_pose(
                         perception.state.measured.most_certain_pose, self.history, now_s
                     )
-        mirrored = perception.is_mirrored
-        self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
+        self.camera_problem = self._note
+        self.problem_kind = self._frame_kind if is_doubtful else None
+        if perception.is_mirrored:
+            self.camera_problem = mirrored_problem(self.profile.camera).sentence
+            self.problem_kind = "mirrored"
 
     @property
     def _positioning(self) -> TargetPositioning | None:
@@ -260,8 +273,8 @@ class FlightInputs:
                 self.taken.frame, checksum=zlib.crc32(np.ascontiguousarray(frame.image).data)
             )
             self.taken = replace(self.taken, frame=seen)
-        # A dark target may still be seen, and a bare ceiling looks like an empty screen.
-        self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
+        self._frame_kind = kind
+        self._note = VERDICT_TEXTS[kind] if kind in DOUBTFUL_KINDS else None
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]
         t_s = self.perception.exposure_s(frame)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from perchctl.camera import FrameSource, mirrored_note
+from perchctl.camera import FrameSource, mirrored_problem
 from perchctl.errors import Interrupted, NotFound, SafetyAbort
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import GroundCriteria, RestCheck
@@ -167,7 +167,7 @@ def _wait_until_ready(
         refuse_wrong_positions(feed, newest, parts.profile, now_s, at_rest)
         turns.report_waiting_turn(inputs, now_s, feed)
         if inputs.perception.is_mirrored:
-            raise SafetyAbort(mirrored_note(parts.profile.camera))
+            raise SafetyAbort(mirrored_problem(parts.profile.camera).sentence)
         if parts.profile.safety.land_on_log_error and (problem := watchers.problem):
             raise SafetyAbort(
                 f"flight log: {problem}, and safety.land_on_log_error is set: not flying"

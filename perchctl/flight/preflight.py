@@ -9,11 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from perchctl.errors import SafetyAbort, TimedOut
+from perchctl.errors import Problem, SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
     REST_S,
     GroundCriteria,
-    Problem,
     RestCheck,
     estimate_problem,
     feed_name,

@@ -84,6 +84,18 @@ def size_ratio(
     return side_m / target.small.side_m, bias
 
 
+@dataclass(frozen=True)
+class PrintVerdict:
+    """What the ratio of both markers says about the print. `advice` is empty unless it is wrong."""
+
+    found: str
+    advice: str = ""
+
+    @property
+    def is_wrong(self) -> bool:
+        return bool(self.advice)
+
+
 @dataclass(eq=False)
 class PrintCheck:
     """The ratio of the two markers' apparent sizes over the frames that show both."""
@@ -112,11 +124,11 @@ class PrintCheck:
         """True when enough frames showed both markers."""
         return len(self._ratios) >= MIN_FRAMES
 
-    def error_and_text(self) -> tuple[bool, str]:
-        """True if the median ratio shows a print error beyond noise and bias (False for too few
-        frames), and a sentence on the ratio."""
+    def verdict(self) -> PrintVerdict:
+        """Judge the median ratio: wrong if the error is beyond noise and bias; not wrong for too
+        few frames."""
         if not self.has_enough_frames:
-            return False, (
+            return PrintVerdict(
                 f"print not judged: both markers were seen in only {len(self._ratios)} frames "
                 f"of {MIN_FRAMES} needed"
             )
@@ -132,9 +144,9 @@ class PrintCheck:
             f"says {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
         )
         if abs(off) <= max(SIGMAS * total, MIN_ERROR):
-            return False, f"print correct within the noise: {ratio_text}"
-        return True, (
-            f"print error: {ratio_text}; measure both black squares and write them to the "
-            "profile with perchctl make-target measured --measured-large MM "
-            "--measured-small MM"
+            return PrintVerdict(f"print correct within the noise: {ratio_text}")
+        return PrintVerdict(
+            f"print error: {ratio_text}",
+            "measure both black squares and write them to the profile with perchctl make-target "
+            "measured --measured-large MM --measured-small MM",
         )

@@ -18,10 +18,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import VERDICT_TEXTS
 from perchctl.check import Row, Verdict, camera
 from perchctl.check import profile as of_profile
-from perchctl.check.rehearsal import Rehearsal, rehearse
+from perchctl.check.rehearsal import PictureProblem, Rehearsal, rehearse
 from perchctl.check.row import Finding, evaluate_row
 from perchctl.errors import NotFound, TimedOut
 from perchctl.faults.edges import CameraFault, FaultyCamera
@@ -188,7 +187,7 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("picture age", "warn", {"ages_s": [0.3] * 20}),
     ("picture age", "fail", {"ages_s": [0.5] * 20}),
     ("picture age", "skipped", {"live": False}),
-    ("pictures", "warn", {"problems": Counter({VERDICT_TEXTS["snow"]: 2})}),
+    ("pictures", "warn", {"problems": Counter({PictureProblem("snow", "snow"): 2})}),
     ("pictures", "pass", {"repeats": 100}),
     ("focus", "warn", {"blur_px": 2.0}),
     ("target", "warn", {"target_pictures": 3, "target": None}),
@@ -227,16 +226,16 @@ def test_what_a_camera_delivers_otherwise_makes_its_row(
     assert words in finding.found
 
 
-@pytest.mark.parametrize(("text", "advice"), [
-    ("camera:7 was not found; there are camera:0; plug in the camera", "plug in the camera"),
-    ("http://x: no answer", "see docs/check.md"),
-    ("camera:0 cannot be opened", "--cameras lists"),
+@pytest.mark.parametrize(("source", "error", "advice"), [
+    ("camera:7", NotFound("it was not found; there is none", "plug it in"), "plug it in"),
+    ("http://x", NotFound("no answer"), "see docs/check.md"),
+    ("camera:0", NotFound("it cannot be opened"), "--cameras lists"),
 ])  # fmt: skip
-def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
-    first, *rest = camera.failed_camera_rows(NotFound(text), PROFILE)
-    assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
+def test_a_missing_camera_skips_the_rest(source: str, error: NotFound, advice: str) -> None:
+    first, *rest = camera.failed_camera_rows(error, source, PROFILE)
+    assert (first.name, first.verdict, first.found) == ("camera", Verdict.FAIL, error.found)
     assert advice in first.advice
-    assert text.startswith("camera:") or "--cameras" not in first.advice
+    assert source == "camera:0" or "--cameras" not in first.advice
     assert {r.verdict for r in rest} == {Verdict.SKIPPED}
 
 
@@ -254,10 +253,12 @@ def test_the_advice_fits_the_kind_of_source(scheme: str, gone: str, lossy: str) 
 
 
 def test_the_advice_of_an_error_is_the_row_s() -> None:
-    error = TimedOut("aideck://x: no first frame within 8 s: connected: switch it off and on")
-    error.advice = "switch it off and on"
-    first, *_ = camera.failed_camera_rows(error, PROFILE)
-    assert first.found == "aideck://x: no first frame within 8 s: connected"
+    error = TimedOut(
+        "aideck://x: no first frame: connected", "switch it off and on", separator=": "
+    )
+    assert str(error) == "aideck://x: no first frame: connected: switch it off and on"
+    first, *_ = camera.failed_camera_rows(error, "aideck://x", PROFILE)
+    assert first.found == "aideck://x: no first frame: connected"
     assert first.advice == "switch it off and on"
 
 

@@ -247,16 +247,16 @@ def claimed(text: str) -> tuple[float, float]:
     ("scale", "wrong"), [(1.0, False), (1.001, False), (0.97, True), (1.02, True)]
 )
 def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> None:
-    named, text = checked(scale, 0.05, 60, wrong=6).error_and_text()
-    assert named is wrong
-    value, sigma = claimed(text)
+    verdict = checked(scale, 0.05, 60, wrong=6).verdict()
+    assert verdict.is_wrong is wrong
+    value, sigma = claimed(verdict.found)
     assert value == pytest.approx(scale / 6.0, abs=3.0 * sigma / 6.0 + 1e-4)
-    assert ("--measured-small" in text) is wrong
+    assert ("--measured-small" in verdict.advice) is wrong
 
 
 def test_noise_hides_a_small_error_more_frames_are_surer_and_few_say_nothing() -> None:
-    few, many = (claimed(checked(1.02, 1.0, n).error_and_text()[1])[1] for n in (10, 200))
+    few, many = (claimed(checked(1.02, 1.0, n).verdict().found)[1] for n in (10, 200))
     assert many < 0.4 * few
-    assert not checked(1.006, 0.6, 6).error_and_text()[0]
+    assert not checked(1.006, 0.6, 6).verdict().is_wrong
     assert not checked(1.05, 0.05, 2).has_enough_frames
-    assert "not judged" in checked(1.05, 0.05, 2).error_and_text()[1]
+    assert "not judged" in checked(1.05, 0.05, 2).verdict().found
