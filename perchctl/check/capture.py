@@ -32,6 +32,7 @@ from perchctl.check.row import (
     warned,
     worst_finding,
 )
+from perchctl.errors import PerchError
 from perchctl.flight import GroundCriteria
 from perchctl.geometry import Array, nearest_axis, rotation_from_rpy, rpy_from_rotation
 from perchctl.link import vehicle_uri
@@ -58,11 +59,11 @@ WILD_M = 0.1
 @dataclass(frozen=True)
 class CaptureSamples:
     """Samples of one listening period: the vehicle's telemetry, the motion capture's frames, and
-    the motion capture's problem or None."""
+    the motion capture's problem as an error, or None."""
 
     telemetry: tuple[Telemetry, ...] = ()
     frames: tuple[CaptureFrame, ...] = ()
-    problem: str | None = None
+    error: PerchError | None = None
 
     def body_poses(self, config: PositioningConfig) -> list[VehiclePose]:
         """The vehicle's poses by the motion capture, corrected for latency, oldest first."""
@@ -92,7 +93,15 @@ def collect_samples(
         if frame is not None:
             frames.append(frame)
         wait(CAPTURE_POLL_S)
-    return CaptureSamples(tuple(telemetry), tuple(frames), source.problem(clock()))
+    return CaptureSamples(tuple(telemetry), tuple(frames), _find_error(source, clock()))
+
+
+def _find_error(source: CaptureSource, now_s: float) -> PerchError | None:
+    if hasattr(source, "error"):
+        error: PerchError | None = source.error(now_s)
+        return error
+    problem = source.problem(now_s)
+    return None if problem is None else PerchError(problem)
 
 
 # --- At rest ---
@@ -101,22 +110,21 @@ def collect_samples(
 BODY_ROWS = ("body", "body place")
 
 
-def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
-    """The rows of a motion capture that cannot be opened or sends nothing; `why` is shown."""
-    found, _, advice = why.rpartition("; ")
-    if not found:
-        found, advice = (
-            why,
-            "check that it streams, that positioning.host is right, and that no firewall blocks it",
-        )
-    return [Row("capture", *failed(found, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
+def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Row]:
+    """The rows of a motion capture that cannot be opened or sends nothing."""
+    advice = error.advice or (
+        "check that it streams, that positioning.host is right, and that no firewall blocks it"
+    )
+    first = Row("capture", *failed(error.found, advice))
+    return [first, *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
 
 def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
     """Judge the samples of a motion capture taken while the vehicle stood still."""
     config = profile.positioning
     if not samples.frames:
-        return failed_capture_rows(samples.problem or f"{config.label} sends no frames", config)
+        error = samples.error or PerchError(f"{config.label} sends no frames")
+        return failed_capture_rows(error, config)
     first = Row("capture", *passed(f"{config.label} sends frames"))
     places = samples.body_poses(config)
     if not places:

@@ -93,11 +93,11 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     yield from offline_rows(options)
 
 
-MocapOrProblem = CaptureSource | str | None
+MocapOrError = CaptureSource | PerchError | None
 """An open motion capture, or why it could not be opened; None where decks do it."""
 
 
-def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrProblem:
+def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:
     config = profile.positioning
     if not config.source.is_mocap:
         return None
@@ -107,7 +107,7 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
     except UsageError:
         raise  # a library that does not load is the computer's fault, here as in `fly`
     except PerchError as error:
-        return str(error)
+        return error
     stack.callback(opened.close)
     return opened
 
@@ -122,7 +122,7 @@ class VehicleChecks:
     probe: ProbeLink
     uri: str
     profile: Profile
-    mocap: MocapOrProblem
+    mocap: MocapOrError
     scope: CheckScope
 
     def rows(self) -> Generator[Row, None, TakeTelemetry]:
@@ -131,10 +131,11 @@ class VehicleChecks:
         try:
             self.probe.connect()
         except ConnectionFailed as error:
-            found, _, advice = str(error).partition("\n")
             scheme = self.uri.partition("://")[0]
-            advice = advice or vehicle.ADDRESS_ADVICE[scheme]
-            yield Row("address", *failed(found, advice))
+            advice = vehicle.ADDRESS_ADVICE[scheme]
+            if error.advice and scheme != "sim":
+                advice = error.advice
+            yield Row("address", *failed(error.found, advice))
             yield from skipped_rows(
                 [*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer"
             )
@@ -155,7 +156,7 @@ class VehicleChecks:
         config = self.profile.positioning
         if self.mocap is None:
             return []
-        if isinstance(self.mocap, str):
+        if isinstance(self.mocap, PerchError):
             return capture.failed_capture_rows(self.mocap, config)
         seconds = self.scope.capture_s
         self.scope.announce(f"listening to {config.label} for {seconds:g} s")
@@ -194,7 +195,7 @@ class VehicleChecks:
         if mocap is None:
             self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
             return vehicle.lift_finding(vehicle.record_lift(self.probe, time.sleep, within_s))
-        if isinstance(mocap, str):
+        if isinstance(mocap, PerchError):
             return skipped(f"no {config.label}")
         self.scope.announce(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
         take = self.probe.telemetry

@@ -21,6 +21,7 @@ from perchctl.check.row import (
     warned,
     worst_finding,
 )
+from perchctl.errors import Problem
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
@@ -378,13 +379,12 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
 # --- Which vehicles answer ---
 
 
-def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
+def radio_scan_rows(uris: Sequence[str], radio_problem: Problem | None) -> list[Row]:
     """A row for the radio, and one for each vehicle that answers, from the result of
     `find_uris_and_problem`."""
     radio = passed("scanned channels 0 to 125 at 250K, 1M and 2M")
-    if radio_problem:
-        cause, _, advice = radio_problem.partition("\n")
-        radio = skipped(cause.rstrip("."), advice)
+    if radio_problem is not None:
+        radio = skipped(radio_problem.found, radio_problem.advice)
     found = [passed(f"{uri} answers") for uri in uris]
     nobody = failed(
         "no vehicle answers",

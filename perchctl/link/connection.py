@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from perchctl.errors import ConnectionFailed
+from perchctl.errors import ConnectionFailed, Problem
 from perchctl.link import internals
 from perchctl.link.crtp import Packet
 from perchctl.link.hub_driver import HubDriver
@@ -54,6 +54,7 @@ class Connection:
             cache.mkdir(parents=True, exist_ok=True)
         self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
+        self.cause = Problem("", "")  # of the newest `lost`
         self.claim = contextlib.ExitStack()
         self._settled = threading.Event()  # set when connected, or failed
         # guards the fields below; cflib is never called with it held
@@ -136,7 +137,7 @@ class Connection:
             if self.lost is None:
                 if cause is None:
                     return
-                self._give_up(cause)
+                self._give_up(Problem(cause, ""))
             self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
@@ -156,17 +157,20 @@ class Connection:
         """Record a driver's end; called in any thread, at any time."""
         with self._change:
             if number == self._number and not self._left:
-                self._give_up(readable_cause(message))
+                self._give_up(find_cause(message))
         self._settled.set()
 
     def _on_failed(self, _uri: str, message: str) -> None:
-        self.lost = readable_cause(message)
+        self._lose(find_cause(message))
         self._settled.set()
 
-    def _give_up(self, cause: str) -> None:
+    def _lose(self, cause: Problem) -> None:
+        self.cause, self.lost = cause, _cause_text(cause)
+
+    def _give_up(self, cause: Problem) -> None:
         """Close the present driver without a replacement; called with `_change` held."""
         self._number += 1
-        self.lost = cause
+        self._lose(cause)
         driver, self.cf.link = self.cf.link, _Nowhere()
         if driver is not None:
             self._closer = start_thread("perchctl-close", driver.close)
@@ -254,13 +258,15 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
                 if not answered or connection.lost is not None:
                     connection.close(farewell=False)
             if answered and connection.lost is not None:
-                raise ConnectionFailed(f"no Crazyflie at {uri}: {connection.lost}")
+                cause = connection.cause
+                found, separator = f"no Crazyflie at {uri}: {cause.found}", _separator(cause)
+                raise ConnectionFailed(found, cause.advice, separator=separator)
             if answered:
                 connection.claim = claim.pop_all()
                 return connection
     raise ConnectionFailed(
-        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s; check that it is "
-        "switched on and that the address is right"
+        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s",
+        "switch it on and check its address; perchctl check --scan lists the vehicles that answer",
     )
 
 
@@ -297,26 +303,43 @@ def _as_cflib(packet: Packet) -> Any:
     return outgoing
 
 
-_PERMISSION = f"you have no permission to use it.\n{UDEV_HELP}"
+_PERMISSION = "you have no permission to use it"
 _CAUSES = {
-    "Resource busy": "another program has it open: a Crazyradio or a USB cable serves one program "
-    "at a time; end that program, or plug in another Crazyradio and name it as "
-    "radio://1/...",
-    "Connection refused": "nothing listens there (connection refused)",
-    "Could not open usb": "no Crazyflie is connected by USB and switched on, or " + _PERMISSION,
-    "Cannot find": "no Crazyradio is plugged in, or " + _PERMISSION,
-    "Access denied": _PERMISSION,
+    "Resource busy": Problem(
+        "another program has it open: a Crazyradio or a USB cable serves one program at a time",
+        "end that program, or plug in another Crazyradio and name it as radio://1/...",
+    ),
+    "Connection refused": Problem("nothing listens there (connection refused)", ""),
+    "Could not open usb": Problem(
+        f"no Crazyflie is connected by USB and switched on, or {_PERMISSION}", UDEV_HELP
+    ),
+    "Cannot find": Problem(f"no Crazyradio is plugged in, or {_PERMISSION}", UDEV_HELP),
+    "Access denied": Problem(_PERMISSION, UDEV_HELP),
 }
-"""Message for an error of cflib, by words in it; the first match is used."""
+"""Cause and remedy for an error of cflib, by words in it; the first match is used."""
 
 
-def readable_cause(message: str) -> str:
+def find_cause(message: str) -> Problem:
     """Return cflib's message without its traceback or, if known, the cause and its remedy."""
     for words, cause in _CAUSES.items():
         if words in message:
             return cause
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
-    return line.removeprefix("Couldn't load link driver: ")
+    return Problem(line.removeprefix("Couldn't load link driver: "), "")
+
+
+def readable_cause(message: str) -> str:
+    """Return the cause and its remedy as one text."""
+    return _cause_text(find_cause(message))
+
+
+def _cause_text(cause: Problem) -> str:
+    return f"{cause.found}{_separator(cause)}{cause.advice}" if cause.advice else cause.found
+
+
+def _separator(cause: Problem) -> str:
+    """Return what precedes the remedy: a remedy of several lines begins with a line of its own."""
+    return ".\n" if "\n" in cause.advice else "; "
 
 
 def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
@@ -356,7 +379,8 @@ def lock_vehicle(uri: str) -> contextlib.ExitStack:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ConnectionFailed(
-                    f"the vehicle at {uri} is in use by another program: end that program, or name "
-                    "another vehicle"
+                    f"the vehicle at {uri} is in use by another program",
+                    "end that program, or name another vehicle",
+                    separator=": ",
                 ) from None
         return claim.pop_all()

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from perchctl.calibration import AttitudeSample
-from perchctl.errors import NotFound, TimedOut
+from perchctl.errors import NotFound, Problem, TimedOut
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.connection import (
     Connection,
+    find_cause,
     init_cflib,
-    readable_cause,
     send_packets,
     start_thread,
 )
@@ -224,10 +224,9 @@ SCAN_TIMEOUT_S = 20.0
 """Longest search for vehicles, s."""
 
 
-def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
+def find_uris_and_problem(uri: str = "") -> tuple[list[str], Problem | None]:
     """Search for vehicles that answer now, at a radio's usual address and at that of `uri`; sends
-    only null packets. Return their URIs, and why no radio was searched, with advice in further
-    lines; an empty string if a radio was searched.
+    only null packets. Return their URIs, and why no radio was searched; None if one was searched.
 
     A driver may block: after `SCAN_TIMEOUT_S`, the URIs found so far are returned.
     """
@@ -236,7 +235,7 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     if uri.startswith("radio://") and len(parts) > 5 and parts[5].upper() != USUAL_ADDRESS:
         addresses.append(int(parts[5], 16))
     found: list[str] = []
-    why = ["the radio did not answer in time"]
+    why: list[Problem | None] = [Problem("the radio did not answer in time", "")]
 
     init_cflib()
 
@@ -255,11 +254,11 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     return list(uris), why[0]
 
 
-def _radio_problem() -> str:
+def _radio_problem() -> Problem | None:
     from cflib.drivers.crazyradio import Crazyradio
 
     try:
         Crazyradio().close()
     except Exception as error:
-        return readable_cause(str(error) or "Cannot find a Crazyradio Dongle")
-    return ""
+        return find_cause(str(error) or "Cannot find a Crazyradio Dongle")
+    return None

@@ -72,21 +72,23 @@ class LateFrames:
     count: int
     pause_s: float
 
-    def text(self, who: str) -> str:
+    def error(self, who: str) -> ConnectionFailed:
         """Return what is wrong with the capture `who`, and what to do."""
         if self.count == 0:
-            return (
+            return ConnectionFailed(
                 f"{who} has paused for {self.pause_s:.2f} s: frames after a pause may be old, "
                 "so they are not used"
             )
         if self.count == 1:
-            return (
+            return ConnectionFailed(
                 f"{who} sends a frame only every {self.pause_s:.2f} s, and such frames are not "
-                "used; set its rate to at least 50 Hz"
+                "used",
+                "set its rate to at least 50 Hz",
             )
-        return (
+        return ConnectionFailed(
             f"{who} sends its frames late, in bursts ({self.count} at once after "
-            f"{self.pause_s:.2f} s), and such frames are not used; connect it by cable"
+            f"{self.pause_s:.2f} s), and such frames are not used",
+            "connect it by cable",
         )
 
 
@@ -160,15 +162,20 @@ class MotionCapture:
         return [self._frames.popleft() for _ in range(len(self._frames))]
 
     def problem(self, now_s: float) -> str | None:
+        error = self.error(now_s)
+        return None if error is None else str(error)
+
+    def error(self, now_s: float) -> ConnectionFailed | None:
+        """Return the problem as an error, which holds its advice separately."""
         if self._ended is not None:
-            return self._ended
+            return ConnectionFailed(self._ended)
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
         if self._late is not None and now_s - self._late[0] <= LATE_S and silent_s > QUEUE_PAUSE_S:
-            return self._late[1].text(self._who)
+            return self._late[1].error(self._who)
         if silent_s <= CAPTURE_SILENT_S:
             return None
         what = "no body" if self._setup.skip_empty else "no frame"
-        return f"{self._who} has sent {what} for {silent_s:.1f} s"
+        return ConnectionFailed(f"{self._who} has sent {what} for {silent_s:.1f} s")
 
     def close(self) -> None:
         """End the child process in bounded time, whatever its library is doing."""
@@ -197,10 +204,11 @@ class MotionCapture:
         reading.start()
         if not self._settled.wait(self._setup.timeout_s):
             if self._late is not None:
-                raise ConnectionFailed(self._late[1].text(self._who))
+                raise self._late[1].error(self._who)
             raise ConnectionFailed(
-                f"no {self._who}: no frame within {self._setup.timeout_s:g} s (check that it "
-                f"streams and that the address is right){self._words()}"
+                f"no {self._who}: no frame within {self._setup.timeout_s:g} s{self._words()}",
+                "check that it streams, that positioning.host is right, and that no firewall "
+                "blocks it",
             )
         if self._failed is not None and not self._failed.is_loaded:
             raise broken_motion_capture(self._failed.text)

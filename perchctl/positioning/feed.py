@@ -50,7 +50,9 @@ class CaptureFrame:
 
 class CaptureSource(Protocol):
     """A motion-capture system, real or simulated; none of its methods block. Your own source is
-    called with the clock and the profile's section `positioning`."""
+    called with the clock and the profile's section `positioning`. It may have another method,
+    `error`, which returns the problem as a `perchctl.errors.PerchError`: `perchctl check` then
+    shows the error's advice."""
 
     def poll(self, now_s: float) -> CaptureFrame | None:
         """Return the newest frame that has arrived by `now_s`; None if no frame is new."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from perchctl.check import Row, Verdict, capture
+from perchctl.errors import ConnectionFailed
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import PositioningConfig, Profile
@@ -148,7 +149,10 @@ def test_without_a_vehicle_no_place_is_compared() -> None:
 
 
 def test_one_that_does_not_open_skips_the_rest() -> None:
-    rows = capture.failed_capture_rows("no motion capture vicon:lab: no answer within 5 s", CONFIG)
+    rows = capture.failed_capture_rows(ConnectionFailed("no vicon:lab: no frame"), CONFIG)
     assert [row.name for row in rows] == ["capture", *capture.BODY_ROWS]
     assert rows[0].verdict is Verdict.FAIL
+    assert "positioning.host" in rows[0].advice
     assert {row.verdict for row in rows[1:]} == {Verdict.SKIPPED}
+    late, *_ = capture.failed_capture_rows(ConnectionFailed("it is late", "use a cable"), CONFIG)
+    assert (late.found, late.advice) == ("it is late", "use a cable")

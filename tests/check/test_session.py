@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
-from perchctl.errors import UsageError, broken_motion_capture
+from perchctl.errors import Problem, UsageError, broken_motion_capture
 from perchctl.link.crtp import encode
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import Scenario, SimProcess
@@ -81,6 +81,7 @@ def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
     assert rows[0].verdict is Verdict.FAIL
     assert "--scan" in rows[0].advice
+    assert "switch it on" not in rows[0].found
     assert {row.verdict for row in rows[1 : len(VEHICLE)]} == {Verdict.SKIPPED}
     assert exit_code(rows) == 10
 
@@ -128,8 +129,8 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
 
 
 def test_a_scan_names_what_answers_and_why_no_radio_was_asked() -> None:
-    radio, found = vehicle.radio_scan_rows([NOWHERE], "no Crazyradio is plugged in\nudev rules")
+    radio, found = vehicle.radio_scan_rows([NOWHERE], Problem("no Crazyradio", "udev rules"))
     assert (radio.verdict, radio.advice) == (Verdict.SKIPPED, "udev rules")
     assert (found.verdict, found.found) == (Verdict.PASS, f"{NOWHERE} answers")
-    radio, nobody = vehicle.radio_scan_rows([], "")
+    radio, nobody = vehicle.radio_scan_rows([], None)
     assert (radio.verdict, nobody.verdict) == (Verdict.PASS, Verdict.FAIL)

@@ -27,6 +27,7 @@ from perchctl.link import connection as room
 from perchctl.link.connection import (
     DEAD_S,
     Connection,
+    find_cause,
     lock_vehicle,
     open_connection,
     readable_cause,
@@ -276,6 +277,7 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     assert "another program has it open" in said
     assert "radio://1" in said
     assert "permission" not in said
+    assert find_cause("Access denied").advice.startswith("Write these lines")
 
 
 def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
