@@ -54,18 +54,13 @@ class _Given:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = delay_s
         self._pictures = _readable(pictures)
-        self._name = "the recording"
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = TurnInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
 
     def turn(self, turn: Turn) -> None:
-        taken, obs = turn.taken, turn.observation
+        taken = turn.taken
         self._taken, self._samples = taken, [taken.samples, taken.late]
-        told = None if obs is None else obs.camera_problem
-        if taken.ended and told is not None and told.endswith(FlightInputs.ENDED_TEXT):
-            # No other record has the flown source's name.
-            self._name = told.removesuffix(FlightInputs.ENDED_TEXT)
 
     # As a link.
 
@@ -94,7 +89,7 @@ class _Given:
         return self._taken.problem
 
     def describe(self) -> str:
-        return self._name
+        return "the recording"
 
     def close(self) -> None:
         return None
@@ -129,6 +124,16 @@ class _Given:
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 
+class _ReplayedSenses(FlightInputs):
+    """The inputs of a replay. Once the recording is over, the camera's problem names the flown
+    source, whose name no other record has: it is taken from the `recorded` observation."""
+
+    recorded: str | None = None
+
+    def ended_problem(self) -> str:
+        return self.recorded or super().ended_problem()
+
+
 def replay_inputs(
     turns: Iterable[Turn],
     profile: Profile,
@@ -143,11 +148,12 @@ def replay_inputs(
     there the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
-    inputs = FlightInputs(given, given, pipeline, profile, is_logged=True)
+    inputs = _ReplayedSenses(given, given, pipeline, profile, is_logged=True)
     with one_thread():
         for turn in turns:
             given.turn(turn)
-            taken = turn.taken
+            taken, obs = turn.taken, turn.observation
+            inputs.recorded = None if obs is None else obs.camera_problem
             inputs.poll_inputs(
                 turn.began_s,
                 search=taken.look,

@@ -72,8 +72,6 @@ class FlightInputs:
         "mismatch",
     )
     """The fields of an `Observation` that come from here; the others are the loop's."""
-    ENDED_TEXT: ClassVar = " has ended"
-    """Follows the source's description in the camera's problem of a recording that is over."""
 
     link: TelemetrySource
     source: FrameSource
@@ -152,7 +150,7 @@ class FlightInputs:
         )
         if frame is None:
             if problem is None and self.source.finished:
-                problem = f"{self.source.describe()}{self.ENDED_TEXT}"
+                problem = self.ended_problem()
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
@@ -181,6 +179,10 @@ class FlightInputs:
         if perception.is_mirrored:
             self.camera_problem = mirrored_problem(self.profile.camera).sentence
             self.problem_kind = "mirrored"
+
+    def ended_problem(self) -> str:
+        """Return the camera's problem once a recording is over."""
+        return f"{self.source.describe()} has ended"
 
     @property
     def _positioning(self) -> TargetPositioning | None:
