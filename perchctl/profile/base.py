@@ -110,8 +110,8 @@ def split_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
     """A profile's values without the keys that have become constants (class variables of
-    `model` or of its nested models); a note for each such key with the constant's value; and an
-    error sentence for each with another value. `path`: the keys' prefix in these texts."""
+    `model` or of its nested models); a note for each such key with the constant's value; and
+    what is wrong with each that has another value. `path`: the keys' prefix in these texts."""
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None
@@ -120,9 +120,9 @@ def split_constant_keys(
             constant = getattr(model, key)
             now = f"{path}{key} is no longer a key: it is {constant} for every profile"
             if value == (list(constant) if isinstance(constant, tuple) else constant):
-                notes.append(f"{now}; remove it")
+                notes.append(now)
             else:
-                lost.append(f"{now}, but {value} here; remove it")
+                lost.append(f"{now}, but {value} here")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
             result[key], more, gone = split_constant_keys(value, kind, f"{path}{key}.")
             notes, lost = notes + more, lost + gone

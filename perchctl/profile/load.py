@@ -245,9 +245,9 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
     values, notes, lost = split_constant_keys(values, Profile)
     if lost:
-        raise InvalidValue(f"{path}: {lost[0]}")
+        raise InvalidValue(f"{path}: {lost[0]}", "remove it")
     for note in notes:
-        warnings.warn(f"{path}: {note}", ProfileNote, stacklevel=2)
+        warnings.warn(f"{path}: {note}; remove it", ProfileNote, stacklevel=2)
     return values
 
 

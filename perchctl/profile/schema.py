@@ -133,7 +133,7 @@ class Profile(Section):
         try:
             _, notes, lost = split_constant_keys(values, Profile)
             if notes or lost:
-                raise InvalidValue((notes + lost)[0])
+                raise InvalidValue((notes + lost)[0], "remove it")
             return Profile.model_validate(values)
         except ValidationError as error:
             key, why = key_and_reason(error)
@@ -141,7 +141,7 @@ class Profile(Section):
 
     @classmethod
     def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
-        """An error sentence for each value that differs from the constant its key has become."""
+        """For each value that differs from the constant its key has become, what is wrong."""
         return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")

@@ -243,9 +243,8 @@ class FlightLog:
         """The flown profile, without passwords. A `Note` warns of each key that has become a
         constant and was flown with another value. Errors: InvalidValue."""
         values = self.header.get("profile")
-        for sentence in Profile.constant_key_errors(values) if isinstance(values, dict) else ():
-            said = sentence.removesuffix("; remove it")
-            warnings.warn(f"an older perchctl flew this flight: {said}", Note, stacklevel=2)
+        for found in Profile.constant_key_errors(values) if isinstance(values, dict) else ():
+            warnings.warn(f"an older perchctl flew this flight: {found}", Note, stacklevel=2)
         try:
             return Profile.model_validate(values, extra="ignore")
         except ValidationError as error:
