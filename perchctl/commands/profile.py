@@ -258,12 +258,12 @@ def ask_questions(given: Answers) -> Answers:
                 print_lines(f"  found {typed!r}; press Enter, or type no or {BACK}")
             else:
                 answered = {**answers, name: _read(name, typed) if typed else default}
-                profile_and_keys(answered, "new")
+                profile_and_keys(answered, "new", option="")
                 before.append(answered)
         except (PerchError, UnicodeDecodeError) as error:
             if isinstance(error, UsageError):
                 raise
-            print_lines(f"  {str(error).removeprefix('--set: ')}")
+            print_lines(f"  {error}")
 
 
 def _typed(question: str) -> str:
@@ -316,9 +316,12 @@ def answers_text(answers: Answers) -> str:
     return "\n".join(f"  {name:<24} {text}" for name, text in rows)
 
 
-def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
+def profile_and_keys(
+    answers: Answers, name: str, option: str = "--set"
+) -> tuple[Profile, set[str]]:
     """Return the profile of these answers, with defaults for the others, and the keys to write to
-    its file. Raises NotFound, InvalidValue, UsageError, each with the key."""
+    its file. Raises NotFound, InvalidValue, UsageError, each with the key and, if the answers come
+    from the command line, with the `option`."""
     texts = {key: text for key, text in answers.items() if key not in EDGES_AND_CEILING}
     if "target.large.side_m" in texts and "target.small.side_m" not in texts:
         texts["target.small.side_m"] = default_answer("target.small.side_m", answers)
@@ -346,7 +349,7 @@ def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
     for key, text in texts.items():
         is_text = isinstance(profile_value(Profile(), key), str)
         settings[key] = json.dumps(text) if is_text else text
-    profile = apply_settings(base, [f"{key}={text}" for key, text in settings.items()])
+    profile = apply_settings(base, [f"{key}={text}" for key, text in settings.items()], option)
     return profile, {*settings, *shipped, *SHOWN_KEYS} - {"name"}
 
 

@@ -29,7 +29,7 @@ from perchctl.profile.schema import Profile
 
 def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
     """The profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
-    YAML. `option` names the command-line option in messages.
+    YAML. `option` names the command-line option in messages; empty if there is none.
 
     Raises:
         UsageError: a setting is not ``key=value``.
@@ -40,11 +40,12 @@ def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--s
         try:
             values[key] = parse_yaml(text)
         except ValueError as error:
-            raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
+            setting = f"{option} {clip_text(f'{key}={text}')}".lstrip()
+            raise InvalidValue(f"{setting}: {error}") from None
     try:
         return profile.with_(values)
     except InvalidValue as error:
-        raise InvalidValue(f"{option}: {error}") from None
+        raise InvalidValue(f"{option}: {error}" if option else str(error)) from None
 
 
 def _parsed(setting: str, option: str) -> tuple[str, str]:
