@@ -73,11 +73,9 @@ def _why(stay: PhaseSpan) -> str:
 def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     log = flight.log
     end = replace(flight.summary, battery_min_v=None)
-    first, *others = end.text().splitlines()
-    yield from wrap(printable_text(first), COLUMNS, subsequent_indent="  ")
-    for line in others:
-        name, _, text = line.partition(":")
-        yield from _named(name, text.strip())
+    yield from wrap(printable_text(end.headline), COLUMNS, subsequent_indent="  ")
+    for name, text in end.rows():
+        yield from _named(name, text)
     if log.summary is None:
         cause = "its end: the program may have been killed, or the disk have failed"
         if not log.phases:

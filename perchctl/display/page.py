@@ -64,9 +64,8 @@ class FlightPage:
 
     def end(self, summary: FlightSummary, log: Path) -> None:
         """Show the flight's outcome, its log, and the command for a report, as the final state."""
-        first, *lines = summary.text().splitlines()
-        rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
-        self._end(summary.outcome, first.partition(": ")[2], rows, log)
+        rows = [list(row) for row in summary.rows()]
+        self._end(summary.outcome, summary.reason_text, rows, log)
 
     def fail(self, error: BaseException, log: Path | None) -> None:
         """Show that the flight ended in an error or never began, with the rescue's report, and the

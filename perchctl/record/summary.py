@@ -31,6 +31,10 @@ class RecordingEnd(NamedTuple):
         return f"{self.pictures} pictures in {self.recording}{missing}{why}"
 
 
+NAME_COLUMNS = 11
+"""Width of the column of names in a summary."""
+
+
 @dataclass(frozen=True)
 class FlightSummary:
     """How one flight ended, and what it found out.
@@ -120,43 +124,58 @@ class FlightSummary:
             **({} if self.recording is None else self.recording._asdict()),
         }
 
+    @property
+    def reason_text(self) -> str:
+        """The reason, followed by the cause if the outcome does not say it."""
+        cause = f"[{self.cause}]" if self.cause and self.cause != self.outcome else ""
+        return f"{self.reason} {cause}".strip()
+
+    @property
+    def headline(self) -> str:
+        """The outcome and its reason."""
+        return f"{self.outcome.upper()}: {self.reason_text}".rstrip(": ")
+
     def text(self, log_path: Path | None = None) -> str:
         """A few lines about the flight, without colour or a last line break."""
-        lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
-        if self.cause and self.cause != self.outcome:
-            lines[0] += f" [{self.cause}]"
-        if self.simulated and self.is_profile_suspect:
-            lines.append(
-                "note:      camera and positions were simulated: do not change the profile of "
-                "a real vehicle"
-            )
-        if self.miss_m is not None:
-            lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
-        if self.contact is not None:
-            lines.append(f"contact:   {self.contact.text}")
-        attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
-        lines.append(f"flight:    {self.duration_s:.1f} s, {attempts}")
-        if self.battery_min_v is not None:
-            lines.append(f"battery:   {self.battery_min_v:.2f} V at the lowest")
-        if self.findings is not None:  # with 95 % intervals
-            lines.append(f"latency:   {self.findings.latency_text}")
-            lines.append(f"mounting:  rotated by {self.findings.turn_text} (x, y, z)")
-            lines += [f"advice:    {sentence}" for sentence in self.findings.advice]
-        if self.locked:
-            lines.append("vehicle:   locked by its supervisor: inspect and restart it")
-        if self.touchdown is not None and self.touchdown.is_hard:
-            lines.append(f"vehicle:   {self.touchdown.text}")
-        if self.fell:
-            lines.append("vehicle:   fell")
-        if self.lost_records:
-            lines.append(f"log lost:  {self.lost_records} records ({self.log_problem})")
-        elif self.log_problem is not None:
-            lines.append(f"log lost:  possibly the last records ({self.log_problem})")
-        if self.recording is not None:
-            lines.append(f"recording: {self.recording.text}")
+        rows = self.rows()
         if log_path is not None:
-            lines.append(f"log:       {log_path}")
-        return "\n".join(lines)
+            rows.append(("log", str(log_path)))
+        lines = [f"{name + ':':<{NAME_COLUMNS}}{text}" for name, text in rows]
+        return "\n".join([self.headline, *lines])
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The name and text of each line below the headline."""
+        lines: list[tuple[str, str]] = []
+        if self.simulated and self.is_profile_suspect:
+            note = (
+                "camera and positions were simulated: do not change the profile of a real vehicle"
+            )
+            lines.append(("note", note))
+        if self.miss_m is not None:
+            lines.append(("miss", f"{self.miss_m * 1e3:.1f} mm"))
+        if self.contact is not None:
+            lines.append(("contact", self.contact.text))
+        attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
+        lines.append(("flight", f"{self.duration_s:.1f} s, {attempts}"))
+        if self.battery_min_v is not None:
+            lines.append(("battery", f"{self.battery_min_v:.2f} V at the lowest"))
+        if self.findings is not None:  # with 95 % intervals
+            lines.append(("latency", self.findings.latency_text))
+            lines.append(("mounting", f"rotated by {self.findings.turn_text} (x, y, z)"))
+            lines += [("advice", sentence) for sentence in self.findings.advice]
+        if self.locked:
+            lines.append(("vehicle", "locked by its supervisor: inspect and restart it"))
+        if self.touchdown is not None and self.touchdown.is_hard:
+            lines.append(("vehicle", self.touchdown.text))
+        if self.fell:
+            lines.append(("vehicle", "fell"))
+        if self.lost_records:
+            lines.append(("log lost", f"{self.lost_records} records ({self.log_problem})"))
+        elif self.log_problem is not None:
+            lines.append(("log lost", f"possibly the last records ({self.log_problem})"))
+        if self.recording is not None:
+            lines.append(("recording", self.recording.text))
+        return lines
 
 
 def is_simulated(header: Mapping[str, Any]) -> bool:
