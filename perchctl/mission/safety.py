@@ -188,6 +188,13 @@ def is_outside_fence(c: Context) -> bool:
     return math.hypot(dx, dy) > c.safety.fence_radius_m
 
 
+def is_outside_corridor(c: Context) -> bool:
+    """True if a vehicle of a fleet is where another one may fly, or if nothing says where it is.
+    A vehicle without a corridor is never outside."""
+    corridor, (x_m, y_m, _) = c.safety.corridor, c.telemetry.position_m
+    return corridor is not None and not corridor.contains(x_m, y_m, c.belief.height_m)
+
+
 def latency_reason(c: Context) -> str:
     """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
@@ -394,6 +401,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: f"height {c.belief.height_m:.2f} m is above the limit",
     ),
     land_row("fence", PRE_CONTACT_PHASES, is_outside_fence, "outside the fence"),
+    land_row("corridor", PRE_CONTACT_PHASES, is_outside_corridor, "outside its corridor"),
     land_row(
         "camera-gone",
         CAMERA_GUIDED_PHASES,

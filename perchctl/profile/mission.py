@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
+from perchctl.corridor import Corridor
 from perchctl.extensions import PATTERN
 from perchctl.profile.base import Section, key
 
@@ -227,6 +228,21 @@ class PlannerConfig(Section):
     """To which that integral grows while the vehicle moves."""
 
 
+class CorridorConfig(Section):
+    """The space that a vehicle of a fleet may use, in the axes of its state estimate: all places
+    within `radius_m` of the line from `home_m` to `target_m` (`perchctl.corridor`)."""
+
+    home_m: tuple[float, float] = key(..., "place of take-off: x, y")
+    target_m: tuple[float, float] = key(..., "place under the target: x, y")
+    radius_m: float = key(..., "largest distance from the line between them", gt=0, le=50)
+    way_top_m: float = key(..., "height above the ground up to which it may fly", gt=0, le=20)
+    target_top_m: float = key(..., "the same under its target", gt=0, le=20)
+
+    def contains(self, x_m: float, y_m: float, height_m: float) -> bool:
+        """True for a place inside; False for one that is not known (NaN)."""
+        return Corridor(**dict(self)).contains(x_m, y_m, height_m)
+
+
 class SafetyConfig(Section):
     """Limits and reaction times: the vehicle hovers after `*_hold_s` and lands after `*_land_s`."""
 
@@ -287,6 +303,9 @@ class SafetyConfig(Section):
     )
     fence_radius_m: float = key(
         2.0, "distance from the take-off point beyond which the vehicle lands", gt=0, le=50
+    )
+    corridor: CorridorConfig | None = key(
+        None, "corridor of a vehicle in a fleet, outside which it lands; the fleet sets it"
     )
     max_tilt_deg: float = key(55.0, "tilt above which perchctl cuts the motors", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted

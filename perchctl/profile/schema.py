@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import difflib
 from collections.abc import Collection, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -204,5 +204,7 @@ def nearest_names(name: str, allowed: Collection[str]) -> str:
 
 def _keys_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
     for part in loc:
-        model = model.model_fields[part].annotation
+        kind = model.model_fields[part].annotation
+        # A section that may be missing is a union with None.
+        model = next((each for each in get_args(kind) if each is not type(None)), kind)
     return list(model.model_fields)

@@ -36,6 +36,18 @@ FINE_BATTERY = BatteryFit(
 """After some seconds of flight: enough for every attempt."""
 PROFILE = Profile()
 PROFILES = {by: Profile.model_validate({"positioning": by}) for by in ("deck", "mocap", "target")}
+IN_CORRIDOR = PROFILE.with_(
+    {
+        "safety.corridor": {
+            "home_m": (0.0, 0.0),
+            "target_m": (0.0, 0.0),
+            "radius_m": 0.4,
+            "way_top_m": 1.6,
+            "target_top_m": 3.0,
+        }
+    }
+)
+"""A vehicle of a fleet, right below its target."""
 MOCAP, BY_TARGET = PROFILES["mocap"], PROFILES["target"]
 HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 """Height of the body that hangs with its gear at the target."""

@@ -28,6 +28,7 @@ from tests.helpers.mission import (
     CEILING_M,
     HANG_Z_M,
     HOVER_THRUST,
+    IN_CORRIDOR,
     PROFILE,
     READY,
     changed,
@@ -89,6 +90,10 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _tel(position_m=(0.0, 0.0, 3.4)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
     "fence": (_tel(position_m=(2.5, 0.0, 1.0)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "corridor": (_tel(position_m=(0.5, 0.0, 1.0)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "corridor-unknown": (
+        _tel(position_m=(math.nan, 0.0, 1.0)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
+    ),
     "camera-gone": (
         _obs(camera_age_s=4.0, new_frame=False, camera_problem="camera unplugged"),
         0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
@@ -122,17 +127,22 @@ def down(command: object, z_m: float, *, by_itself: bool = False, level: bool = 
         assert command.z_m <= z_m + 1e-9
 
 
+PROFILES = {name: IN_CORRIDOR for name in EVENTS if name.startswith("corridor")}
+"""The profile of an event that another one than `PROFILE` meets."""
+
+
 def _begin(phase: Phase, event: str) -> PlannerState:
     z = CEILING_M - 0.03 if phase is Phase.COMPLETE else 1.0
     state = state_in(phase, z_m=z)
     return remembering(state, started_s=-1000.0) if event == "time-over" else state
 
 
-def _run(state: PlannerState, event: Event, lasts_s: float) -> tuple[PlannerState, list[object]]:
+def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
+    event, lasts_s, *_ = EVENTS[name]
     commands: list[object] = []
     for t_s in times(lasts_s):
         obs = event(observation(t_s, state.entry.position_m[2]))
-        state, command = planner.step_mission(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILES.get(name, PROFILE))
         commands.append(command)
         if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row != "":
             break
@@ -142,8 +152,8 @@ def _run(state: PlannerState, event: Event, lasts_s: float) -> tuple[PlannerStat
 @pytest.mark.parametrize("name", EVENTS)
 @pytest.mark.parametrize("phase", sorted(ALL, key=lambda p: p.value))
 def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
-    event, lasts_s, counts_in, ends, outcome = EVENTS[name]
-    state, commands = _run(_begin(phase, name), event, lasts_s)
+    _, _, counts_in, ends, outcome = EVENTS[name]
+    state, commands = _run(_begin(phase, name), name)
     if phase not in counts_in:
         assert state.outcome is not Outcome.SAFETY
         assert not any(isinstance(c, EmergencyStop | StopMotors) for c in commands)
@@ -161,15 +171,21 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
     assert state.reason
 
 
+@pytest.mark.parametrize("name", PROFILES)
+def test_without_a_corridor_no_place_is_outside_of_it(name: str) -> None:
+    event, *_ = EVENTS[name]
+    state, _ = planner.step_mission(state_in(Phase.ALIGN), event(observation(10.02)), PROFILE)
+    assert state.row != "corridor"
+
+
 @pytest.mark.parametrize("name", [n for n, e in EVENTS.items() if e[3] == LAND])
 def test_a_landing_is_never_undone(name: str) -> None:
     """Once it lands nothing but a stop changes it, whatever comes and goes."""
-    event, lasts_s, _, _, _ = EVENTS[name]
-    state, _ = _run(_begin(Phase.ALIGN, name), event, lasts_s)
+    state, _ = _run(_begin(Phase.ALIGN, name), name)
     orders = 0
     for i in range(200):
         obs = observation(20.0 + 0.02 * i, 0.8)
-        state, command = planner.step_mission(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILES.get(name, PROFILE))
         assert state.phase is Phase.LANDING
         assert isinstance(command, RawThrust if name in LEVEL else Land | Idle | PositionSetpoint)
         if isinstance(command, PositionSetpoint):

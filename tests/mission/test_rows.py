@@ -50,6 +50,7 @@ from tests.helpers.mission import (
     CEILING_M,
     FINE_BATTERY,
     HOVER_THRUST,
+    IN_CORRIDOR,
     MOCAP,
     PROFILE,
     READY,
@@ -186,6 +187,7 @@ CASES: dict[str, Case] = {
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
+    "corridor": Case(P.ALIGN, P.LANDING, aside(0.6), 0.1, O.SAFETY, profile=IN_CORRIDOR),
     "camera-gone": Case(
         P.ALIGN, P.LANDING, seen(camera_age_s=4.0, new_frame=False), 0.1, O.SAFETY
     ),

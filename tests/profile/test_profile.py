@@ -64,6 +64,8 @@ def _refusal(tmp_path: Path, text: str) -> str:
     [
         ("planer: {}", ["planer", "unknown", "extends", "planner"]),
         ("kalman: {alfa: 0.85}", ["kalman.alfa", "unknown", "alpha"]),
+        ("safety: {corridor: {home_m: [0, 0], target_m: [0, 0], radius_m: 1, way_top_m: 1, "
+         "target_top_m: 3, width_m: 2}}", ["safety.corridor.width_m", "unknown", "radius_m"]),
         ("target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
          ["target.large", "997", "0 to 99"]),
         ("target: {large: {dictionary: DICT_4X4_1000, id: 1000, side_m: 0.15}}",
