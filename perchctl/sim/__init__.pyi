@@ -1,6 +1,7 @@
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
+from .downwash import downwash_mps as downwash_mps
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import max_thrust_n as max_thrust_n
 from .process import SimProcess as SimProcess

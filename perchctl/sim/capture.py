@@ -65,7 +65,8 @@ class CaptureSettings:
 
     Attributes:
         body: name of the vehicle's rigid body; `body_*`: its pose in the vehicle's axes.
-        others: (name, position m) of each rigid body that stands still.
+        others: (name, position m) of each other rigid body. It stands still, unless somebody
+            moves it (`SimCapture.others_m`).
         rate_hz: frame rate of the system's cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
@@ -128,6 +129,7 @@ class SimCapture:
         self.settings = settings
         self._rng = np.random.default_rng([settings.seed, _CAPTURE_STREAM])
         self._faults = list(settings.faults)
+        self.others_m = [position_m for _, position_m in settings.others]  # where they are now
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._R_capture_world = rot_z(settings.heading_rad)
         self._due_s = float(self._rng.random()) / settings.rate_hz
@@ -190,7 +192,7 @@ class SimCapture:
         R = rotation_from_quaternion(world.quaternion)
         place = np.array((world.x_m, world.y_m, world.z_m)) + R @ settings.body_position_m
         poses = [(place, R @ self._R_body_rigid)]
-        poses += [(np.asarray(position_m), np.eye(3)) for _, position_m in settings.others]
+        poses += [(np.asarray(position_m), np.eye(3)) for position_m in self.others_m]
         seen = [
             self._pose(place, R, white, faults)
             for (place, R), white in zip(poses, noise, strict=True)

@@ -15,6 +15,7 @@ Assumptions of the model, each with its source:
 - Near the floor the rotors lift more, by `Scenario.ground_effect`.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
   standard deviations of the gusts (`Wind`).
+- Other vehicles of a fleet blow down on it by `downwash_mps` (`perchctl.sim.downwash`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
   thrust at the ceiling itself; with 0.1 as measured by benches with rotors of this size
   (Hsiao and Chirarattananon, arXiv 1905.04632).
@@ -78,6 +79,7 @@ class World:
         self.powertrain = Powertrain(scenario)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
+        self.downwash_mps = 0.0  # from other vehicles, straight down
         self._hand: Callable[[World], None] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -121,6 +123,9 @@ class World:
             return
         if self._steps % _WIND_EVERY == 1:
             self._wind_mps = self._wind.at(self.t_s)
+            if self.downwash_mps:
+                x_mps, y_mps, z_mps = self._wind_mps
+                self._wind_mps = x_mps, y_mps, z_mps - self.downwash_mps
         thrust_n = f1 + f2 + f3 + f4
         height_m = self._scenario.ceiling_z_m - self.z_m
         if height_m < 0.2:
