@@ -6,6 +6,7 @@ from .compare import make_sweep as make_sweep
 from .flights import fly_all as fly_all
 from .flights import fly_in_folder as fly_in_folder
 from .flights import fly_measured as fly_measured
+from .flights import run_measured as run_measured
 from .flights import seed_log_path as seed_log_path
 from .flights import simulate as simulate
 from .pool import defer_interrupts as defer_interrupts

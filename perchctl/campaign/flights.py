@@ -48,13 +48,25 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
     """Call `fly` on one core with the scenario drawn from `seed`, and return its result (a
     dataclass) with CPU time and scenario filled in. Frees the flight's memory."""
+
+    def fly_drawn() -> R:
+        scenario = draw_scenario(profile, seed)
+        result: Any = fly(scenario)
+        flown: R = replace(result, scenario=scenario)
+        return flown
+
+    return run_measured(fly_drawn)
+
+
+def run_measured(job: Callable[[], R]) -> R:
+    """Call `job`, a unit of a campaign's work, on one core, and return its result (a dataclass)
+    with its CPU time filled in. Frees its memory."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
-    scenario = draw_scenario(profile, seed)
-    result: Any = fly(scenario)
+    result: Any = job()
     cpu_s = time.process_time() - cpu_began_s
     _give_back_memory()
-    flown: R = replace(result, cpu_s=cpu_s, scenario=scenario)
+    flown: R = replace(result, cpu_s=cpu_s)
     return flown
 
 

@@ -56,6 +56,7 @@ def campaign_results(
     result_type: type[R],
     *,
     faults: Sequence[str] | None = None,
+    fleet: str | None = None,
     out: Path | None = None,
     resume: bool = False,
     force: bool = False,
@@ -64,7 +65,8 @@ def campaign_results(
     """Yield the results (of class `result_type`) of a campaign, appended to the file `out`.
 
     An existing file is refused, replaced with `force`, or continued with `resume`: then program,
-    profile and faults must be the same. Errors: InvalidValue, also for a `log_dir` that is not
+    profile, faults and `fleet` (a hash of what a fleet flies; None without one) must be the same.
+    Errors: InvalidValue, also for a `log_dir` that is not
     writable.
     """
     if log_dir is not None:
@@ -78,7 +80,7 @@ def campaign_results(
             "name another file"
         )
     check_writable(out, force=True)
-    header = campaign_header(profile, faults)
+    header = campaign_header(profile, faults, fleet)
     earlier: dict[int, R] = {}
     good = 0
     with ExitStack() as stack:
@@ -101,15 +103,23 @@ def campaign_results(
 SOURCE = Path(perchctl.__file__).resolve().parent
 VERSION = 2
 _FORM = {"kind": "header", "format": "perchctl-campaign", "version": VERSION}
-_MUST_AGREE = {"source": "program", "profile_sha256": "profile", "faults": "selection of faults"}
+_MUST_AGREE = {
+    "source": "program",
+    "profile_sha256": "profile",
+    "faults": "selection of faults",
+    "fleet_sha256": "fleet",
+}
 
 
-def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> dict[str, Any]:
+def campaign_header(
+    profile: Profile, faults: Sequence[str] | None = None, fleet: str | None = None
+) -> dict[str, Any]:
     """The first line of a new campaign's file.
 
     `perchctl` is the version, `source` the hash of the source code, `profile` the profile's name,
     `profile_sha256` the hash of calibration and profile without name and description. `faults`:
-    names of the faults to draw from, or None.
+    names of the faults to draw from, or None. `fleet_sha256`: only of a fleet, the hash of all its
+    vehicles.
     """
     return {
         **_FORM,
@@ -118,6 +128,7 @@ def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> di
         "profile": profile.name,
         "profile_sha256": profile_sha256(profile),
         "faults": None if faults is None else list(faults),
+        **({} if fleet is None else {"fleet_sha256": fleet}),
     }
 
 
@@ -163,7 +174,7 @@ def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dic
         found, *flights = map(json.loads, good.splitlines())
         if any(found.get(key) != value for key, value in _FORM.items()):
             raise ValueError(f"no header of version {VERSION}")
-        others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
+        others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header.get(key)]
         if others:
             raise InvalidValue(
                 f"{path} was flown with another {' and another '.join(others)}: use the same, "

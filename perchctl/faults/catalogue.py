@@ -535,6 +535,8 @@ FAULTS: tuple[Fault, ...] = (
     ),
 )
 
+NO_FAULT = Fault("none", "no fault", (), ())
+"""What a flight without a fault has, in a campaign in which others have one."""
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 
@@ -553,6 +555,10 @@ class Case:
     landed_from: Phase | None = None
     landed_after_s: float = 0.0
     first_hold_ratio: float | None = None
+
+
+HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())
+"""A flight without a fault."""
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -50,7 +51,7 @@ from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher, to_exact_json
-from perchctl.sim import Scenario, draw_capture
+from perchctl.sim import Scenario, SimulatedVehicle, draw_capture
 from perchctl.vision import make_pipeline
 
 AFTER_PROGRAM_END_S = 6.0
@@ -71,10 +72,22 @@ class FaultyFlight:
     """One flight with a fault and its judge, ready for a single call of `fly`.
 
     It is also a `Watcher` of the loop; `problem` is the error of the log's disk, or None.
+
+    Args:
+        on_sample: called with the vehicle's time every `e.SAMPLE_S` of the flight, after the judge
+            has seen it: where a fleet's flights wait for each other.
+        others: (name, position m) of the other rigid bodies of a motion capture; None: as drawn.
     """
 
     def __init__(
-        self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
+        self,
+        profile: Profile,
+        case: Case,
+        scenario: Scenario,
+        log: LogWatcher | None = None,
+        *,
+        on_sample: Callable[[float], None] = lambda t_s: None,
+        others: tuple[tuple[str, tuple[float, float, float]], ...] | None = None,
     ) -> None:
         profile = e.apply_to_profile(profile, case.effects)
         self._profile, self._case, self._log = profile, case, log
@@ -82,6 +95,10 @@ class FaultyFlight:
         self.problem: str | None = None
         camera = profile_camera(profile.camera)
         capture = draw_capture(profile, scenario.seed)
+        if capture is not None and others is not None:
+            capture = replace(capture, others=others)
+        self._on_sample = on_sample
+        self._end: str | None = None
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
         self._radio = radio = FaultyRadio(Radio(scenario.radio_bursts()))
         radio.receive = vehicle.receive
@@ -136,6 +153,7 @@ class FaultyFlight:
             self._link.close()
         except ProgramKilled:
             end, reason, report = "gone", "", None
+        self._end = end
         self._vehicle.camera = None
         end_s = self._link.now_s
         self._oracle.note_program_end(end_s, crashed=self._crashed, endless=self._clock.endless)
@@ -143,6 +161,25 @@ class FaultyFlight:
         if self._oracle.is_airborne:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
         return self._result(end, reason, report, end_s)
+
+    @property
+    def vehicle(self) -> SimulatedVehicle:
+        """The simulated vehicle, with its true state."""
+        return self._vehicle
+
+    @property
+    def end(self) -> str | None:
+        """One of `ENDS` once the program has ended, though its vehicle is still watched."""
+        return self._end
+
+    def land(self) -> None:
+        """Order the landing, as the operator does."""
+        self._switch.land()
+
+    def begin_fault(self) -> None:
+        """Begin the case's effects now, unless they have begun."""
+        if self._injector.begin_s is None:
+            self._injector.begin(self._vehicle.t_s)
 
     def tick(self, tick: Tick) -> None:
         for injector in self._injectors:
@@ -182,6 +219,7 @@ class FaultyFlight:
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.on_floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
+        self._on_sample(t_s)
 
     def _sample(self, t_s: float) -> Sample:
         sample, world = true_sample(self._vehicle), self._vehicle.world

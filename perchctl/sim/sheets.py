@@ -249,7 +249,7 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
     return PlacedSheet(printed_sheet(target.model_dump_json()), plane)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=32)  # the targets of a fleet
 def printed_sheet(target_json: str) -> Sheet:
     """A target's sheet; flights share its textures, which cost more than a second."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
