@@ -115,6 +115,8 @@ def cheap(line: str) -> list[str]:
                 words += ["-p", "quick.yaml"]
             if "-n" in words:
                 words[words.index("-n") + 1] = "1"
+        case ["perchctl", "fleet"] if words[2:3] == ["simulate"]:
+            words.append("--help")  # many flights; tests/fleet has a few
         case ["perchctl", "fit-weights"] if "collect" in words:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand

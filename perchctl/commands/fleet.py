@@ -1,19 +1,31 @@
-"""`perchctl fleet`: the plan of a fleet's flight, and fleet files from other programs' lists."""
+"""`perchctl fleet`: the plan of a fleet's flight, its simulation, and fleet files from other
+programs' lists."""
 
 from __future__ import annotations
 
 import shlex
 import textwrap
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-# By its package, whose names load as they are used.
+# By their packages, whose names load as they are used: the help needs no simulator.
+from perchctl import campaign as campaigns
 from perchctl import fleet as fleets
 from perchctl.commands.command_line import ForceOption, Group, JsonOption, command, new_app
-from perchctl.commands.output import print_lines, print_result, say
-from perchctl.errors import InvalidValue
+from perchctl.commands.interrupt import handle_signals
+from perchctl.commands.output import add_problem, print_lines, print_result, say
+from perchctl.commands.simulate import (
+    ClusterOption,
+    JobsOption,
+    SeedOption,
+    make_executor,
+    run_campaign,
+    stop_handler,
+)
+from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 
 PLAN_COLUMNS = 80
@@ -44,7 +56,8 @@ def check(
     as_json: JsonOption = False,
     force: ForceOption = False,
 ) -> None:
-    """Plan the flight of several vehicles in one room, and convert lists of other programs.
+    """Plan and simulate the flight of several vehicles in one room, and convert lists of other
+    programs.
 
     By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
     vehicles, decides who flies together and in which order, and draws the room from above. It
@@ -105,6 +118,95 @@ def plan_text(plan: fleets.FleetPlan) -> str:
             ),
         ]
     )
+
+
+@command(
+    app,
+    "perchctl fleet simulate -n 20 --jobs 2",
+    "perchctl fleet simulate atrium.yaml -n 50 --seed 0 --json",
+    "perchctl fleet simulate --faults all -n 200 --jobs 2 --out flown.jsonl",
+)
+def simulate(
+    file: FleetArgument = None,
+    fleets_flown: Annotated[
+        int, typer.Option("-n", "--fleets", min=1, help="Number of seeds to fly.")
+    ] = 10,
+    seed: SeedOption = 0,
+    jobs: JobsOption = None,
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            "--faults",
+            metavar="all|list|NAME,NAME",
+            help="Inject a fault into one vehicle, or a common cause into several, and judge all "
+            "vehicles by the simulator's ground truth; list only prints the faults.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+    cluster: ClusterOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="JSONL file to which each result is written as a fleet ends."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue --out: fly only the seeds that it lacks.")
+    ] = False,
+    force: ForceOption = False,
+) -> int:
+    """Fly a fleet of simulated vehicles in one room many times, faster than real time.
+
+    Each vehicle flies as in perchctl simulate. All share one clock, feel the air that the others
+    blow down on them, and fly in the order of the plan. perchctl counts how they ended, how near
+    they came to each other, and what went wrong by the simulator's ground truth.
+    """
+    if faults == "list":
+        return _list_fleet_faults(as_json)
+    if resume and out is None:
+        raise UsageError("--resume goes on with a file of results: name it with --out")
+    names = () if faults is None else fleets.select_fleet_faults(faults)
+    loaded = fleets.load_fleet(file or fleets.EXAMPLE)
+    try:
+        plan = fleets.make_plan(loaded)
+    except InvalidValue as error:
+        raise InvalidValue(f"{loaded.path}: {error}") from None
+    profiles = [vehicle.profile for vehicle in plan.fleet.vehicles]
+    seeds = range(seed, seed + fleets_flown)
+    flyers = make_executor(jobs, cluster, profiles, fleets_flown)
+    fly = partial(fleets.fly_fleet, plan, names)
+
+    def report(results: list[Any], problem: PerchError | None) -> None:
+        figures = add_problem(fleets.fleet_summary(results), problem) if as_json else None
+        print_result(figures or fleets.fleet_table(results))
+
+    with (
+        handle_signals(stop_handler()),
+        campaigns.campaign_results(
+            profiles[0],
+            seeds,
+            fleets.FleetResult,
+            faults=names or None,
+            fleet=fleets.plan_sha256(plan),
+            out=out,
+            resume=resume,
+            force=force,
+        ) as kept,
+    ):
+        return run_campaign(
+            lambda executor, note: campaigns.fly_all(fly, kept.remaining, executor, note),
+            report,
+            len(seeds),
+            flyers,
+            kept.earlier,
+            kept.write_result,
+            unit="fleets",
+        )
+
+
+def _list_fleet_faults(as_json: bool) -> int:
+    faults = fleets.fleet_faults()
+    table = "\n".join(campaigns.align_columns(list(faults.items())))
+    print_result({"faults": faults} if as_json else table)
+    return 0
 
 
 @command(

@@ -38,13 +38,16 @@ class FinishedFlight(Protocol):
 
 @contextlib.contextmanager
 def progress_bar(
-    total: int, earlier: Iterable[FinishedFlight] = (), stream: TextIO | None = None
+    total: int,
+    earlier: Iterable[FinishedFlight] = (),
+    stream: TextIO | None = None,
+    unit: str = "flights",
 ) -> Iterator[Callable[[FinishedFlight], None]]:
     """Show a bar that counts flights; yield the function to call with each result; `earlier`
     results are counted from the start."""
     ends = Counter(result.outcome for result in earlier)
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
-    with _bar("flights", *columns, total=total, stream=stream, width=8) as update:
+    with _bar(unit, *columns, total=total, stream=stream, width=8) as update:
 
         def show() -> None:
             counted = " ".join(f"{n} {end}" for end, n in ends.items())

@@ -311,8 +311,10 @@ def run_campaign(
     earlier: Sequence[Any] = (),
     store_result: Callable[[Any], None] = lambda result: None,
     find_error: Callable[[list[Any]], PerchError | None] = lambda results: None,
+    unit: str = "flights",
 ) -> int:
-    """Fly a campaign of `total` flights; report those flown, however it ends; return the exit code.
+    """Fly a campaign of `total` flights, or of another `unit` of work; report those flown, however
+    it ends; return the exit code.
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
     results, and the error if there is one. `earlier` results are counted, too; `store_result`
@@ -326,7 +328,7 @@ def run_campaign(
         with (
             contextlib.suppress(KeyboardInterrupt),
             executor_context as executor,
-            progress_bar(total, list(results)) as advance,
+            progress_bar(total, list(results), unit=unit) as advance,
         ):
             begun = True
 
@@ -341,7 +343,7 @@ def run_campaign(
         if not begun:
             raise
         problem = error
-    flown = f"{len(results)} of {total} flights were flown"
+    flown = f"{len(results)} of {total} {unit} were flown"
     if problem is None and len(results) < total:
         problem = Interrupted(f"stopped: {flown}")
     elif problem is not None:

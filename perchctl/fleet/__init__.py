@@ -1,8 +1,8 @@
 """Several vehicles in one room: the fleet file, the radio budget, corridors, and the order of
 flight.
 
-Everything here is a pure function of the fleet file and the profiles that it names: nothing is
-connected, opened or armed. For those who fly, simulate or show a fleet:
+The plan is a pure function of the fleet file and the profiles that it names: nothing is connected,
+opened or armed. For those who fly, simulate or show a fleet:
 
     fleet = load_fleet("atrium.yaml")   # Fleet; raises NotFound, InvalidValue, one sentence each
     fleet.vehicles                      # FleetVehicle: name, home_m, target_m, and an ordinary
@@ -14,13 +14,17 @@ connected, opened or armed. For those who fly, simulate or show a fleet:
     plan.corridors["north"]             # perchctl.corridor.Corridor, in the room's axes
     estimate_corridor(vehicle)          # the same in the axes of its own estimate: its fence,
                                         # estimate_corridor(vehicle).contains(x_m, y_m, z_m)
+    flown_profile(vehicle)              # its profile with that corridor as safety.corridor
     plan.dongles                        # DongleLoad: which vehicles share a Crazyradio
     draw_text(fleet, groups), draw_svg(fleet, groups)
+    fly_fleet(plan, faults, seed)       # FleetResult of one seed, in lockstep: a unit of work
+    fleet_summary(results), fleet_table(results)
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
 assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and
 who flies when. plan: all of it in one call. drawing: the room from above. convert: lists of
-Crazyflies from other programs.
+Crazyflies from other programs. lockstep: a whole fleet's simulated flight. room: what its vehicles
+share. coroutine: how its flights wait for each other. results: how they ended.
 """
 
 import lazy_loader

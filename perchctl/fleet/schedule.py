@@ -26,7 +26,7 @@ from graphlib import CycleError, TopologicalSorter
 from perchctl.corridor import Corridor
 from perchctl.errors import InvalidValue
 from perchctl.fleet.fleet import Fleet, FleetVehicle
-from perchctl.profile import MarkerConfig, Profile
+from perchctl.profile import CorridorConfig, MarkerConfig, Profile
 
 WANDER_M = 0.3
 """How far a draught carries a healthy vehicle from its setpoint, level; the profile's own limit for
@@ -113,6 +113,24 @@ def estimate_corridor(vehicle: FleetVehicle) -> Corridor:
         way_top_m=corridor.way_top_m,
         target_top_m=corridor.target_top_m,
     )
+
+
+def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Profile:
+    """The profile that a vehicle of a fleet flies by: its own, with its corridor as a safety row
+    (`safety.corridor`), outside which it lands.
+
+    `estimate`: the same vehicle with other axes of its state estimate, whose profile is taken.
+    """
+    at, corridor = estimate or vehicle, vehicle_corridor(vehicle)
+    section = CorridorConfig(
+        home_m=at.to_estimate(corridor.home_m),
+        target_m=at.to_estimate(corridor.target_m),
+        radius_m=corridor.radius_m,
+        way_top_m=corridor.way_top_m,
+        target_top_m=corridor.target_top_m,
+    )
+    safety = at.profile.safety.model_copy(update={"corridor": section})
+    return at.profile.model_copy(update={"safety": safety})
 
 
 # --- Who may fly with whom ---

@@ -1,0 +1,77 @@
+"""A function that runs in a thread of its own, but only while its owner lets it.
+
+A flight in lockstep is one long call, whose simulated time passes deep inside. To advance several
+flights together, each one runs in a thread that gives the baton back at each step:
+
+    owner                       thread
+    resume()  ── baton ──>      ... runs on ...
+              <── baton ──      pause()
+
+Exactly one of all these threads runs at a time, and the owner decides which, so that what they
+compute does not depend on the computer's scheduler.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+R = TypeVar("R")
+
+
+class CoroutineClosed(BaseException):
+    """Ends a function whose owner has gone; its `except Exception` clauses do not catch it."""
+
+
+class ThreadCoroutine(Generic[R]):
+    """Runs `function` from one `pause` to the next; the function itself calls `pause`.
+
+    `result` is what it has returned, None before. Close it in the end: a thread that waits for ever
+    keeps all that its function refers to.
+    """
+
+    def __init__(self, function: Callable[[], R], name: str) -> None:
+        self._function = function
+        self._baton, self._returned = threading.Semaphore(0), threading.Semaphore(0)
+        self._error: BaseException | None = None
+        self._closed = self._ended = False
+        self.result: R | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def resume(self) -> bool:
+        """Let the function run until it pauses or ends; True if it has ended. What it raises is
+        raised here."""
+        if not self._ended:
+            self._baton.release()
+            self._returned.acquire()
+        if self._error is not None:
+            raise self._error
+        return self._ended
+
+    def pause(self) -> None:
+        """Called by the function: wait for the next `resume`."""
+        if not self._closed:
+            self._returned.release()
+            self._baton.acquire()
+        if self._closed:
+            raise CoroutineClosed
+
+    def close(self) -> None:
+        """End the function where it waits, if it has not ended by itself."""
+        self._closed = True
+        self._baton.release()
+        self._thread.join()
+
+    def _run(self) -> None:
+        self._baton.acquire()
+        try:
+            if not self._closed:
+                self.result = self._function()
+        except CoroutineClosed:
+            pass
+        except BaseException as error:  # for the owner, in its own thread
+            self._error = error
+        self._ended = True
+        self._returned.release()

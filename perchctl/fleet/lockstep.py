@@ -1,0 +1,337 @@
+"""A whole fleet's flight in lockstep: one room, one clock, the same result for a seed.
+
+Each vehicle is one flight in lockstep, as `perchctl simulate --faults` flies and judges it. It runs
+in a `ThreadCoroutine` that pauses at each tick of the room's clock:
+
+    for each group of the schedule:
+        until all of its flights have ended:
+            the clock advances by TICK_S
+            each flight runs until its own clock has reached the room's     (in the fleet's order)
+            the room measures distances, and says who feels whose downwash
+
+A vehicle of a later group stands at its home meanwhile. What has ended stays where it is: it hangs,
+stands or lies. The next group is started only past what the schedule allows: who lies away from its
+home may be in somebody's way.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perchctl.campaign import run_measured
+from perchctl.corridor import Point
+from perchctl.errors import UsageError
+from perchctl.faults import (
+    COMMON_CAUSES,
+    FAULTS,
+    HEALTHY,
+    Case,
+    CommonCause,
+    FaultResult,
+    FaultyFlight,
+    draw_case,
+    lasts_s,
+)
+from perchctl.fleet.coroutine import ThreadCoroutine
+from perchctl.fleet.plan import FleetPlan
+from perchctl.fleet.results import FleetResult, fleet_outcome, refused_vehicle
+from perchctl.fleet.room import PlacedVehicle, Room, place_fleet, vehicle_seed
+from perchctl.fleet.schedule import OBSTACLE_M
+
+TICK_S = 0.02
+"""Of the room's clock: two vehicles that fly 0.4 m/s are 8 mm nearer by then. Larger: a collision
+between two ticks is missed, and downwash is late; smaller: more waiting for each other."""
+AT_HOME_M = 0.12
+"""A vehicle that has landed this near its home stands where the plan expects it: the radius that
+Crazyswarm takes for a vehicle. Larger: a plan is trusted whose obstacles have moved."""
+CAUSE_S = (1.0, 25.0)
+"""When a common cause befalls a group, after its begin: nearly all vehicles hang after 25 s."""
+FOR_GOOD_S = 1e3
+"""A common cause that lasts longer than any flight is over for no later group."""
+_FAULT_STREAM = 32
+_BY_NAME = {fault.name: fault for fault in FAULTS}
+_CAUSES = {cause.name: cause for cause in COMMON_CAUSES}
+
+
+def fleet_faults() -> dict[str, str]:
+    """All faults of one vehicle and all common causes: name and description."""
+    causes = {name: f"in several vehicles: {c.fault.description}" for name, c in _CAUSES.items()}
+    return {name: fault.description for name, fault in _BY_NAME.items()} | causes
+
+
+def plan_sha256(plan: FleetPlan) -> str:
+    """The SHA-256 of all that may change a fleet's flight, for a file of results."""
+    profiles = [vehicle.profile.model_dump(mode="json") for vehicle in plan.fleet.vehicles]
+    text = json.dumps([plan.record(), profiles], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def select_fleet_faults(names: str) -> tuple[str, ...]:
+    """The names of faults and common causes that stand in `names` between commas; ``all``: every
+    fault and every cause. Errors: UsageError."""
+    if names == "all":
+        return (*_BY_NAME, *_CAUSES)
+    found = [part.strip() for part in names.split(",")]
+    unknown = next((name for name in found if name not in {*_BY_NAME, *_CAUSES}), None)
+    if unknown is not None:
+        raise UsageError(f"fault {unknown!r} is unknown; `--faults list` shows all there are")
+    return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trouble:
+    """What befalls the fleet of one seed.
+
+    Attributes:
+        name: of a fault or of a common cause; "none" without.
+        cases: by vehicle; who is not named has none.
+        group, at_s: when a common cause begins: so long after the begin of a group (from 0).
+            None: each case begins by itself.
+    """
+
+    name: str = HEALTHY.fault.name
+    cases: dict[str, Case]
+    group: int = 0
+    at_s: float | None = None
+
+
+def draw_trouble(
+    plan: FleetPlan, placed: Sequence[PlacedVehicle], faults: Sequence[str], seed: int
+) -> Trouble:
+    """The fault or common cause of a seed, drawn from the names `faults`; none of no names."""
+    if not faults:
+        return Trouble(cases={})
+    rng = np.random.default_rng([seed, _FAULT_STREAM])
+    name = faults[int(rng.integers(len(faults)))]
+    number = int(rng.integers(len(placed)))
+    if name in _BY_NAME:
+        one = placed[number]
+        case = draw_case(vehicle_seed(seed, number), one.scenario, [_BY_NAME[name]])
+        return Trouble(name=name, cases={one.name: case})
+    cause = _CAUSES[name]
+    case = cause.draw(rng, placed[number].scenario)
+    whom = _whom(cause, plan, [each.name for each in placed], number, rng)
+    group = int(rng.integers(len(plan.schedule.groups)))
+    at_s = round(float(rng.uniform(*CAUSE_S)), 3)
+    return Trouble(name=name, cases=dict.fromkeys(whom, case), group=group, at_s=at_s)
+
+
+def _whom(
+    cause: CommonCause, plan: FleetPlan, names: list[str], number: int, rng: np.random.Generator
+) -> Sequence[str]:
+    match cause.whom:
+        case "pair" if len(names) > 1:
+            others = [name for name in names if name != names[number]]
+            return names[number], others[int(rng.integers(len(others)))]
+        case "dongle" if plan.dongles:
+            return plan.dongles[int(rng.integers(len(plan.dongles)))].vehicles
+    return names
+
+
+# --- One fleet ---
+
+
+class _Seat:
+    """One vehicle's flight in the room: a thread that waits at each tick."""
+
+    def __init__(self, placed: PlacedVehicle, case: Case, room: Room, clock: _Clock) -> None:
+        self._placed, self._case, self._room, self._clock = placed, case, room, clock
+        self._begin_s = clock.t_s
+        self.name = placed.name
+        self.flight: FaultyFlight | None = None
+        self.known_m: Point = placed.profile.safety.corridor.home_m  # type: ignore[union-attr]
+        self.coroutine = ThreadCoroutine(self._fly, f"flight of {placed.name}")
+
+    def _fly(self) -> FaultResult:
+        placed = self._placed
+        self.flight = flight = FaultyFlight(
+            placed.profile,
+            self._case,
+            placed.scenario,
+            on_sample=self._wait,
+            others=self._room.others_of(self.name),
+        )
+        self._room.bodies[self.name].follow(flight.vehicle)
+        return flight.fly()
+
+    def _wait(self, t_s: float) -> None:
+        """Wait for the room's clock where this flight's own has reached it."""
+        while self._begin_s + t_s >= self._clock.t_s - 1e-6:
+            self.coroutine.pause()
+
+    def note_place(self) -> None:
+        """Note where the vehicle's estimate has it, in its own axes: all that its parent knows."""
+        if self.flight is not None:
+            read = self.flight.vehicle.firmware.log_value
+            self.known_m = read("stateEstimate.x"), read("stateEstimate.y")
+
+
+class _Clock:
+    """The room's time."""
+
+    def __init__(self) -> None:
+        self._ticks = 0
+
+    @property
+    def t_s(self) -> float:
+        return self._ticks * TICK_S
+
+    def advance(self) -> None:
+        self._ticks += 1
+
+
+class FleetFlight:
+    """One fleet's flight, ready for a single call of `fly`."""
+
+    def __init__(self, plan: FleetPlan, placed: Sequence[PlacedVehicle], trouble: Trouble) -> None:
+        self._plan, self._trouble = plan, trouble
+        self._placed = {each.name: each for each in placed}
+        self._room, self._clock = Room(placed), _Clock()
+        self._results: dict[str, FaultResult] = {}
+        self._known_m: dict[str, Point] = {}  # where who has ended is, in the room, as known
+        self._landed_all = ""  # who has failed, and all land for it
+
+    def fly(self, seed: int) -> FleetResult:
+        """Fly group by group, and return what became of all."""
+        for number, group in enumerate(self._plan.schedule.groups):
+            starters = [name for name in group if not self._refuse(name)]
+            self._fly_group(starters, number)
+        room, results = self._room, [self._results[name] for name in self._placed]
+        return FleetResult(
+            seed=seed,
+            outcome=fleet_outcome(results),
+            fault=self._trouble.name,
+            names=tuple(self._placed),
+            vehicles=tuple(replace(result, seed=seed) for result in results),
+            collisions=len(room.collided),
+            collided=tuple(sorted(room.collided)),
+            least_distance_m=_finite(room.least_m),
+            least_distance_in_air_m=_finite(room.least_both_m),
+            separation_m=self._plan.separation_m,
+            time_s=self._clock.t_s,
+        )
+
+    def _fly_group(self, names: Sequence[str], number: int) -> None:
+        begin_s, cause_s = self._clock.t_s, self._trouble.at_s
+        waiting = cause_s is not None and number == self._trouble.group
+        with self._seats(names) as seats:
+            while seats:
+                self._clock.advance()
+                for seat in list(seats):
+                    if seat.coroutine.resume():
+                        self._end(seat)
+                        seats.remove(seat)
+                self._room.update()
+                if waiting and cause_s is not None and self._clock.t_s >= begin_s + cause_s:
+                    waiting = False
+                    self._begin_cause(seats)
+                self._land_after_failure(seats)
+
+    @contextmanager
+    def _seats(self, names: Sequence[str]) -> Iterator[list[_Seat]]:
+        with ExitStack() as stack:
+            seats = []
+            for name in names:
+                case = self._trouble.cases.get(name, HEALTHY)
+                seats.append(_Seat(self._placed[name], case, self._room, self._clock))
+                stack.callback(seats[-1].coroutine.close)
+            yield seats
+
+    def _begin_cause(self, seats: Sequence[_Seat]) -> None:
+        for seat in seats:
+            flight = seat.flight
+            if seat.name in self._trouble.cases and flight is not None and flight.end is None:
+                flight.begin_fault()
+
+    def _end(self, seat: _Seat) -> None:
+        result = seat.coroutine.result
+        assert result is not None
+        body = self._room.bodies[seat.name]
+        seat.note_place()
+        self._results[seat.name] = result
+        body.rest()
+        vehicle = self._plan.fleet.vehicle(seat.name)
+        frame = replace(vehicle, frame="home")
+        hangs = result.outcome == "perched"
+        self._known_m[seat.name] = vehicle.target_m if hangs else frame.to_room(seat.known_m)
+
+    def _land_after_failure(self, seats: Sequence[_Seat]) -> None:
+        """By ``on_failure: land-all``, land all others once one has ended without perching."""
+        if self._plan.fleet.on_failure != "land-all" or self._landed_all:
+            return
+        ended = {name: result.outcome for name, result in self._results.items()}
+        ended |= {s.name: s.flight.end for s in seats if s.flight is not None and s.flight.end}
+        failed = next((name for name, end in ended.items() if end != "perched"), None)
+        if failed is None:
+            return
+        self._landed_all = failed
+        for seat in seats:
+            if seat.flight is not None and seat.flight.end is None:
+                seat.flight.land()
+
+    # --- Who must not start ---
+
+    def _refuse(self, name: str) -> bool:
+        """Note a vehicle that must not start as refused, standing at its home."""
+        reason = self._refusal(name)
+        if not reason:
+            return False
+        self._results[name] = refused_vehicle(reason)
+        self._known_m[name] = self._plan.fleet.vehicle(name).home_m
+        return True
+
+    def _refusal(self, name: str) -> str:
+        if self._landed_all:
+            return f"{self._landed_all} has failed, and on_failure is land-all"
+        if self._is_lasting(name):
+            return f"{self._trouble.name}: {self._trouble.cases[name].fault.description}"
+        return next(filter(None, (self._in_the_way(other, name) for other in self._known_m)), "")
+
+    def _in_the_way(self, other: str, name: str) -> str:
+        """Why a vehicle that has ended is in the way of `name`; empty if it is not. A place that
+        nobody knows (NaN) is."""
+        place_m, result = self._known_m[other], self._results[other]
+        does = "hangs" if result.outcome == "perched" else "lies"
+        if not all(map(math.isfinite, place_m)):
+            return f"nobody knows where {other} {does}"
+        gap_m = self._plan.corridors[name].distance_to_m(place_m)
+        if gap_m < OBSTACLE_M:
+            inside = f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
+            return f"{other} {does} {inside} its corridor"
+        away_m = math.dist(place_m, self._plan.fleet.vehicle(other).home_m)
+        together = self._plan.schedule.may_fly_together(other, name)
+        if does == "lies" and not (together or away_m <= AT_HOME_M):
+            return f"{other} lies {away_m:.2f} m from its home, in a corridor that is too near"
+        return ""
+
+    def _is_lasting(self, name: str) -> bool:
+        """True if a common cause that befell an earlier group lasts for good."""
+        trouble = self._trouble
+        if trouble.at_s is None or name not in trouble.cases or not self._results:
+            return False
+        flown = self._plan.group_number(name) - 1 > trouble.group
+        return flown and lasts_s(trouble.cases[name]) > FOR_GOOD_S
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+
+def fly_fleet(plan: FleetPlan, faults: tuple[str, ...], seed: int) -> FleetResult:
+    """Fly one seed of a fleet to its end; any executor can send this function to a worker.
+
+    `faults`: names of `select_fleet_faults`, one of which the seed draws; none: no fault.
+    """
+
+    def fly() -> FleetResult:
+        placed = place_fleet(plan.fleet, seed)
+        return FleetFlight(plan, placed, draw_trouble(plan, placed, faults, seed)).fly(seed)
+
+    return run_measured(fly)

@@ -1,0 +1,138 @@
+"""How simulated fleets ended: one fleet's result, and a campaign's figures for JSON and as text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from perchctl.campaign import CampaignFlight, align_columns, rate_text
+from perchctl.faults import ENDS, NO_FAULT, FaultResult, fault_summary
+
+_FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
+WORST_FLEETS = 10
+"""That are named."""
+
+
+@dataclass(frozen=True)
+class FleetResult(CampaignFlight):
+    """Result of one fleet's flight.
+
+    Attributes:
+        outcome: perched if all vehicles have, else that of its worst vehicle.
+        fault: name of the fault in one vehicle, or of the common cause; "none" without.
+        vehicles: result of each vehicle, in the order of `names`.
+        collisions: number of pairs in `collided`, which came nearer than two vehicles may.
+        least_distance_m: least level distance between two vehicles while one's motors turned.
+        least_distance_in_air_m: the same while both's did; None if there were never two.
+        separation_m: what the plan promises between the corridors of two that fly together.
+        time_s: from the first group's begin to the last one's end.
+    """
+
+    fault: str
+    names: tuple[str, ...]
+    vehicles: tuple[FaultResult, ...]
+    collisions: int
+    collided: tuple[tuple[str, str], ...]
+    least_distance_m: float | None
+    least_distance_in_air_m: float | None
+    separation_m: float
+    time_s: float
+
+    @property
+    def is_bad(self) -> bool:
+        """True if two collided, if a flag counts, or if a vehicle did not perch without a fault."""
+        missed = self.fault == NO_FAULT.name and self.outcome != "perched"
+        return self.collisions > 0 or missed or any(v.is_bad for v in self.vehicles)
+
+
+def fleet_outcome(results: Sequence[FaultResult]) -> str:
+    """The fleet's outcome: perched if all vehicles have, else that of its worst one."""
+    return max((result.outcome for result in results), key=_FROM_GOOD_TO_BAD.index)
+
+
+def refused_vehicle(reason: str) -> FaultResult:
+    """The result of a vehicle that the fleet did not let start."""
+    return FaultResult(
+        seed=0,
+        outcome="refused",
+        fault=NO_FAULT.name,
+        phase="",
+        moment_s=0.0,
+        begin_s=None,
+        parameters={},
+        reason=reason,
+        flags={},
+        counted=(),
+        time_s=0.0,
+        miss_m=None,
+        drop_m=0.0,
+    )
+
+
+def fleet_summary(results: Sequence[FleetResult]) -> dict[str, Any]:
+    """A campaign's figures as a record for JSON: of the fleets, and of all their vehicles what
+    `fault_summary` counts."""
+    figures = fault_summary([vehicle for fleet in results for vehicle in fleet.vehicles])
+    del figures["worst_seeds"]
+    return {
+        "fleets": len(results),
+        "vehicles": figures.pop("flights"),
+        **figures,
+        "all_perched": sum(r.outcome == "perched" for r in results),
+        "collisions": sum(r.collisions for r in results),
+        "least_distance_m": _least([r.least_distance_m for r in results]),
+        "least_distance_in_air_m": _least([r.least_distance_in_air_m for r in results]),
+        "separation_m": results[0].separation_m if results else None,
+        "worst_seeds": [r.seed for r in worst_fleets(results)[:WORST_FLEETS]],
+    }
+
+
+def _least(values_m: Sequence[float | None]) -> float | None:
+    return min((value for value in values_m if value is not None), default=None)
+
+
+def worst_fleets(results: Sequence[FleetResult]) -> list[FleetResult]:
+    """The fleets in which something went wrong: collisions first, then flags that count."""
+    bad = [r for r in results if r.is_bad]
+    return sorted(bad, key=lambda r: (-r.collisions, -sum(v.is_bad for v in r.vehicles), r.seed))
+
+
+def fleet_table(results: Sequence[FleetResult]) -> str:
+    """The figures and the worst fleets as plain text."""
+    figures = fleet_summary(results)
+    vehicles = figures["vehicles"]
+    lines = [
+        f"{'fleets':<22}{figures['fleets']}, {figures['all_perched']} with all vehicles perched",
+        f"{'vehicles':<22}{vehicles}",
+    ]
+    for end, meaning in ENDS.items():
+        if figures[end] or end == "perched":
+            lines.append(f"{end:<22}{rate_text(figures[end], vehicles)}: {meaning}")
+    lines.append(f"{'collisions':<22}{figures['collisions']}")
+    for name, words in (("least_distance_m", "flying"), ("least_distance_in_air_m", "both flying")):
+        if (least_m := figures[name]) is not None:
+            lines.append(f"{'least distance':<22}{least_m:.2f} m between two vehicles, {words}")
+    wrong = figures["wrong"].get("rate", 0.0) * vehicles
+    lines.append(f"{'with a flag':<22}{wrong:.0f} vehicles; {figures['unavoidable']} unavoidable")
+    if worst := worst_fleets(results)[:WORST_FLEETS]:
+        lines += ["", "worst fleets"]
+        rows: list[tuple[str, ...]] = [("seed", "fault", "vehicle", "end", "what")]
+        for fleet in worst:
+            rows += _rows(fleet)
+        lines += align_columns(rows)
+    return "\n".join(lines)
+
+
+def _rows(fleet: FleetResult) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [
+        (str(fleet.seed), fleet.fault, f"{first}, {second}", "", "collided")
+        for first, second in fleet.collided
+    ]
+    for name, vehicle in zip(fleet.names, fleet.vehicles, strict=True):
+        missed = fleet.fault == NO_FAULT.name and vehicle.outcome != "perched"
+        if vehicle.counted or missed:
+            flags = ", ".join(flag.replace("_", " ") for flag in vehicle.counted)
+            what = flags or vehicle.reason
+            rows.append((str(fleet.seed), fleet.fault, name, vehicle.outcome, what))
+    return rows

@@ -1,0 +1,237 @@
+"""One simulated room: where each vehicle of a fleet stands, hangs and flies, what they blow onto
+each other, and how near they come.
+
+Each vehicle is simulated in axes of its own, whose origin is the floor below its start. An estimate
+in the room's axes is the same flight with other numbers, so it is simulated in those axes, too. The
+room converts all places with `FleetVehicle.to_room`.
+
+A start is never exactly where the fleet file says. An estimate that starts at zero does not know
+the difference; one in the room's axes does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perchctl.fleet.fleet import Fleet, FleetVehicle
+from perchctl.fleet.load import MOST_VEHICLES
+from perchctl.fleet.schedule import flown_profile
+from perchctl.profile import Profile
+from perchctl.sim import (
+    Neighbour,
+    Scenario,
+    SimulatedVehicle,
+    downwash_mps,
+    draw_scenario,
+)
+
+START_ERROR_M = 0.03
+"""Of a home from the fleet file, each axis, at most: measured with a tape, and set down by hand.
+Larger: flights that no plan allows for."""
+START_TURN_DEG = 2.0
+"""Of a nose from `heading_deg`, at most. Larger: a way of 2 m ends farther off than drift leads."""
+SEEN_M = 3.0
+"""A neighbour's target farther off is in no picture of a camera below another one. Larger: pictures
+take longer to compute."""
+COLLISION_RADIUS_M = 0.12
+"""Half-width of the ellipsoid that one vehicle needs, by Crazyswarm (IMRCLab/crazyswarm). The
+centres of two vehicles keep twice as much. Larger: vehicles that pass count as collided."""
+COLLISION_HALF_HEIGHT_M = 0.3
+"""Half-height of the same: a vehicle this far below flies in the other one's wake."""
+_START_STREAM = 31
+_Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedVehicle:
+    """A vehicle in the room of one seed.
+
+    Attributes:
+        true: the vehicle where it really stands, its estimate in axes that begin there.
+        profile: what it flies by, its corridor included.
+    """
+
+    name: str
+    true: FleetVehicle
+    profile: Profile
+    scenario: Scenario
+
+
+def vehicle_seed(seed: int, number: int) -> int:
+    """The seed of the vehicle with that number (from 0) in the fleet: no two flights share one."""
+    return MOST_VEHICLES * seed + number
+
+
+def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
+    """The fleet in the room of a seed: its starts, one ceiling, and each vehicle's own scenario
+    with its own target, and its neighbours' as far as its camera may see them."""
+    rng = np.random.default_rng([seed, _START_STREAM])
+    drawn = []
+    for number, vehicle in enumerate(fleet.vehicles):
+        x_m, y_m = rng.uniform(-START_ERROR_M, START_ERROR_M, size=2).tolist()
+        turn_deg = float(rng.uniform(-START_TURN_DEG, START_TURN_DEG))
+        true = replace(
+            vehicle,
+            home_m=(vehicle.home_m[0] + x_m, vehicle.home_m[1] + y_m),
+            heading_deg=vehicle.heading_deg + turn_deg,
+            frame="home",
+        )
+        drawn.append((true, draw_scenario(vehicle.profile, vehicle_seed(seed, number))))
+    ceiling_z_m = drawn[0][1].ceiling_z_m
+    placed = []
+    for vehicle, (true, scenario) in zip(fleet.vehicles, drawn, strict=True):
+        knows = vehicle.frame == "room"
+        flown = true.with_target(true.target_m, vehicle.profile.target) if knows else vehicle
+        placed.append(
+            PlacedVehicle(
+                name=vehicle.name,
+                true=true,
+                profile=flown_profile(vehicle, flown),
+                scenario=replace(
+                    scenario,
+                    ceiling_z_m=ceiling_z_m,
+                    target_xy_m=true.to_estimate(true.target_m),
+                    neighbours=_neighbours(true, scenario, drawn),
+                ),
+            )
+        )
+    return tuple(placed)
+
+
+def _neighbours(
+    own: FleetVehicle, scenario: Scenario, drawn: Sequence[tuple[FleetVehicle, Scenario]]
+) -> tuple[Neighbour, ...]:
+    """The other vehicles' targets in the axes of the own one. Their ids are named even where they
+    are the own ones: to fly to one of them is to stray."""
+    found = []
+    heading_rad = math.radians(own.heading_deg) + scenario.target_yaw_rad
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    for other, theirs in drawn:
+        x_m, y_m = (b - a for a, b in zip(own.target_m, other.target_m, strict=True))
+        if other is own or other.name == own.name or math.hypot(x_m, y_m) > SEEN_M:
+            continue
+        target = other.profile.target
+        found.append(
+            Neighbour(
+                (c * x_m + s * y_m, c * y_m - s * x_m),
+                math.radians(other.heading_deg) + theirs.target_yaw_rad - heading_rad,
+                target.large.id,
+                target.small.id,
+            )
+        )
+    return tuple(found)
+
+
+# --- All of them, as time passes ---
+
+
+class Body:
+    """One vehicle in the room: simulated, or where it stands, hangs or lies."""
+
+    def __init__(self, placed: PlacedVehicle) -> None:
+        self._true = placed.true
+        self._vehicle: SimulatedVehicle | None = None
+        self._rest_m: _Place = (*placed.true.home_m, 0.0)
+
+    def follow(self, vehicle: SimulatedVehicle) -> None:
+        """Take the place of a simulated vehicle from now on."""
+        self._vehicle = vehicle
+
+    def rest(self) -> None:
+        """Stay where it is, with its motors off."""
+        self._rest_m, self._vehicle = self.place_m, None
+
+    @property
+    def vehicle(self) -> SimulatedVehicle | None:
+        return self._vehicle
+
+    @property
+    def place_m(self) -> _Place:
+        """Its true place, in the room's axes."""
+        if self._vehicle is None:
+            return self._rest_m
+        world = self._vehicle.world
+        return (*self._true.to_room((world.x_m, world.y_m)), world.z_m)
+
+    @property
+    def thrust_n(self) -> float:
+        """Of all rotors together."""
+        return 0.0 if self._vehicle is None else sum(self._vehicle.world.powertrain.forces_n)
+
+    @property
+    def turns(self) -> bool:
+        """True if its motors turn."""
+        return self._vehicle is not None and max(self._vehicle.firmware.motors) > 0.0
+
+    def in_own_axes(self, place_m: _Place) -> _Place:
+        """A place of the room in the axes of this vehicle's simulation."""
+        return (*self._true.to_estimate(place_m[:2]), place_m[2])
+
+
+class Room:
+    """All vehicles of a fleet, by name.
+
+    Attributes:
+        collided: the pairs whose centres came nearer than two ellipsoids of `COLLISION_RADIUS_M`
+            and `COLLISION_HALF_HEIGHT_M` while the motors of one turned.
+        least_m: least level distance between the centres of two vehicles of which one's motors
+            turn, as heights do not count between corridors; infinite before.
+        least_both_m: the same of two whose motors turn.
+    """
+
+    def __init__(self, placed: Sequence[PlacedVehicle]) -> None:
+        self.bodies = {each.name: Body(each) for each in placed}
+        self.collided: set[tuple[str, str]] = set()
+        self.least_m = self.least_both_m = math.inf
+
+    def others_of(self, name: str) -> tuple[tuple[str, _Place], ...]:
+        """The other vehicles with their places, as a motion capture sees them in the axes of the
+        vehicle called `name`."""
+        own = self.bodies[name]
+        return tuple(
+            (f"body of {other}", own.in_own_axes(body.place_m))
+            for other, body in self.bodies.items()
+            if body is not own
+        )
+
+    def update(self) -> None:
+        """Measure distances, and let each simulated vehicle feel and see the others where they are
+        now. To call when all of them have reached the same time."""
+        places = {name: body.place_m for name, body in self.bodies.items()}
+        turning = {name: body.turns for name, body in self.bodies.items()}
+        for pair in itertools.combinations(self.bodies, 2):
+            self._measure(pair, places, turning)
+        for name, body in self.bodies.items():
+            if body.vehicle is None:
+                continue
+            x_m, y_m, z_m = places[name]
+            body.vehicle.world.downwash_mps = sum(
+                downwash_mps(other.thrust_n, z - z_m, math.hypot(x - x_m, y - y_m))
+                for above, other in self.bodies.items()
+                for x, y, z in [places[above]]
+                if above != name and turning[above]
+            )
+            if body.vehicle.capture is not None:
+                order = [other for other, _ in body.vehicle.capture.settings.others]
+                seen = dict(self.others_of(name))
+                body.vehicle.capture.others_m = [seen[other] for other in order]
+
+    def _measure(
+        self, pair: tuple[str, str], places: dict[str, _Place], turning: dict[str, bool]
+    ) -> None:
+        motors = [turning[name] for name in pair]
+        if not any(motors):
+            return
+        (x, y, z), (u, v, w) = (places[name] for name in pair)
+        level_m = math.hypot(x - u, y - v)
+        self.least_m = min(self.least_m, level_m)
+        if all(motors):
+            self.least_both_m = min(self.least_both_m, level_m)
+        aside, above = level_m / COLLISION_RADIUS_M, (z - w) / COLLISION_HALF_HEIGHT_M
+        if math.hypot(aside, above) < 2.0:
+            self.collided.add(pair)

@@ -1,0 +1,345 @@
+"""Who flies when in a simulated fleet, and what befalls it: with flights that a test makes up, and
+in whole flights that run with the long tests."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.errors import UsageError
+from perchctl.faults import FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
+from perchctl.fleet import (
+    Fleet,
+    FleetResult,
+    fleet_summary,
+    fleet_table,
+    fly_fleet,
+    load_fleet,
+    lockstep,
+    make_plan,
+    select_fleet_faults,
+)
+from perchctl.fleet.lockstep import TICK_S, FleetFlight, Trouble, draw_trouble
+from perchctl.fleet.results import refused_vehicle
+from perchctl.fleet.room import place_fleet
+from perchctl.record import from_exact_json, to_exact_json
+from tests.fleet.rig import fleet
+from tests.fleet.test_room import flying
+from tests.helpers.commands import run
+
+SAMPLE_S = 0.01
+
+
+@dataclass
+class Script:
+    """What a made-up flight does: it ends after `lasts_s`, and its estimate has it at `lies_m`,
+    in its own axes."""
+
+    lasts_s: float = 0.1
+    outcome: str = "perched"
+    lies_m: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass
+class Stage:
+    """The scripts of the flights, by vehicle, and what happened, in order."""
+
+    scripts: dict[str, Script] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+
+
+class FakeFlight:
+    """A `FaultyFlight` by script."""
+
+    def __init__(
+        self, stage: Stage, name: str, case: Case, on_sample: Callable[[float], None]
+    ) -> None:
+        self._stage, self.name, self._case, self._on_sample = stage, name, case, on_sample
+        self._script = stage.scripts.get(name, Script())
+        self.vehicle = flying(0.0, 0.0, 1.0)
+        place = dict(zip(("stateEstimate.x", "stateEstimate.y"), self._script.lies_m, strict=True))
+        self.vehicle.firmware.log_value = place.__getitem__
+        self.end: str | None = None
+        self._lands = False
+
+    def fly(self) -> FaultResult:
+        self._stage.log.append(f"{self.name} starts")
+        for step in range(1, round(self._script.lasts_s / SAMPLE_S) + 1):
+            self.sample(step * SAMPLE_S)
+            if self._lands:
+                break
+        self.end = "landed" if self._lands else self._script.outcome
+        self._stage.log.append(f"{self.name} {self.end}")
+        self.sample(self._script.lasts_s + 1.0)  # it is still watched
+        made = refused_vehicle("")
+        return replace(made, outcome=self.end, fault=self._case.fault.name, reason="as scripted")
+
+    def sample(self, t_s: float) -> None:
+        self._on_sample(t_s)
+
+    def land(self) -> None:
+        self._lands = True
+
+    def begin_fault(self) -> None:
+        self._stage.log.append(f"{self.name} meets {self._case.fault.name}")
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
+    made = Stage()
+
+    def flight(profile: Any, case: Case, _scenario: Any, *, on_sample: Any, others: Any) -> Any:
+        return FakeFlight(made, profile.name, case, on_sample)
+
+    monkeypatch.setattr(lockstep, "FaultyFlight", flight)
+    return made
+
+
+def fly(planned: Fleet, trouble: Trouble | None = None) -> FleetResult:
+    plan = make_plan(planned)
+    placed = [
+        replace(each, profile=each.profile.model_copy(update={"name": each.name}))
+        for each in place_fleet(plan.fleet, 1)
+    ]
+    return FleetFlight(plan, placed, trouble or Trouble(cases={})).fly(1)
+
+
+def row(count: int, apart_m: float = 3.0, **settings: Any) -> Fleet:
+    """Vehicles in a row, each below its own target, without conflicts."""
+    places = [(apart_m * n, 0.0) for n in range(count)]
+    return fleet([(place, place) for place in places], **settings)
+
+
+def outcomes(result: FleetResult) -> list[str]:
+    return [vehicle.outcome for vehicle in result.vehicles]
+
+
+def test_a_group_starts_together_and_the_next_when_all_of_it_have_ended(stage: Stage) -> None:
+    stage.scripts = {"v0": Script(0.3), "v1": Script(0.1)}
+    result = fly(row(3, order="2 at a time"))
+    assert stage.log == [
+        "v0 starts", "v1 starts", "v1 perched", "v0 perched", "v2 starts", "v2 perched",
+    ]  # fmt: skip
+    assert outcomes(result) == ["perched"] * 3
+    assert result.outcome == "perched"
+    assert result.least_distance_m == pytest.approx(3.0, abs=0.1)
+
+
+def test_no_flight_is_more_than_a_tick_ahead_of_another(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clocks = dict.fromkeys(("v0", "v1", "v2"), 0.0)
+    furthest_s: list[float] = []
+    wait = FakeFlight.sample
+
+    def note(flight: FakeFlight, t_s: float) -> None:
+        clocks[flight.name] = t_s
+        furthest_s.append(max(clocks.values()) - min(clocks.values()))
+        wait(flight, t_s)
+
+    monkeypatch.setattr(FakeFlight, "sample", note)
+    stage.scripts = {name: Script(0.3) for name in clocks}
+    result = fly(row(3, order="together"))
+    assert max(furthest_s[:-3]) <= TICK_S + 1e-9, "but for the wait after the end"
+    assert result.time_s == pytest.approx(1.3, abs=2 * TICK_S)
+
+
+CROSSING = [((0.0, 0.0), (1.0, 0.0)), ((0.5, -1.0), (0.5, -1.5)), ((5.0, 0.0), (5.0, 0.0))]
+"""v0 and v1 may not fly together: their corridors are 0.3 m apart."""
+
+
+@pytest.mark.parametrize(
+    ("script", "second", "words"),
+    [
+        (Script(), "perched", ""),
+        (Script(outcome="landed"), "perched", ""),  # at its home, as planned
+        (Script(outcome="landed", lies_m=(0.6, 0.0)), "refused", "v0 lies 0.60 m from its home"),
+        (Script(outcome="landed", lies_m=(0.5, -0.5)), "refused", "v0 lies 0.15 m from its cor"),
+        (Script(outcome="gone", lies_m=(math.nan, 0.0)), "refused", "nobody knows where v0 lies"),
+        (Script(outcome="landed", lies_m=(0.5, -1.2)), "refused", "v0 lies 0.35 m inside its"),
+    ],
+)
+def test_who_lies_away_from_its_home_may_block_others(
+    stage: Stage, script: Script, second: str, words: str
+) -> None:
+    stage.scripts = {"v0": script}
+    result = fly(fleet(CROSSING))
+    third = "refused" if math.isnan(script.lies_m[0]) else "perched"
+    assert outcomes(result)[1:] == [second, third], "whose corridor is far away"
+    assert words in result.vehicles[1].reason
+    assert ("v1 starts" in stage.log) is (second == "perched")
+
+
+def test_land_all_lands_who_flies_and_starts_nobody_else(stage: Stage) -> None:
+    stage.scripts = {"v0": Script(0.1, "aborted"), "v1": Script(9.0)}
+    result = fly(row(3, order="2 at a time", on_failure="land-all"))
+    assert outcomes(result) == ["aborted", "landed", "refused"]
+    assert result.vehicles[2].reason == "v0 has failed, and on_failure is land-all"
+    assert result.outcome == "aborted"
+    stage.log.clear()
+    result = fly(row(3, order="2 at a time"))
+    assert outcomes(result) == ["aborted", "perched", "perched"]
+
+
+def test_a_common_cause_befalls_all_that_fly_and_outlasts_them(stage: Stage) -> None:
+    plan = make_plan(row(3, order="2 at a time"))
+    drawn = draw_trouble(plan, place_fleet(plan.fleet, 1), ["dongle-dies"], 3)
+    assert set(drawn.cases) == {"v0", "v1", "v2"}
+    stage.scripts = {f"v{n}": Script(0.3) for n in range(3)}
+    result = fly(plan.fleet, replace(drawn, group=0, at_s=0.1))
+    assert [line for line in stage.log if "meets" in line] == [
+        "v0 meets dongle-dies", "v1 meets dongle-dies",
+    ]  # fmt: skip
+    assert outcomes(result) == ["perched", "perched", "refused"]
+    assert result.vehicles[2].reason.startswith("dongle-dies: the links of all")
+    stage.log.clear()
+    stall = draw_trouble(plan, place_fleet(plan.fleet, 1), ["stall"], 3)
+    assert outcomes(fly(plan.fleet, replace(stall, group=0, at_s=0.1)))[2] == "perched"
+
+
+def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
+    plan = make_plan(row(4, order="together"))
+    placed = place_fleet(plan.fleet, 1)
+    for seed in range(8):
+        assert len(draw_trouble(plan, placed, ["bodies-swap"], seed).cases) == 2
+        one = draw_trouble(plan, placed, ["kick", "gust"], seed)
+        assert len(one.cases) == 1
+        assert one.at_s is None
+        (name, case), again = *one.cases.items(), draw_trouble(plan, placed, ["kick", "gust"], seed)
+        assert (again.name, again.cases[name].moment_s) == (one.name, case.moment_s)
+    met = {next(iter(draw_trouble(plan, placed, ["kick"], seed).cases)) for seed in range(30)}
+    assert met == {"v0", "v1", "v2", "v3"}
+    assert draw_trouble(plan, placed, (), 1).cases == {}
+
+
+def test_an_error_of_a_flight_ends_the_fleet_and_all_its_threads(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any, **__: Any) -> Any:
+        raise UsageError("no simulator")
+
+    stage.scripts = {"v0": Script(9.0)}
+    working = lockstep.FaultyFlight
+
+    def flight(profile: Any, *parts: Any, **named: Any) -> Any:
+        return (broken if profile.name == "v1" else working)(profile, *parts, **named)
+
+    monkeypatch.setattr(lockstep, "FaultyFlight", flight)
+    with pytest.raises(UsageError, match="no simulator"):
+        fly(row(2, order="together"))
+
+
+# --- what is printed ---
+
+
+def made(**changes: Any) -> FleetResult:
+    vehicle = replace(refused_vehicle(""), outcome="perched")
+    values: dict[str, Any] = {
+        "seed": 5, "outcome": "perched", "fault": "none", "names": ("a", "b"),
+        "vehicles": (vehicle, vehicle), "collisions": 0, "collided": (), "least_distance_m": 1.5,
+        "least_distance_in_air_m": None, "separation_m": 0.4, "time_s": 40.0,
+    }  # fmt: skip
+    return FleetResult(**{**values, **changes})
+
+
+def test_figures_count_fleets_and_vehicles() -> None:
+    landed = replace(made().vehicles[0], outcome="landed", flags={"fell": 1.0}, counted=("fell",))
+    hit = made(
+        seed=6, fault="kick", outcome="landed", vehicles=(landed, made().vehicles[0]),
+        collisions=1, collided=(("a", "b"),), least_distance_m=0.1, least_distance_in_air_m=0.2,
+    )  # fmt: skip
+    figures = fleet_summary([made(), hit])
+    wanted = {
+        "fleets": 2, "vehicles": 4, "perched": 3, "landed": 1, "collisions": 1, "fell": 1,
+        "least_distance_m": 0.1, "least_distance_in_air_m": 0.2, "worst_seeds": [6],
+    }  # fmt: skip
+    assert wanted.items() <= figures.items()
+    text = fleet_table([made(), hit])
+    assert "a, b" in text
+    assert "collided" in text
+    assert "0.10 m between two vehicles, flying" in text
+    assert json.loads(json.dumps(fleet_summary([]))) == fleet_summary([])
+
+
+def test_a_result_is_written_and_read_back() -> None:
+    data = json.loads(json.dumps(to_exact_json(made())))
+    assert from_exact_json(FleetResult, data) == made()
+
+
+def test_faults_are_chosen_by_name() -> None:
+    assert len(select_fleet_faults("all")) == len(FAULTS) + 4
+    assert select_fleet_faults("kick, stall") == ("kick", "stall")
+    assert HEALTHY.fault.name not in select_fleet_faults("all")
+    done = run("fleet", "simulate", "--faults", "none")
+    assert done.code == 2
+    assert done.complaint.startswith("fault 'none' is unknown")
+    assert "bodies-swap" in run("fleet", "simulate", "--faults", "list").stdout
+
+
+def test_a_fleet_that_cannot_fly_is_refused_before_any_flight(tmp_path: Path) -> None:
+    path = tmp_path / "clash.yaml"
+    path.write_text(
+        "vehicles:\n  - {name: a, home_m: [0, 0], target_m: [0, 0]}\n"
+        "  - {name: b, home_m: [0.1, 0], target_m: [0.1, 0]}\n"
+    )
+    done = run("fleet", "simulate", str(path))
+    assert (done.code, done.stdout) == (30, "")
+    assert str(path) in done.stderr
+
+
+# --- whole flights ---
+
+SEED = 7
+
+
+@cache
+def flown(*faults: str, seed: int = SEED) -> FleetResult:
+    return fly_fleet(make_plan(load_fleet()), faults, seed)
+
+
+def told(result: FaultResult) -> FaultResult:
+    """All that became of a vehicle."""
+    return replace(result, seed=0, cpu_s=0.0)
+
+
+@pytest.mark.long
+def test_four_vehicles_perch_as_if_each_were_alone() -> None:
+    """No jet reaches the next one: to the last bit, the flight of each is the one without the
+    others."""
+    result = flown()
+    assert outcomes(result) == ["perched"] * 4
+    assert result.collisions == 0
+    assert result.least_distance_in_air_m is not None
+    assert result.least_distance_in_air_m > result.separation_m
+    placed = place_fleet(make_plan(load_fleet()).fleet, SEED)[1]
+    alone = FaultyFlight(placed.profile, HEALTHY, placed.scenario).fly()
+    assert told(result.vehicles[1]) == told(alone)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", ["killed", "kick", "hung"])
+def test_a_fault_in_one_vehicle_changes_nothing_for_its_neighbours(fault: str) -> None:
+    healthy, faulty = flown(), flown(fault)
+    pairs = list(zip(healthy.vehicles, faulty.vehicles, strict=True))
+    assert sum(theirs.fault == fault for _, theirs in pairs) == 1
+    for ours, theirs in pairs:
+        if theirs.fault != fault:
+            assert told(theirs) == told(ours)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("cause", ["capture-silent", "bodies-swap", "stall", "dongle-dies"])
+def test_no_common_cause_makes_vehicles_meet(cause: str) -> None:
+    result = flown(cause)
+    assert [vehicle.counted for vehicle in result.vehicles] == [()] * 4
+    assert result.collisions == 0
+    assert sum(vehicle.begin_s is not None for vehicle in result.vehicles) >= 1
