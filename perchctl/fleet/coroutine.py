@@ -4,8 +4,8 @@ A flight in lockstep is one long call, whose simulated time passes deep inside. 
 flights together, each one runs in a thread that gives the baton back at each step:
 
     owner                       thread
-    resume()  ── baton ──>      ... runs on ...
-              <── baton ──      pause()
+    resume()  --- baton --->    runs on
+              <-- baton ----    pause()
 
 Exactly one of all these threads runs at a time, and the owner decides which, so that what they
 compute does not depend on the computer's scheduler.

@@ -27,7 +27,7 @@ import numpy as np
 
 from perchctl.campaign import run_measured
 from perchctl.corridor import Point
-from perchctl.errors import UsageError
+from perchctl.errors import ConnectionFailed, UsageError
 from perchctl.faults import (
     COMMON_CAUSES,
     FAULTS,
@@ -151,13 +151,16 @@ class _Seat:
 
     def _fly(self) -> FaultResult:
         placed = self._placed
-        self.flight = flight = FaultyFlight(
-            placed.profile,
-            self._case,
-            placed.scenario,
-            on_sample=self._wait,
-            others=self._room.others_of(self.name),
-        )
+        try:
+            self.flight = flight = FaultyFlight(
+                placed.profile,
+                self._case,
+                placed.scenario,
+                on_sample=self._wait,
+                others=self._room.others_of(self.name),
+            )
+        except ConnectionFailed as error:  # such as no motion capture that sees it
+            return refused_vehicle(str(error))
         self._room.bodies[self.name].follow(flight.vehicle)
         return flight.fly()
 

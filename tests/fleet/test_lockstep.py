@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -15,15 +16,16 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.errors import UsageError
+from perchctl.errors import ConnectionFailed, UsageError
 from perchctl.faults import FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
 from perchctl.fleet import (
     Fleet,
+    FleetPlan,
     FleetResult,
+    FleetVehicle,
     fleet_summary,
     fleet_table,
     fly_fleet,
-    load_fleet,
     lockstep,
     make_plan,
     select_fleet_faults,
@@ -35,6 +37,7 @@ from perchctl.record import from_exact_json, to_exact_json
 from tests.fleet.rig import fleet
 from tests.fleet.test_room import flying
 from tests.helpers.commands import run
+from tests.helpers.flights import short_profile
 
 SAMPLE_S = 0.01
 
@@ -221,6 +224,21 @@ def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
     assert draw_trouble(plan, placed, (), 1).cases == {}
 
 
+def test_whom_nothing_measures_is_refused(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others fly on."""
+    working = lockstep.FaultyFlight
+
+    def flight(profile: Any, *parts: Any, **named: Any) -> Any:
+        if profile.name == "v0":
+            raise ConnectionFailed("no position within 1 s")
+        return working(profile, *parts, **named)
+
+    monkeypatch.setattr(lockstep, "FaultyFlight", flight)
+    result = fly(row(2, order="together"))
+    assert outcomes(result) == ["refused", "perched"]
+    assert result.vehicles[0].reason == "no position within 1 s"
+
+
 def test_an_error_of_a_flight_ends_the_fleet_and_all_its_threads(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +254,7 @@ def test_an_error_of_a_flight_ends_the_fleet_and_all_its_threads(
     monkeypatch.setattr(lockstep, "FaultyFlight", flight)
     with pytest.raises(UsageError, match="no simulator"):
         fly(row(2, order="together"))
+    assert not [each for each in threading.enumerate() if each.name.startswith("flight of")]
 
 
 # --- what is printed ---
@@ -299,47 +318,64 @@ def test_a_fleet_that_cannot_fly_is_refused_before_any_flight(tmp_path: Path) ->
 # --- whole flights ---
 
 SEED = 7
+CAUSE_S = 5.0
+"""Into the first group's flight: all are in the air."""
 
 
 @cache
-def flown(*faults: str, seed: int = SEED) -> FleetResult:
-    return fly_fleet(make_plan(load_fleet()), faults, seed)
+def short_plan() -> FleetPlan:
+    """Three vehicles on short flights, turned by other angles: two at a time."""
+    profile = short_profile()
+    places = [((0.0, 0.0), 0.0), ((2.5, 0.0), 90.0), ((0.0, 2.5), -45.0)]
+    vehicles = [
+        FleetVehicle(
+            name=f"v{n}", profile=profile, home_m=home_m, target_m=home_m, heading_deg=deg
+        ).with_target((home_m[0] + 0.05, home_m[1]))
+        for n, (home_m, deg) in enumerate(places)
+    ]
+    return make_plan(Fleet(name="short", vehicles=tuple(vehicles), order="2 at a time"))
 
 
-def told(result: FaultResult) -> FaultResult:
-    """All that became of a vehicle."""
-    return replace(result, seed=0, cpu_s=0.0)
+@cache
+def flown(*faults: str) -> FleetResult:
+    plan = short_plan()
+    placed = place_fleet(plan.fleet, SEED)
+    trouble = draw_trouble(plan, placed, faults, SEED)
+    if trouble.at_s is not None:
+        trouble = replace(trouble, group=0, at_s=CAUSE_S)
+    return FleetFlight(plan, placed, trouble).fly(SEED)
 
 
 @pytest.mark.long
-def test_four_vehicles_perch_as_if_each_were_alone() -> None:
+def test_vehicles_perch_as_if_each_were_alone_and_the_same_each_time() -> None:
     """No jet reaches the next one: to the last bit, the flight of each is the one without the
     others."""
     result = flown()
-    assert outcomes(result) == ["perched"] * 4
+    assert outcomes(result) == ["perched"] * 3
     assert result.collisions == 0
     assert result.least_distance_in_air_m is not None
     assert result.least_distance_in_air_m > result.separation_m
-    placed = place_fleet(make_plan(load_fleet()).fleet, SEED)[1]
+    placed = place_fleet(short_plan().fleet, SEED)[1]
     alone = FaultyFlight(placed.profile, HEALTHY, placed.scenario).fly()
-    assert told(result.vehicles[1]) == told(alone)
+    assert replace(result.vehicles[1], seed=0) == replace(alone, seed=0)
+    again = fly_fleet(short_plan(), (), SEED)
+    assert replace(again, cpu_s=0.0) == result
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", ["killed", "kick", "hung"])
 def test_a_fault_in_one_vehicle_changes_nothing_for_its_neighbours(fault: str) -> None:
-    healthy, faulty = flown(), flown(fault)
-    pairs = list(zip(healthy.vehicles, faulty.vehicles, strict=True))
+    pairs = list(zip(flown().vehicles, flown(fault).vehicles, strict=True))
     assert sum(theirs.fault == fault for _, theirs in pairs) == 1
     for ours, theirs in pairs:
         if theirs.fault != fault:
-            assert told(theirs) == told(ours)
+            assert theirs == ours
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("cause", ["capture-silent", "bodies-swap", "stall", "dongle-dies"])
 def test_no_common_cause_makes_vehicles_meet(cause: str) -> None:
     result = flown(cause)
-    assert [vehicle.counted for vehicle in result.vehicles] == [()] * 4
+    assert [vehicle.counted for vehicle in result.vehicles] == [()] * 3
     assert result.collisions == 0
     assert sum(vehicle.begin_s is not None for vehicle in result.vehicles) >= 1
