@@ -87,7 +87,7 @@ MOST_NAMES = {
     "check": 8,
     "commands": 2,
     "display": 6,
-    "faults": 15,
+    "faults": 16,
     "fleet": 28,
     "flight": 19,
     "link": 18,

@@ -9,6 +9,7 @@ from .common import CommonCause as CommonCause
 from .common import lasts_s as lasts_s
 from .flight import FaultyFlight as FaultyFlight
 from .flight import fly_fault_in_folder as fly_fault_in_folder
+from .oracle import FLAGS as FLAGS
 from .results import ENDS as ENDS
 from .results import FaultResult as FaultResult
 from .results import fault_summary as fault_summary

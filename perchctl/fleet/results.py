@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.campaign import CampaignFlight, align_columns, rate_text
-from perchctl.faults import ENDS, NO_FAULT, FaultResult, fault_summary
+from perchctl.faults import ENDS, FLAGS, NO_FAULT, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
@@ -113,8 +113,11 @@ def fleet_table(results: Sequence[FleetResult]) -> str:
     for name, words in (("least_distance_m", "flying"), ("least_distance_in_air_m", "both flying")):
         if (least_m := figures[name]) is not None:
             lines.append(f"{'least distance':<22}{least_m:.2f} m between two vehicles, {words}")
-    wrong = figures["wrong"].get("rate", 0.0) * vehicles
-    lines.append(f"{'with a flag':<22}{wrong:.0f} vehicles; {figures['unavoidable']} unavoidable")
+    wrong = sum(vehicle.is_bad for fleet in results for vehicle in fleet.vehicles)
+    lines.append(f"{'with a flag':<22}{wrong} vehicles; {figures['unavoidable']} unavoidable")
+    for flag, meaning in FLAGS.items():
+        if figures[flag]:
+            lines.append(f"{flag.replace('_', ' '):<22}{figures[flag]}: {meaning}")
     if worst := worst_fleets(results)[:WORST_FLEETS]:
         lines += ["", "worst fleets"]
         rows: list[tuple[str, ...]] = [("seed", "fault", "vehicle", "end", "what")]

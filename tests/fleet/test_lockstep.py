@@ -38,7 +38,7 @@ from perchctl.record import from_exact_json, to_exact_json
 from tests.fleet.rig import fleet
 from tests.fleet.test_room import flying
 from tests.helpers.commands import run
-from tests.helpers.flights import short_profile
+from tests.helpers.flights import SHORT, short_profile
 
 SAMPLE_S = 0.01
 
@@ -287,6 +287,7 @@ def test_figures_count_fleets_and_vehicles() -> None:
     assert "a, b" in text
     assert "collided" in text
     assert "0.10 m between two vehicles, flying" in text
+    assert "fell                  1: fell" in text
     assert json.loads(json.dumps(fleet_summary([]))) == fleet_summary([])
 
 
@@ -400,3 +401,23 @@ def test_no_common_cause_makes_vehicles_meet(cause: str, ends: list[str]) -> Non
     assert outcomes(result) == ends
     assert result.collisions == 0
     assert [vehicle.begin_s for vehicle in result.vehicles[:2]] == pytest.approx([CAUSE_S] * 2)
+
+
+@pytest.mark.long
+def test_the_command_flies_writes_and_resumes(tmp_path: Path) -> None:
+    path, out = tmp_path / "short.yaml", tmp_path / "flown.jsonl"
+    path.write_text(
+        f"defaults: {{profile: {SHORT}}}\n"
+        "vehicles:\n  - {name: a, home_m: [0, 0], target_m: [0, 0]}\n"
+    )
+    words = ("fleet", "simulate", str(path), "--json", "--out", str(out))
+    figures = json.loads(run(*words, "-n", "1").stdout)
+    assert (figures["fleets"], figures["vehicles"], figures["perched"]) == (1, 1, 1)
+    assert figures["least_distance_m"] is None
+    again = json.loads(run(*words, "-n", "1", "--resume").stdout)
+    assert again == figures
+    assert len(out.read_text().splitlines()) == 2
+    path.write_text(path.read_text().replace("[0, 0]}", "[0.1, 0]}"))
+    other = run(*words, "-n", "1", "--resume")
+    assert other.code == 30
+    assert "was flown with another" in other.stderr
