@@ -49,11 +49,16 @@ from perchctl.mission import (
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Idle
+from perchctl.vehicle import Idle, Telemetry
 from perchctl.vision import Pipeline
 
 TURN_HANG_S = 0.25
 """A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
+PERMISSION = "permission to take off"
+"""What a vehicle waits for whose own checks have passed, when others fly in the same room."""
+PERMISSION_PERIOD_S = 0.1
+"""Between two turns of such a wait. Longer, and take-off follows its permission later; shorter, and
+vehicles on the floor take the computing time of those in the air."""
 
 
 class PositionStatus(Protocol):
@@ -72,8 +77,10 @@ class FlightParts:
     simulation, whose errors do. `positions` sends the external positions, None where decks measure
     them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
     `table` is flown instead of the profile's. `begin_turn` is called in the loop's own thread at
-    the beginning of each turn, also before take-off. What a `simulated` flight shows of latency and
-    mounting is no advice for a profile."""
+    the beginning of each turn, also before take-off. `may_take_off` is called in each turn before
+    take-off with what the vehicle still waits for, empty once its own checks have passed; until it
+    returns True, the vehicle stays on the floor, disarmed, and goes on being checked. What a
+    `simulated` flight shows of latency and mounting is no advice for a profile."""
 
     link: Link
     source: FrameSource
@@ -87,6 +94,7 @@ class FlightParts:
     table: tuple[Transition, ...] = load_table(None)
     judges: tuple[Watcher, ...] = ()
     begin_turn: Callable[[], None] = lambda: None
+    may_take_off: Callable[[str], bool] = lambda waiting: True
     simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
@@ -192,20 +200,32 @@ def _wait_until_ready(
                 "recording"
             )
         _end_on_word(parts.operator(), arming)  # given in this turn, it counts before the request
+        if not waiting and newest is not None:
+            _refuse_lost_view(parts, inputs, newest)
+        if not parts.may_take_off(waiting) and not waiting:
+            # Whoever may wait for minutes is later given the usual time again for each check.
+            waiting, started_s = PERMISSION, now_s
         arming.note_waiting(waiting, now_s, parts.clock.now())
         if not waiting and newest is not None:
-            positioning = inputs.target_positioning
-            if positioning is not None and positioning.feed.target:
-                camera, yaw_rad = parts.pipeline.camera, newest.yaw_rad
-                place, start_m = positioning.feed.target, newest.position_m
-                abort_on(view_problem(place, start_m, yaw_rad, parts.profile, camera))
             if not GroundCriteria(newest, parts.profile).waits_for_arming:
                 return
             request = arming.next_request(newest, now_s)
             if request is not None:
                 parts.link.send(request)
                 watchers.sent(SentCommand(now_s, "preflight", request))
-        parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
+        # A target that is the positioning system must go on being sent as the position.
+        slow = waiting is PERMISSION and inputs.target_positioning is None
+        period_s = PERMISSION_PERIOD_S if slow else 1.0 / parts.profile.link.loop_hz
+        parts.clock.wait_until(now_s + period_s)
+
+
+def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetry) -> None:
+    """Raises SafetyAbort where the target is the positioning system and would leave the picture on
+    the way up."""
+    positioning = inputs.target_positioning
+    if positioning is not None and positioning.feed.target:
+        camera, place = parts.pipeline.camera, positioning.feed.target
+        abort_on(view_problem(place, newest.position_m, newest.yaw_rad, parts.profile, camera))
 
 
 def _end_on_word(word: Operator, arming: Arming) -> None:

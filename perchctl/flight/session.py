@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -53,6 +53,8 @@ class FlyOptions:
     seed: int = 11  # a newcomer's first flight: nothing in it goes wrong that would need words
     log_dir: Path = Path("perchctl-logs")
     record: bool = False
+    sim_target_xy_m: tuple[float, float] | None = None
+    """Where a simulated target hangs, from where the vehicle stands; None: drawn from the seed."""
 
     @property
     def simulated(self) -> bool:
@@ -107,13 +109,15 @@ def fly_session(
     remarks: Callable[[], Sequence[str]] = tuple,
     before_arming: Callable[[], None] | None = None,
     rows: Sequence[Transition] = (),
+    may_take_off: Callable[[str], bool] = lambda waiting: True,
 ) -> tuple[FlightReport, float | None]:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
     Returns the report, and the gear's distance from the target's centre, m, where a simulator
     measures it.
 
-    `switch` carries the operator's commands. `begin_turn`, `remarks`: as in `FlightParts`.
+    `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`: as in
+    `FlightParts`.
     `before_arming` is called once vehicle and camera have answered; what it raises ends the session
     on the ground. `rows` are added to the profile's table.
     """
@@ -166,6 +170,7 @@ def fly_session(
                 lambda: [*remarks(), *link.new_notes()],
                 table,
                 begin_turn=begin_turn,
+                may_take_off=may_take_off,
                 simulated=options.simulated,
             )
             with contextlib.ExitStack() as waiting:
@@ -193,8 +198,11 @@ def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProc
         raise no_simulator()
     from perchctl.sim import SimProcess, draw_capture, draw_scenario
 
+    scenario = draw_scenario(options.profile, options.seed)
+    if options.sim_target_xy_m is not None:
+        scenario = replace(scenario, target_xy_m=options.sim_target_xy_m)
     return SimProcess.start(
-        draw_scenario(options.profile, options.seed),
+        scenario,
         camera=camera,
         target=options.profile.target,
         capture=draw_capture(options.profile, options.seed),
