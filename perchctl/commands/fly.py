@@ -45,14 +45,8 @@ from perchctl.display import (
 )
 from perchctl.errors import (
     EXIT_CODES,
-    AttemptsUsedUp,
-    EmergencyStopped,
-    Interrupted,
     InvalidValue,
-    LogIncomplete,
     PerchError,
-    SafetyAbort,
-    TargetNotFound,
     UsageError,
 )
 from perchctl.flight import (
@@ -65,7 +59,7 @@ from perchctl.flight import (
     fly_session,
     operator_signals,
 )
-from perchctl.mission import FlightReport, Outcome, Phase, Watcher
+from perchctl.mission import FlightReport, Phase, Watcher
 from perchctl.profile import (
     PositioningConfig,
     Profile,
@@ -77,14 +71,6 @@ from perchctl.profile import (
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.target import mm_text, overhead_text
 
-EXIT_CODE_OF: dict[Outcome, int] = {
-    Outcome.PERCHED: 0,
-    Outcome.TARGET_NOT_FOUND: TargetNotFound.exit_code,
-    Outcome.ATTEMPTS_USED_UP: AttemptsUsedUp.exit_code,
-    Outcome.SAFETY: SafetyAbort.exit_code,
-    Outcome.EMERGENCY: EmergencyStopped.exit_code,
-    Outcome.OPERATOR: Interrupted.exit_code,
-}
 POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
 
 app = new_app()
@@ -234,7 +220,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
         written = print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
             page.end(summary, log.path)
-    code = exit_code(report.outcome, summary) or (0 if written else InvalidValue.exit_code)
+    code = summary.exit_code or (0 if written else InvalidValue.exit_code)
     plot = draw_flight_plot(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
@@ -272,12 +258,6 @@ def flight_record(
         "log": str(log),
         "plot": None if plot is None else str(plot),
     }
-
-
-def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Return the exit code of the flight or, if only the log is incomplete, that of the log."""
-    code = EXIT_CODE_OF[outcome]
-    return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
 
 def _session(

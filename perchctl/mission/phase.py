@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from enum import Enum, Flag, IntEnum, auto
 
+from perchctl.errors import (
+    AttemptsUsedUp,
+    EmergencyStopped,
+    Interrupted,
+    SafetyAbort,
+    TargetNotFound,
+)
+
 
 class Phase(Enum):
     """The paper's seven phases, recovery, landing, and the three final phases."""
@@ -92,6 +100,21 @@ class Outcome(Enum):
     SAFETY = "safety abort"
     EMERGENCY = "emergency stop"
     OPERATOR = "operator"
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code of a flight that ended so, if its log is complete."""
+        return _EXIT_CODES[self]
+
+
+_EXIT_CODES: dict[Outcome, int] = {
+    Outcome.PERCHED: 0,
+    Outcome.TARGET_NOT_FOUND: TargetNotFound.exit_code,
+    Outcome.ATTEMPTS_USED_UP: AttemptsUsedUp.exit_code,
+    Outcome.SAFETY: SafetyAbort.exit_code,
+    Outcome.EMERGENCY: EmergencyStopped.exit_code,
+    Outcome.OPERATOR: Interrupted.exit_code,
+}
 
 
 class Claim(Flag):

@@ -9,7 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import Claim, ContactOffset, Findings, Touchdown, find_row_claims
+from perchctl.errors import LogIncomplete
+from perchctl.mission import (
+    Claim,
+    ContactOffset,
+    Findings,
+    Outcome,
+    Touchdown,
+    find_row_claims,
+)
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -69,6 +77,13 @@ class FlightSummary:
     recording: RecordingEnd | None = None
     simulated: bool = False
     is_profile_suspect: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code of the flight or, if only its log is incomplete, that of the log. For a
+        summary by `LogWatcher.close`: one that is read back may lack its cause."""
+        code = Outcome(self.cause).exit_code
+        return LogIncomplete.exit_code if code == 0 and self.log_problem is not None else code
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:

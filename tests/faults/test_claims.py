@@ -6,7 +6,6 @@ import re
 
 import pytest
 
-from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
 from perchctl.faults.oracle import (
     NOT_KNOWN,
@@ -58,7 +57,7 @@ def test_a_row_claims_what_its_sentence_says(name: str) -> None:
 def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
     """The words of the exit codes' table, as the README prints it."""
     claims = OUTCOME_CLAIMS[outcome]
-    meaning = EXIT_CODES[EXIT_CODE_OF[outcome]]
+    meaning = EXIT_CODES[outcome.exit_code]
     words: dict[frozenset[str], str] = {
         frozenset({"hangs on the target"}): r"^perched",
         frozenset({"stands"}): r"landed$",

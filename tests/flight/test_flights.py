@@ -15,7 +15,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult
 from perchctl.campaign.flights import fly_seed
-from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import EventKind, Operator, Outcome, Phase, planner
@@ -46,7 +45,7 @@ def assert_perched(flown: Flown, attempts: int = 1) -> None:
 def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "") -> None:
     flight, report = flown.flight, flown.report
     assert (report.phase, report.outcome) == (Phase.LANDED, outcome), flown
-    assert EXIT_CODE_OF[outcome] == exit_code
+    assert outcome.exit_code == exit_code
     assert words in report.reason
     assert flown.z_m < ON_THE_FLOOR_M
     assert not any((flight.hanging, flight.locked, report.locked, flight.fell))
@@ -189,7 +188,7 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     report, hanging = flown.report, flown.flight.hanging
     assert flown.way[-3:] == [phase.value, "LANDING", "PERCHED" if hanging else "LANDED"]
     assert report.outcome is Outcome.OPERATOR
-    assert EXIT_CODE_OF[report.outcome] == 130
+    assert report.outcome.exit_code == 130
     words = "hanging with" if hanging else "motors off"
     assert report.reason.startswith(f"the operator asked to land; {words}")
     assert not any((flown.flight.locked, flown.flight.fell))
@@ -207,7 +206,7 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     report = flown.report
     assert flown.way[-3:] == [phase.value, "LANDING", "ABORTED"]
     assert (report.phase, report.outcome) == (Phase.ABORTED, Outcome.EMERGENCY)
-    assert EXIT_CODE_OF[report.outcome] == 53
+    assert report.outcome.exit_code == 53
     assert flown.flight.locked  # docs/firmware.md, "Emergency stop"
     assert report.locked  # which is said, though no telemetry has told it yet
 
