@@ -1,0 +1,110 @@
+"""The processes of a fleet's vehicles, as the parent holds them."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import threading
+import time
+from pathlib import Path
+
+from perchctl.children import Channel, last_line, spawn, wait_or_kill
+from perchctl.errors import InvalidValue
+from perchctl.fleet.messages import Order, Result, Status
+from perchctl.flight import FlyOptions
+
+END_TIMEOUT_S = 5.0
+"""For a process to end after its result. Longer, and the fleet ends later; shorter, and one that is
+only slow is killed."""
+# The parent hears that it is up before the libraries are loaded.
+_CHILD = (
+    "from perchctl.children import connect_to_parent; channel = connect_to_parent(); "
+    "from perchctl.fleet.vehicle_process import main; main(channel)"
+)
+
+
+class VehicleProcess:
+    """One vehicle's process: in a session of its own, so that the terminal's Ctrl-C does not reach
+    it, with what it prints in a file of the flight's folder.
+
+    A thread takes its messages in. One that is stopped in the middle of a message holds up that
+    thread only.
+    """
+
+    def __init__(self, name: str, options: FlyOptions) -> None:
+        """Start it. Raises InvalidValue if the folder cannot be written, OSError without
+        processes."""
+        self._status: Status | None = None
+        self._result: Result | None = None
+        self._heard_s = time.monotonic()
+        self._killed = self._closed = False
+        self._output_path = Path(options.log_dir) / f"{name}.txt"
+        try:
+            self._output_path.parent.mkdir(parents=True, exist_ok=True)
+            self._output = self._output_path.open("wb+")
+        except OSError as error:
+            raise InvalidValue(
+                f"{self._output_path} cannot be written ({error.strerror}): name another folder "
+                f"with --log-dir"
+            ) from None
+        self._process, self._channel = spawn(_CHILD, self._output)
+        self.pid = self._process.pid
+        with contextlib.suppress(OSError):  # it is gone already, which its end will tell
+            self._channel.send(options)
+        self._reader = threading.Thread(target=self._read, name=f"fleet-{name}", daemon=True)
+        self._reader.start()
+
+    def send(self, order: Order) -> None:
+        """Send an order, or leave it if there is no room: a stopped process reads nothing, and must
+        not hold up the others."""
+        with contextlib.suppress(OSError, ValueError):
+            if select.select([], [self._channel], [], 0.0)[1]:
+                self._channel.send(order)
+
+    def newest(self) -> tuple[Status | None, float]:
+        return self._status, self._heard_s
+
+    def result(self) -> Result | None:
+        return self._result
+
+    def end_of_process(self) -> str | None:
+        if self._reader.is_alive() or self._result is not None:
+            return None
+        code = self._process.poll()
+        if code is None and not self._killed:
+            return "its process has closed the line to the fleet"
+        how = "" if code is None else f" (signal {-code})" if code < 0 else f" (exit {code})"
+        return f"its process has ended unexpectedly{how}{last_line(self._output)}"
+
+    def kill(self) -> None:
+        self._killed = True
+        self._process.kill()
+
+    def close(self) -> None:
+        """End the process, bounded, and drop its output if there is none. May be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        wait_or_kill(self._process, END_TIMEOUT_S if self._result is not None else 0.0)
+        self._reader.join(END_TIMEOUT_S)
+        self._channel.close()
+        with contextlib.suppress(OSError):
+            is_empty = self._output.seek(0, 2) == 0
+            self._output.close()
+            if is_empty:
+                self._output_path.unlink()
+
+    def _read(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                message = self._receive()
+                self._heard_s = time.monotonic()
+                if isinstance(message, Status):
+                    self._status = message
+                elif isinstance(message, Result):
+                    self._result = message
+                    return
+
+    def _receive(self) -> object:
+        channel: Channel = self._channel
+        return channel.receive()

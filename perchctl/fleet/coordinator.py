@@ -1,0 +1,180 @@
+"""The parent of a fleet: hears its vehicles, orders, and ends what hangs. No flight logic.
+
+`Coordinator.step` does one round and waits for nobody; `run` repeats it in a thread of its own. So
+neither a screen that stands still nor a question that nobody answers holds up a stop, and a parent
+whose rounds hang sends no more orders, upon which every vehicle lands by itself.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Protocol
+
+from perchctl.errors import PerchError, SafetyAbort
+from perchctl.fleet.dispatch import Decision, VehicleView, are_all_ready, decide
+from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status
+from perchctl.fleet.plan import FleetPlan
+from perchctl.flight import OperatorSwitch
+from perchctl.mission import Operator
+
+ROUND_S = 0.02
+"""Between two rounds. Longer, and a stop waits longer; shorter, and the rounds cost more computing
+time than they are worth."""
+HUNG_S = 10.0
+"""A process that has sent nothing for so long is ended. Its vehicle is down by then, since the
+firmware stops the motors 2 s after the last packet. Longer, and the fleet waits for nothing;
+shorter, and a computer that pauses loses its flights."""
+LOOP_HUNG_S = 60.0
+"""A process whose flight loop has not turned for so long is ended. Longer than any landing by its
+watchdog and the closing of link and log take. Longer, and the fleet waits for nothing."""
+
+
+class Child(Protocol):
+    """The process of one vehicle, as the parent sees it. No method waits."""
+
+    def send(self, order: Order) -> None:
+        """Send an order, or leave it if there is no room: the next one says the same."""
+
+    def newest(self) -> tuple[Status | None, float]:
+        """The newest status, and when the last message came, on `time.monotonic`."""
+
+    def result(self) -> Result | None:
+        """Its result, once it has sent one and ended."""
+
+    def end_of_process(self) -> str | None:
+        """How the process has ended without a result, in words; None if it runs."""
+
+    def kill(self) -> None:
+        """End the process at once."""
+
+
+class Coordinator:
+    """Flies a fleet by its plan. `confirm`, `land` and `view` may be called from any thread.
+
+    Attributes:
+        started: permission to take off has been given to the first group.
+        reasons: why vehicles were ordered to land, other than by the operator.
+    """
+
+    def __init__(
+        self,
+        plan: FleetPlan,
+        children: Mapping[str, Child],
+        switch: OperatorSwitch,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.started = False
+        self.reasons: dict[str, str] = {}
+        self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
+        self._confirmed = False
+        self._landed: frozenset[str] = frozenset()
+        self._results: dict[str, Result] = {}
+        self._views = tuple(VehicleView(name=name) for name in children)
+        self._sent: dict[str, Order] = {}
+        self._sent_s: dict[str, float] = {}
+        self._begun_s = clock()
+        self._flying: set[str] = set()
+
+    # --- what others ask and order ---
+
+    @property
+    def views(self) -> tuple[VehicleView, ...]:
+        """What is known of each vehicle, in the order of the file."""
+        return self._views
+
+    @property
+    def are_ready(self) -> bool:
+        """True if all are ready now."""
+        return are_all_ready(self._views)
+
+    @property
+    def has_ended(self) -> bool:
+        """True once every vehicle has ended."""
+        return len(self._results) == len(self._children)
+
+    def confirm(self) -> None:
+        """The operator's yes: flights begin as soon as all are ready at once."""
+        self._confirmed = True
+
+    def land(self, name: str) -> None:
+        """Land one vehicle; one on the floor does not take off any more."""
+        self._landed = self._landed | {name}
+
+    # --- one round ---
+
+    def step(self) -> None:
+        """Hear all, decide, and send each order that is new or due."""
+        now_s = self._clock()
+        self._views = tuple(
+            self._heard(name, child, now_s) for name, child in self._children.items()
+        )
+        if self._confirmed and are_all_ready(self._views) and self._word() is Operator.NONE:
+            self.started = True
+        decision = decide(
+            self._plan, self._views, started=self.started, word=self._word(), landed=self._landed
+        )
+        for name, why in decision.reasons.items():
+            self.reasons.setdefault(name, why)
+        self._send(decision, now_s)
+
+    def run(self, until: threading.Event) -> None:
+        """Repeat `step` until `until` is set."""
+        while not until.wait(ROUND_S):
+            self.step()
+
+    def _word(self) -> Operator:
+        return self._switch.read()
+
+    def _heard(self, name: str, child: Child, now_s: float) -> VehicleView:
+        status, heard_s = child.newest()
+        silent_s = now_s - max(heard_s, self._begun_s)
+        if status is not None and status.stage is Stage.FLYING:
+            self._flying.add(name)
+        if name not in self._results:
+            result = child.result() or self._lost(name, child, status, silent_s)
+            if result is not None:
+                why = self.reasons.get(name)
+                self._results[name] = _explained(result, why)
+        return VehicleView(
+            name=name, status=status, silent_s=silent_s, result=self._results.get(name)
+        )
+
+    def _lost(
+        self, name: str, child: Child, status: Status | None, silent_s: float
+    ) -> Result | None:
+        """The result of a process that has ended without one, or hangs and is ended now."""
+        problem = child.end_of_process()
+        loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
+        if problem is None and silent_s > HUNG_S:
+            problem = f"its process has not answered for {silent_s:.0f} s and was ended"
+        elif problem is None and loop_age_s > LOOP_HUNG_S:
+            problem = f"its flight loop has hung for {loop_age_s:.0f} s and was ended"
+        if problem is None:
+            return None
+        child.kill()
+        if name not in self._flying:
+            return Result(exit_code=PerchError.exit_code, outcome="failed", reason=problem)
+        return Result(
+            exit_code=SafetyAbort.exit_code,
+            outcome="failed",
+            reason=f"{problem}: look where the vehicle is before you reach for it",
+            has_flown=True,
+            place_m=None,
+        )
+
+    def _send(self, decision: Decision, now_s: float) -> None:
+        for name, order in decision.orders.items():
+            due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
+            if name not in self._results and (due or order != self._sent.get(name)):
+                self._sent[name], self._sent_s[name] = order, now_s
+                self._children[name].send(order)
+
+
+def _explained(result: Result, why: str | None) -> Result:
+    """The result of a vehicle that the parent has kept from flying or has landed, and `why`."""
+    if why is None or result.exit_code == 0:
+        return result
+    return replace(result, reason=f"{why}: {result.reason}")

@@ -1,0 +1,121 @@
+"""What a fleet's parent and the process of one vehicle say to each other.
+
+    parent  --- Order, ten times a second and when it changes --->  vehicle
+    parent  <-- Status, ten times a second, and one Result -------  vehicle
+
+Every message is a whole state, never a step: one that is lost, late or doubled is made good by the
+next, and none has to be answered. What if an `Order` is the last one that arrives? Its word holds,
+and the vehicle lands after `perchctl.fleet.parent_watch.PARENT_SILENCE_S` without another. What if
+it is late? Permission to take off counts in the turn in which it is read, and a word to land or to
+cut the motors comes before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from perchctl.corridor import Point
+from perchctl.mission import Operator
+
+BEAT_S = 0.1
+"""Between two messages in each direction. Longer, and few of them are left within the second after
+which a silent parent counts as dead; shorter, and they cost computing time."""
+
+
+class Stage(Enum):
+    """How far a vehicle's process has come."""
+
+    STARTING = "starting"  # vehicle and camera have not answered yet
+    CHECKING = "checking"  # on the floor, its checks not yet passed
+    READY = "ready"  # on the floor, disarmed; only permission is missing
+    FLYING = "flying"  # from its first setpoint to the end of its mission
+    ENDING = "ending"  # landed or hanging; link and log are being closed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """All that the parent wants of one vehicle. Also a sign of life, so it is sent again and again.
+
+    Attributes:
+        may_take_off: permission to take off; of no meaning in the air.
+        word: the operator's; a vehicle never takes back one that it has heard.
+    """
+
+    may_take_off: bool = False
+    word: Operator = Operator.NONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """Where a vehicle is in its flight, for the parent's schedule and for people. Unknown numbers
+    are None.
+
+    Attributes:
+        reason: what it waits for on the floor, or why it is in its phase.
+        height_m: above the ground.
+        error_m: the target's level distance from the gear.
+        telemetry_age_s: age of the oldest part of the newest telemetry.
+        loop_age_s: time since the last turn of its flight loop; None before the first.
+        place_m: where it is, in the axes of its estimate.
+    """
+
+    stage: Stage = Stage.STARTING
+    phase: str = ""
+    reason: str = ""
+    height_m: float | None = None
+    error_m: float | None = None
+    battery_v: float | None = None
+    telemetry_age_s: float | None = None
+    loop_age_s: float | None = None
+    place_m: Point | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How well the computer kept up with one flight, from its first tick to its last.
+
+    Attributes:
+        flown_s, wall_s: on the loop's clock, which is a simulator's where there is one, and on the
+            wall's.
+        gap_p50_s, gap_p99_s, gap_max_s: between two setpoints, on the wall clock.
+        cores: computing time of the vehicle's process without its simulator, per second.
+    """
+
+    flown_s: float
+    wall_s: float
+    gap_p50_s: float
+    gap_p99_s: float
+    gap_max_s: float
+    cores: float
+
+    @property
+    def ratio(self) -> float:
+        """Time of the flight over time on the wall: 1 in real time."""
+        return self.flown_s / self.wall_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """How one vehicle ended; its process sends nothing after it.
+
+    Attributes:
+        outcome: ``perched``, ``landed``, ``aborted``, or ``failed`` for a flight that raised.
+        has_flown: False if it has never left the floor by its own doing.
+        hangs: it is known to hang with its motors off.
+        ended_s: `time.monotonic` at its last tick, None without one; one clock for all processes.
+        place_m: its last place, in the axes of its estimate.
+    """
+
+    exit_code: int
+    outcome: str
+    reason: str
+    has_flown: bool = False
+    hangs: bool = False
+    ended_s: float | None = None
+    place_m: Point | None = None
+    attempts: int = 0
+    miss_m: float | None = None
+    battery_min_v: float | None = None
+    log: str | None = None
+    pace: Pace | None = None

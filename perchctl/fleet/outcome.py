@@ -1,0 +1,159 @@
+"""How a fleet's flight ended: its exit code, its record in ``fleet.json``, and its table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from perchctl.errors import (
+    EXIT_CODES,
+    AttemptsUsedUp,
+    ConnectionFailed,
+    EmergencyStopped,
+    Interrupted,
+    InvalidValue,
+    LogIncomplete,
+    NotFound,
+    PerchError,
+    ReplayDiffers,
+    SafetyAbort,
+    TargetNotFound,
+    TimedOut,
+    UsageError,
+)
+from perchctl.fleet.messages import Result
+from perchctl.fleet.plan import FleetPlan
+from perchctl.flight import FlyOptions
+
+RECORD_NAME = "fleet.json"
+_WORST_FIRST: tuple[type[PerchError], ...] = (
+    EmergencyStopped,
+    SafetyAbort,
+    AttemptsUsedUp,
+    TargetNotFound,
+    PerchError,
+    ConnectionFailed,
+    NotFound,
+    InvalidValue,
+    TimedOut,
+    UsageError,
+    LogIncomplete,
+    ReplayDiffers,
+    Interrupted,  # the last: vehicles are landed because of what another one has met
+)
+
+
+def fleet_exit_code(results: Sequence[Result]) -> int:
+    """0 if all hang and their logs are complete; else the code of whoever fared worst."""
+    codes = {result.exit_code for result in results}
+    worst = next((cls.exit_code for cls in _WORST_FIRST if cls.exit_code in codes), 0)
+    return worst if codes <= EXIT_CODES.keys() else PerchError.exit_code
+
+
+def worst_of(results: Mapping[str, Result]) -> str:
+    """The name of the vehicle whose exit code is the fleet's."""
+    code = fleet_exit_code([*results.values()])
+    return next(name for name, result in results.items() if result.exit_code == code)
+
+
+def as_error(name: str, result: Result) -> PerchError:
+    """A vehicle's failure as an error of the tree, with its exit code."""
+    kinds = {cls.exit_code: cls for cls in _WORST_FIRST}
+    return kinds.get(result.exit_code, PerchError)(f"{name}: {result.reason}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOutcome:
+    """A fleet's flight that has ended, or has come so far.
+
+    Attributes:
+        started, started_s: when it began, as a date, and on `time.monotonic`.
+        results: of the vehicles that have ended, by name.
+    """
+
+    plan: FleetPlan
+    options: Mapping[str, FlyOptions]
+    started: datetime
+    started_s: float
+    results: Mapping[str, Result]
+
+    @property
+    def exit_code(self) -> int:
+        return fleet_exit_code([*self.results.values()])
+
+    @property
+    def hanging(self) -> int:
+        """How many hang."""
+        return sum(result.hangs for result in self.results.values())
+
+    @property
+    def ratio(self) -> float | None:
+        """Time of the flights over time on the wall: below 1 where simulated time ran slower."""
+        paces = [result.pace for result in self.results.values() if result.pace is not None]
+        wall_s = sum(pace.wall_s for pace in paces)
+        return sum(pace.flown_s for pace in paces) / wall_s if wall_s > 0.0 else None
+
+    def record(self) -> dict[str, Any]:
+        """The content of ``fleet.json``: JSON types, places in the room's axes."""
+        vehicles = [self._vehicle_record(name, result) for name, result in self.results.items()]
+        ratio, code = self.ratio, self.exit_code
+        return {
+            "fleet": self.plan.fleet.name,
+            "started_utc": self.started.isoformat(timespec="milliseconds"),
+            "exit_code": code,
+            "error": None if code == 0 else EXIT_CODES[code],
+            "hanging": self.hanging,
+            "ratio": None if ratio is None else round(ratio, 3),
+            "vehicles": vehicles,
+            "plan": self.plan.record(),
+        }
+
+    def _vehicle_record(self, name: str, result: Result) -> dict[str, Any]:
+        vehicle, options = self.plan.fleet.vehicle(name), self.options[name]
+        place_m = None
+        if result.place_m is not None:
+            # A simulated vehicle's own axes begin at its home, whatever its frame.
+            from perchctl.fleet.prepare import as_flown
+
+            place_m = [round(part, 3) for part in as_flown(vehicle).to_room(result.place_m)]
+        ended_s = None if result.ended_s is None else round(result.ended_s - self.started_s, 3)
+        return {
+            "name": name,
+            "uri": vehicle.uri,
+            "seed": options.seed if options.simulated else None,
+            "outcome": result.outcome,
+            "exit_code": result.exit_code,
+            "hangs": result.hangs,
+            "reason": result.reason,
+            "has_flown": result.has_flown,
+            "ended_s": ended_s,
+            "place_m": place_m,
+            "target_m": list(vehicle.target_m),
+            "miss_m": result.miss_m,
+            "attempts": result.attempts,
+            "battery_min_v": result.battery_min_v,
+            "log": None if result.log is None else Path(result.log).name,
+            "pace": None
+            if result.pace is None
+            else {name: round(part, 4) for name, part in asdict(result.pace).items()}
+            | {"ratio": round(result.pace.ratio, 4)},
+        }
+
+    def text(self) -> str:
+        """The outcome for people, a line for each vehicle."""
+        lines = []
+        for name, result in self.results.items():
+            miss = "" if result.miss_m is None else f", {1e3 * result.miss_m:.1f} mm from centre"
+            state = "hangs" if result.hangs else result.outcome
+            lines.append(f"{name:<12}{state}{miss}: {result.reason}")
+        ratio = self.ratio
+        if ratio is not None and any(each.simulated for each in self.options.values()):
+            lines.append(f"{'pace':<12}{ratio:.2f} s of simulated time per second")
+        gaps_s = [r.pace.gap_max_s for r in self.results.values() if r.pace is not None]
+        if gaps_s and not math.isnan(max(gaps_s)):
+            lines.append(f"{'setpoints':<12}longest gap {max(gaps_s):.2f} s on the wall clock")
+        return "\n".join(lines)

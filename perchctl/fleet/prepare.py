@@ -1,0 +1,110 @@
+"""What each vehicle's process is given, and what is refused before any of them starts."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from perchctl.check import warnings_before_flight
+from perchctl.errors import PerchError, UsageError
+from perchctl.fleet.fleet import FleetVehicle
+from perchctl.fleet.load import MOST_VEHICLES
+from perchctl.fleet.plan import FleetPlan
+from perchctl.flight import FlyOptions, check_options
+
+
+def vehicle_seed(fleet_seed: int, number: int) -> int:
+    """The seed of the vehicle with this number, from 0 on: no two vehicles of any two fleets have
+    the same."""
+    return fleet_seed * MOST_VEHICLES + number
+
+
+def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
+    """The path of a new folder for one fleet flight: ``fleet_<UTC yyyymmdd_hhmmss>_<fleet>``. It is
+    made with the first log."""
+    stem = f"fleet_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{plan.fleet.name}"
+    path, number = parent / stem, 1
+    while path.exists():
+        number += 1
+        path = parent / f"{stem}_{number}"
+    return path
+
+
+@contextlib.contextmanager
+def open_radios(plan: FleetPlan) -> Iterator[Mapping[str, str]]:
+    """Yield the URI that each vehicle's process opens, by the vehicle's name.
+
+    Vehicles that share a dongle need a hub: one process that owns the dongle, and that gives each
+    vehicle a ``udp://127.0.0.1:PORT`` while this block runs. There is none yet, so a shared dongle
+    is refused. Raises UsageError.
+    """
+    for load in plan.dongles:
+        if len(load.vehicles) > 1:
+            first, second = load.vehicles[:2]
+            raise UsageError(
+                f"{first} and {second} share dongle {load.dongle}, which perchctl fleet fly cannot "
+                f"do yet: give each vehicle a dongle of its own, on channels at least 2 apart"
+            )
+    yield {vehicle.name: vehicle.uri for vehicle in plan.fleet.vehicles}
+
+
+def flight_options(
+    plan: FleetPlan, uris: Mapping[str, str], folder: Path, seed: int, record: bool | None
+) -> dict[str, FlyOptions]:
+    """The options of each vehicle's flight, checked as `perchctl fly` checks them. The errors of
+    `check_options`, with the vehicle's name.
+
+    `record`: keep the pictures; None: those of real vehicles.
+    """
+    options = {}
+    for number, vehicle in enumerate(plan.fleet.vehicles):
+        flown = as_flown(vehicle)
+        each = FlyOptions(
+            profile=flown.profile,
+            profile_path=plan.fleet.path or Path(vehicle.name),
+            uri=uris[vehicle.name],
+            source=flown.source,
+            seed=vehicle_seed(seed, number),
+            log_dir=folder,
+            record=not flown.simulated if record is None else record,
+            sim_target_xy_m=flown.to_estimate(flown.target_m) if flown.simulated else None,
+        )
+        with naming(vehicle.name):
+            check_options(each)
+        options[vehicle.name] = each
+    return options
+
+
+def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
+    """The warnings of each vehicle's offline checks, each with the names that it concerns. The
+    errors of `warnings_before_flight` and of a missing comparison with the motion capture, with the
+    vehicle's name."""
+    names: dict[str, list[str]] = {}
+    for name, each in options.items():
+        with naming(name):
+            # The folder of the flight does not exist yet; the one around it is checked.
+            found = warnings_before_flight(replace(each, log_dir=each.log_dir.parent))
+            each.require_lift_check()
+        for warning in found:
+            names.setdefault(warning, []).append(name)
+    return [f"{', '.join(who)}: {warning}" for warning, who in names.items()]
+
+
+def as_flown(vehicle: FleetVehicle) -> FleetVehicle:
+    """The vehicle as its process flies it. The room of a simulated one begins where it stands, also
+    if its position comes from a simulated motion capture."""
+    if not vehicle.simulated or vehicle.frame == "home":
+        return vehicle
+    return replace(vehicle, frame="home").with_target(vehicle.target_m)
+
+
+@contextlib.contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Begin the sentence of each failure of the block with the vehicle's name."""
+    try:
+        yield
+    except PerchError as error:
+        raise type(error)(f"{name}: {error}") from None

@@ -1,0 +1,272 @@
+"""The process of one vehicle in a fleet: one ordinary flight, and a line to the parent.
+
+The flight is the one of `perchctl fly`, with its own link, watchdog, camera and log. Two things are
+added: it waits on the floor for permission to take off, and its operator is the parent. A thread of
+its own keeps the line, so that nothing in the flight ever waits for the parent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import statistics
+import sys
+import threading
+import time
+from dataclasses import replace
+
+from perchctl.children import Channel
+from perchctl.errors import Interrupted, PerchError
+from perchctl.fleet.messages import BEAT_S, Pace, Result, Stage, Status
+from perchctl.fleet.parent_watch import ParentSwitch
+from perchctl.flight import FlyOptions, fly_session, operator_signals
+from perchctl.mission import Event, Phase, Tick, Watcher
+from perchctl.record import FlightSummary, LogWatcher
+from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
+
+OPTIONS_TIMEOUT_S = 60.0
+"""For the options of the flight, which the parent sends at once: nothing is connected before."""
+LAST_WORD_TIMEOUT_S = 2.0
+"""For the parent to take the result. Longer, and a process lingers whose parent hangs; shorter, and
+a busy parent may miss the result, and reports the process as failed."""
+POLL_S = 0.05
+"""Between two looks of the line's thread at what there is to send."""
+
+
+def main(channel: Channel) -> None:
+    """Fly as the first message, `FlyOptions`, says; send one `Result`, and end the process."""
+    switch = ParentSwitch()
+    with operator_signals(switch, _say):
+        try:
+            options: FlyOptions = channel.receive(OPTIONS_TIMEOUT_S)
+        except (EOFError, OSError):  # the parent is gone; TimeoutError is an OSError
+            return
+        line = ParentLine(channel, switch)
+        result = fly_vehicle(options, switch, line)
+        line.finish(result)
+    sys.stdout.flush()
+    os._exit(0)  # a library's thread that hangs must not keep the process
+
+
+def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> Result:
+    """Fly once; whatever happens becomes a `Result`."""
+    reporter = StatusReporter(line, switch)
+    log: LogWatcher | None = None
+    try:
+        seed = options.seed if options.simulated else None
+        log = LogWatcher.open_real_time(
+            options.log_dir, options.profile, options.uri, options.source, seed, options.record
+        )
+        report, miss_m = fly_session(
+            options,
+            (log, reporter),
+            switch,
+            remarks=log.remarks,
+            may_take_off=reporter.may_take_off,
+        )
+        hangs = report.phase is Phase.PERCHED
+        summary = log.close(report, miss_m if hangs else None)
+        assert summary is not None, "it was closed with a report"
+        for sentence in report.detached:
+            _say(sentence)
+        return reporter.result_of(summary, str(log.path), hangs=hangs, lost=switch.lost)
+    except BaseException as error:
+        if log is not None:
+            log.abandon(str(error) or type(error).__name__)
+        return reporter.result_of_error(error, log, lost=switch.lost)
+
+
+class ParentLine:
+    """The line to the parent, kept by a thread of its own; no method waits but `finish`.
+
+    If the parent is gone or sends nonsense, the vehicle lands. Before the flight loop listens, a
+    word ends the process's start as a signal would.
+    """
+
+    def __init__(self, channel: Channel, switch: ParentSwitch) -> None:
+        self._channel, self._switch = channel, switch
+        self._status = Status()
+        self._turned_s: float | None = None
+        self._result: Result | None = None
+        self._soon = self._has_interrupted = False
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="perchctl-parent", daemon=True)
+        self._thread.start()
+
+    def note_turn(self) -> None:
+        """Note that the flight loop has turned."""
+        self._turned_s = time.monotonic()
+
+    def tell(self, status: Status) -> None:
+        """Leave the newest status; one of a new stage or phase goes out at the next look."""
+        before, self._status = self._status, status
+        self._soon = self._soon or (before.stage, before.phase) != (status.stage, status.phase)
+
+    def finish(self, result: Result) -> None:
+        """Send the result as the last message; wait at most `LAST_WORD_TIMEOUT_S` for it."""
+        self._result = result
+        self._ended.wait(LAST_WORD_TIMEOUT_S)
+
+    def _run(self) -> None:
+        told_s = -math.inf
+        try:
+            while True:
+                if self._channel.poll(POLL_S):
+                    self._take_orders()
+                    self._interrupt_start()
+                result = self._result
+                if result is not None:
+                    self._channel.send(result)
+                    return
+                now_s = time.monotonic()
+                if self._soon or now_s - told_s >= BEAT_S:
+                    self._soon, told_s = False, now_s
+                    turned_s = self._turned_s
+                    age_s = None if turned_s is None else now_s - turned_s
+                    self._channel.send(replace(self._status, loop_age_s=age_s))
+        except Exception:  # EOFError, OSError; or bytes that are no message
+            self._switch.lose_parent()
+            self._interrupt_start()
+        finally:
+            self._ended.set()
+
+    def _take_orders(self) -> None:
+        """Take all waiting orders in. After a pause of this process there are many, and permission
+        counts only if the newest still gives it."""
+        order = self._channel.recv()
+        while self._channel.poll(0.0):
+            self._switch.take(replace(order, may_take_off=False))
+            order = self._channel.recv()
+        self._switch.take(order)
+
+    def _interrupt_start(self) -> None:
+        """While vehicle and camera are being connected, nobody reads the word. Once only: a second
+        signal would interrupt what the first one ends."""
+        starts = not self._switch.listening and self._status.stage is Stage.STARTING
+        if starts and self._switch.landing_requested and not self._has_interrupted:
+            self._has_interrupted = True
+            os.kill(os.getpid(), signal.SIGTERM)  # `operator_signals` makes an Interrupted of it
+
+
+class StatusReporter(Watcher):
+    """A flight's watcher that tells the parent where it is, and remembers what the result needs."""
+
+    name = "the status for the fleet"
+    problem: str | None = None
+
+    def __init__(self, line: ParentLine, switch: ParentSwitch) -> None:
+        self._line, self._switch = line, switch
+        self._first: tuple[float, float, float] | None = None  # loop, wall and computing time, s
+        self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self._setpoint_s: float | None = None
+        self._gaps_s: list[float] = []
+        self._rest = ""
+        self._tick: Tick | None = None
+
+    def may_take_off(self, waiting: str) -> bool:
+        """`FlightParts.may_take_off`: the parent's permission."""
+        self._line.note_turn()
+        stage = Stage.CHECKING if waiting else Stage.READY
+        self._line.tell(Status(stage=stage, reason=waiting))
+        return self._switch.may_take_off
+
+    def tick(self, tick: Tick) -> None:
+        now_s = time.monotonic()
+        self._line.note_turn()
+        self._tick, self._last = tick, (tick.t_s, now_s, time.process_time())
+        self._first = self._first or self._last
+        if isinstance(tick.command, PositionSetpoint | RawThrust):
+            if self._setpoint_s is not None:
+                self._gaps_s.append(now_s - self._setpoint_s)
+            self._setpoint_s = now_s
+        else:
+            self._setpoint_s = None
+        self._line.tell(flight_status(tick))
+
+    def event(self, event: Event) -> None:
+        if event.rest is not None:
+            self._rest = event.reason
+
+    def result_of(
+        self, summary: FlightSummary, log: str, *, hangs: bool, lost: str | None
+    ) -> Result:
+        """The result of a flight that has ended by itself."""
+        reason = summary.reason if lost is None else f"{lost}: {summary.reason}"
+        return replace(
+            self._result(summary.exit_code, summary.outcome, reason),
+            hangs=hangs,
+            attempts=summary.attempts,
+            miss_m=summary.miss_m,
+            battery_min_v=summary.battery_min_v,
+            log=log,
+        )
+
+    def result_of_error(
+        self, error: BaseException, log: LogWatcher | None, *, lost: str | None
+    ) -> Result:
+        """The result of a flight that raised: refused on the ground, or rescued in the air."""
+        match error:
+            case PerchError():
+                code, reason = error.exit_code, str(error)
+            case KeyboardInterrupt():
+                code, reason = Interrupted.exit_code, "interrupted"
+            case _:
+                code = PerchError.exit_code
+                reason = f"unforeseen {type(error).__name__}: {error}"
+        if self._rest:
+            reason = f"{reason}; {self._rest}"
+        if lost is not None:
+            reason = f"{lost}: {reason}"
+        result = self._result(code, "failed", reason)
+        return replace(result, log=str(log.path) if log is not None and log.has_begun else None)
+
+    def _result(self, code: int, outcome: str, reason: str) -> Result:
+        tick = self._tick
+        return Result(
+            exit_code=code,
+            outcome=outcome,
+            reason=reason,
+            has_flown=tick is not None,
+            ended_s=None if tick is None else self._last[1],
+            place_m=None if tick is None else tick.telemetry.position_m[:2],
+            pace=self._pace(),
+        )
+
+    def _pace(self) -> Pace | None:
+        if self._first is None or len(self._gaps_s) < 2:
+            return None
+        flown_s, wall_s, cpu_s = (
+            end - begin for begin, end in zip(self._first, self._last, strict=True)
+        )
+        percentiles = statistics.quantiles(self._gaps_s, n=100, method="inclusive")
+        return Pace(
+            flown_s=flown_s,
+            wall_s=wall_s,
+            gap_p50_s=percentiles[49],
+            gap_p99_s=percentiles[98],
+            gap_max_s=max(self._gaps_s),
+            cores=cpu_s / wall_s,
+        )
+
+
+def flight_status(tick: Tick) -> Status:
+    """The status of a vehicle that flies, hangs or has landed."""
+    state, telemetry, target = tick.state, tick.telemetry, tick.target
+    x_m, y_m, z_m = telemetry.position_m
+    return Status(
+        stage=Stage.ENDING if state.phase.is_over else Stage.FLYING,
+        phase=state.phase.value,
+        reason=state.pause or state.reason,
+        height_m=z_m - state.belief.ground_z_m,
+        error_m=None if target is None else math.hypot(*target.e_m[:2]),
+        battery_v=telemetry.battery_v if telemetry.battery_v >= NO_BATTERY_READING_V else None,
+        telemetry_age_s=tick.telemetry_age_s,
+        place_m=(x_m, y_m),
+    )
+
+
+def _say(sentence: str) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        print(f"perchctl: {sentence}", flush=True)

@@ -1,0 +1,280 @@
+"""The parent of a fleet with scripted children: who gets permission when, and how stop arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from perchctl.corridor import Point
+from perchctl.fleet import make_plan
+from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, Coordinator
+from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status
+from perchctl.flight import OperatorSwitch
+from perchctl.mission import Operator
+from tests.fleet.rig import fleet
+
+FAR: tuple[tuple[Point, Point], ...] = tuple(((4.0 * n, 0.0), (4.0 * n, 0.5)) for n in range(4))
+PERCHED = Result(exit_code=0, outcome="perched", reason="hangs", has_flown=True, hangs=True)
+ABORTED = Result(exit_code=52, outcome="aborted", reason="the link was lost", has_flown=True)
+
+
+@dataclass
+class FakeChild:
+    """A vehicle's process that does what the test says, and keeps the orders it was sent."""
+
+    rig: Rig
+    orders: list[Order] = field(default_factory=list)
+    status: Status | None = None
+    heard_s: float = 0.0
+    ended: Result | None = None
+    gone: str | None = None
+    hangs: bool = False
+    killed: bool = False
+
+    def send(self, order: Order) -> None:
+        if not self.hangs:
+            self.orders.append(order)
+
+    def newest(self) -> tuple[Status | None, float]:
+        return self.status, self.heard_s
+
+    def result(self) -> Result | None:
+        return self.ended
+
+    def end_of_process(self) -> str | None:
+        return self.gone
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def tell(self, stage: Stage, **more: Any) -> None:
+        self.status, self.heard_s = Status(stage=stage, **more), self.rig.now_s
+
+    @property
+    def order(self) -> Order:
+        """The newest."""
+        return self.orders[-1] if self.orders else Order()
+
+
+class Rig:
+    """A coordinator with its fake children, on a clock that nobody waits for."""
+
+    def __init__(
+        self,
+        places: Sequence[tuple[Point, Point]] = FAR,
+        order: str = "2 at a time",
+        **settings: Any,
+    ) -> None:
+        self.now_s = 100.0
+        plan = make_plan(fleet(places, order=order, **settings))
+        self.children = {v.name: FakeChild(self) for v in plan.fleet.vehicles}
+        self.switch = OperatorSwitch(clock=lambda: self.now_s)
+        self.fleet = Coordinator(plan, self.children, self.switch, clock=lambda: self.now_s)
+
+    def __getitem__(self, name: str) -> FakeChild:
+        return self.children[name]
+
+    def pass_s(self, seconds: float = BEAT_S) -> None:
+        """Let time pass, in which each child that does not hang says the same again."""
+        end_s = self.now_s + seconds
+        while self.now_s < end_s - 1e-9:
+            self.now_s += BEAT_S
+            for child in self.children.values():
+                if not child.hangs and child.status is not None and child.ended is None:
+                    child.heard_s = self.now_s
+            self.fleet.step()
+
+    def ready(self, *names: str) -> None:
+        for name in names or self.children:
+            self[name].tell(Stage.READY)
+        self.pass_s()
+
+    def fly(self, *names: str) -> None:
+        for name in names:
+            self[name].tell(Stage.FLYING, phase="ALIGN")
+        self.pass_s()
+
+    def end(self, name: str, result: Result = PERCHED) -> None:
+        self[name].ended = result
+        self.pass_s()
+
+    def started(self) -> Rig:
+        self.fleet.confirm()
+        self.ready()
+        return self
+
+    @property
+    def permitted(self) -> list[str]:
+        return [name for name, child in self.children.items() if child.order.may_take_off]
+
+    @property
+    def words(self) -> list[Operator]:
+        return [child.order.word for child in self.children.values()]
+
+
+# --- Permission ---
+
+
+def test_nothing_may_take_off_before_all_are_ready_and_the_operator_has_confirmed() -> None:
+    rig = Rig()
+    rig.ready()
+    assert rig.permitted == []
+    rig["v3"].tell(Stage.CHECKING, reason="a good picture")
+    rig.fleet.confirm()
+    rig.pass_s(5.0)
+    assert rig.permitted == []
+    rig.ready("v3")
+    assert rig.permitted == ["v0", "v1"]
+
+
+def test_groups_fly_in_their_order_each_after_the_one_before() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig.end("v0")
+    assert rig.permitted == ["v0", "v1"], "v1 still flies; an order that has ended means nothing"
+    rig.end("v1")
+    assert {"v2", "v3"} <= set(rig.permitted)
+    rig.fly("v2", "v3")
+    rig.end("v2")
+    assert not rig.fleet.has_ended
+    rig.end("v3")
+    assert rig.fleet.has_ended
+    assert rig.words == [Operator.NONE] * 4
+
+
+def test_a_vehicle_that_is_not_ready_any_more_does_not_hold_up_those_in_the_air() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig["v2"].tell(Stage.CHECKING, reason="a good picture")
+    rig.pass_s(5.0)
+    assert rig.permitted == ["v0", "v1"]
+
+
+def test_one_that_is_not_ready_keeps_all_on_the_floor() -> None:
+    """One bad URI of four: nothing arms."""
+    rig = Rig()
+    rig.fleet.confirm()
+    rig.ready("v0", "v1", "v2")
+    rig.end("v3", Result(exit_code=10, outcome="failed", reason="no Crazyflie answers"))
+    assert rig.permitted == []
+    assert rig.words[:3] == [Operator.LAND] * 3
+    assert not rig.fleet.started
+    rig["v3"].ended = None
+    rig.ready()
+    assert rig.permitted == [], "a result is final"
+
+
+def test_a_silent_process_is_not_ready() -> None:
+    rig = Rig()
+    rig["v3"].hangs = True
+    rig.ready()
+    rig.pass_s(2.0)
+    rig.fleet.confirm()
+    rig.pass_s(2.0)
+    assert rig.permitted == []
+
+
+# --- A vehicle that has ended where it was not meant to ---
+
+
+NEAR: tuple[tuple[Point, Point], ...] = (((0.0, 0.0), (0.0, 0.5)), ((1.0, 0.0), (1.0, 0.5)))
+"""Too near to fly together, but neither stands or hangs in the other's corridor."""
+
+
+def test_one_that_ended_somewhere_keeps_its_neighbour_on_the_floor() -> None:
+    rig = Rig(NEAR).started()
+    assert rig.permitted == ["v0"]
+    rig.fly("v0")
+    rig.end("v0", ABORTED)
+    assert rig["v1"].order == Order(may_take_off=False, word=Operator.LAND)
+    assert "v0 may be in its corridor" in rig.fleet.reasons["v1"]
+
+
+def test_one_that_hangs_or_stands_at_its_home_keeps_nobody() -> None:
+    at_home = Result(
+        exit_code=50, outcome="landed", reason="target not found", has_flown=True, place_m=(0.1, 0)
+    )
+    for result in (PERCHED, at_home, Result(exit_code=52, outcome="failed", reason="battery")):
+        rig = Rig(NEAR).started()
+        rig.end("v0", result)
+        assert rig["v1"].order == Order(may_take_off=True)
+
+
+def test_one_far_away_flies_on_unless_a_failure_lands_all() -> None:
+    rig = Rig(order="one-at-a-time").started()
+    rig.fly("v0")
+    rig.end("v0", ABORTED)
+    assert rig["v1"].order == Order(may_take_off=True)
+    rig = Rig(on_failure="land-all").started()
+    rig.fly("v0", "v1")
+    rig.end("v0", ABORTED)
+    assert rig.words[1:] == [Operator.LAND] * 3
+    assert rig.fleet.reasons["v1"] == "v0 has failed"
+
+
+# --- Stop ---
+
+
+def test_ctrl_c_lands_all_and_again_cuts_all() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig.switch.press()
+    rig.fleet.step()
+    assert rig.words == [Operator.LAND] * 4, "at once, not at the next beat"
+    assert not rig.permitted
+    rig.pass_s(1.5)
+    rig.switch.press()
+    rig.fleet.step()
+    assert rig.words == [Operator.STOP] * 4
+
+
+def test_a_key_lands_one_and_the_next_group_still_flies() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig.fleet.land("v0")
+    rig.fleet.step()
+    assert rig.words == [Operator.LAND, *[Operator.NONE] * 3]
+    rig.end("v0", Result(exit_code=130, outcome="landed", reason="operator", has_flown=True))
+    rig.end("v1")
+    assert {"v2", "v3"} <= set(rig.permitted)
+
+
+def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig["v0"].hangs = True
+    rig.switch.press()
+    rig.pass_s()
+    assert rig["v1"].order.word is Operator.LAND
+    rig.pass_s(HUNG_S + 1.0)
+    assert rig["v0"].killed
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert (result.exit_code, result.has_flown, result.hangs) == (52, True, False)
+    assert "look where the vehicle is" in result.reason
+
+
+def test_a_loop_that_hangs_for_longer_than_any_landing_is_ended() -> None:
+    rig = Rig().started()
+    rig["v0"].tell(Stage.FLYING, phase="ALIGN", loop_age_s=LOOP_HUNG_S - 1.0)
+    rig.pass_s()
+    assert not rig["v0"].killed
+    rig["v0"].tell(Stage.FLYING, phase="ALIGN", loop_age_s=LOOP_HUNG_S + 1.0)
+    rig.pass_s()
+    assert rig["v0"].killed
+
+
+def test_a_process_that_was_killed_in_the_air_counts_as_somewhere() -> None:
+    rig = Rig(NEAR).started()
+    rig.fly("v0")
+    rig["v0"].gone = "its process has ended unexpectedly (signal 9)"
+    rig.pass_s()
+    assert rig["v1"].order.word is Operator.LAND
+
+
+def test_orders_are_repeated_as_signs_of_life() -> None:
+    rig = Rig().started()
+    before = len(rig["v0"].orders)
+    rig.pass_s(1.0)
+    assert len(rig["v0"].orders) - before == 10

@@ -1,0 +1,101 @@
+"""How a fleet's flight ends: its exit code and its record."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from perchctl.errors import EXIT_CODES, ConnectionFailed, UsageError
+from perchctl.fleet import (
+    FleetOutcome,
+    Result,
+    as_error,
+    flight_options,
+    load_fleet,
+    make_plan,
+    open_radios,
+    vehicle_seed,
+    worst_of,
+)
+from perchctl.fleet.messages import Pace
+from perchctl.fleet.outcome import fleet_exit_code
+from tests.fleet.rig import same_channel
+
+PACE = Pace(flown_s=20.0, wall_s=40.0, gap_p50_s=0.02, gap_p99_s=0.05, gap_max_s=0.1, cores=0.4)
+PERCHED = Result(
+    exit_code=0,
+    outcome="perched",
+    reason="hanging still",
+    has_flown=True,
+    hangs=True,
+    ended_s=130.0,
+    place_m=(0.3, 0.1),
+    miss_m=0.002,
+    log="logs/flight_east.jsonl",
+    pace=PACE,
+)
+
+
+def ended(code: int) -> Result:
+    return Result(exit_code=code, outcome="failed", reason="so it was")
+
+
+def test_the_exit_code_is_0_only_if_all_hang() -> None:
+    assert fleet_exit_code([PERCHED] * 4) == 0
+    for code in EXIT_CODES:
+        assert fleet_exit_code([PERCHED, ended(code)]) == code
+
+
+@pytest.mark.parametrize(
+    ("codes", "worst"),
+    [((130, 10, 130, 130), 10), ((53, 52, 130), 53), ((0, 50, 52), 52), ((0, 99), 1)],
+)
+def test_it_is_the_code_of_whoever_fared_worst(codes: tuple[int, ...], worst: int) -> None:
+    assert fleet_exit_code([ended(code) for code in codes]) == worst
+
+
+def test_a_failure_on_the_ground_is_an_error_of_its_own_kind() -> None:
+    results = {"north": ended(130), "east": replace(ended(10), reason="no Crazyflie answers")}
+    assert worst_of(results) == "east"
+    error = as_error("east", results["east"])
+    assert isinstance(error, ConnectionFailed)
+    assert str(error) == "east: no Crazyflie answers"
+
+
+def test_the_record_says_who_hangs_where_and_when(tmp_path: Path) -> None:
+    plan = make_plan(load_fleet())
+    with open_radios(plan) as uris:
+        options = flight_options(plan, uris, tmp_path, 3, None)
+    outcome = FleetOutcome(
+        plan=plan,
+        options=options,
+        started=datetime(2026, 11, 30, tzinfo=UTC),
+        started_s=100.0,
+        results={"north": ended(52), "east": PERCHED},
+    )
+    record = json.loads(json.dumps(outcome.record()))
+    east = record["vehicles"][1]
+    assert (record["exit_code"], record["hanging"], record["ratio"]) == (52, 1, 0.5)
+    assert (east["ended_s"], east["place_m"], east["miss_m"]) == (30.0, [1.5, 0.1], 0.002)
+    assert east["log"] == "flight_east.jsonl"
+    assert east["seed"] == vehicle_seed(3, 1)
+    assert "0.50 s of simulated time per second" in outcome.text()
+
+
+def test_each_simulated_vehicle_has_a_seed_and_a_target_of_its_own(tmp_path: Path) -> None:
+    plan = make_plan(load_fleet())
+    with open_radios(plan) as uris:
+        options = flight_options(plan, uris, tmp_path, 0, None)
+    assert options["east"].sim_target_xy_m == pytest.approx((0.3, 0.1))
+    seeds = {vehicle_seed(fleet, number) for fleet in range(20) for number in range(32)}
+    assert len(seeds) == 20 * 32
+
+
+def test_vehicles_that_share_a_dongle_are_refused_in_one_sentence() -> None:
+    plan = make_plan(same_channel(2))
+    with pytest.raises(UsageError, match="v0 and v1 share dongle 0"), open_radios(plan):
+        pass
