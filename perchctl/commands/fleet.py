@@ -1,5 +1,5 @@
-"""`perchctl fleet`: the plan of a fleet's flight, its simulation, and fleet files from other
-programs' lists."""
+"""`perchctl fleet`: the plan of a fleet's flight, the flight, its simulation, and fleet files from
+other programs' lists."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ import typer
 # By their packages, whose names load as they are used: the help needs no simulator.
 from perchctl import campaign as campaigns
 from perchctl import fleet as fleets
-from perchctl.commands.command_line import ForceOption, Group, JsonOption, command, new_app
+from perchctl.commands.command_line import (
+    EXIT_TABLE,
+    ForceOption,
+    Group,
+    JsonOption,
+    command,
+    new_app,
+)
+from perchctl.commands.fly_fleet import FleetSettings, fly_fleet, refuse_before_start
 from perchctl.commands.interrupt import handle_signals
 from perchctl.commands.output import add_problem, print_lines, print_result, say
 from perchctl.commands.simulate import (
@@ -27,6 +35,7 @@ from perchctl.commands.simulate import (
 )
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
+from perchctl.flight import FlyOptions
 
 PLAN_COLUMNS = 80
 PICTURE = "how the room is drawn"
@@ -56,8 +65,7 @@ def check(
     as_json: JsonOption = False,
     force: ForceOption = False,
 ) -> None:
-    """Plan and simulate the flight of several vehicles in one room, and convert lists of other
-    programs.
+    """Plan, fly and simulate several vehicles in one room, and convert lists of other programs.
 
     By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
     vehicles, decides who flies together and in which order, and draws the room from above. It
@@ -82,6 +90,66 @@ def check(
         raise refusal
     if plan is not None:
         print_result(plan.record() if as_json else plan_text(plan))
+
+
+@command(
+    app,
+    "perchctl fleet fly",
+    "perchctl fleet fly atrium.yaml --dry-run",
+    "perchctl fleet fly atrium.yaml --log-dir logs",
+    ending=EXIT_TABLE,
+    short_help="Fly all vehicles of a fleet, in the order of its plan.",
+)
+def fly(
+    file: FleetArgument = None,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Seed of the simulated fleet.")
+    ] = FlyOptions.seed,
+    log_dir: Annotated[
+        Path | None, typer.Option("--log-dir", help="Folder for the flight's own folder.")
+    ] = None,
+    record: Annotated[
+        bool | None,
+        typer.Option(
+            "--record/--no-record",
+            help="Record the pictures to MCAP files next to the logs. Default: only of real "
+            "vehicles.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show the plan, and connect to nothing.")
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Fly all vehicles of a fleet, each in a process of its own, in the order of the plan.
+
+    No vehicle is armed until all of them are ready. Press Ctrl-C to land all; those that hang
+    stay. Press it again to cut the motors. The space bar cuts the motors at once. The key with a
+    vehicle's number lands that one. The exit code is 0 only if all vehicles hang.
+    """
+    loaded = fleets.load_fleet(file or fleets.EXAMPLE)
+    try:
+        plan = fleets.make_plan(loaded)
+    except InvalidValue as error:
+        if not as_json:
+            print_lines(fleets.draw_text(loaded))
+        raise InvalidValue(f"{loaded.path}: {error}") from None
+    settings = FleetSettings(seed=seed, log_dir=log_dir, record=record, yes=yes, as_json=as_json)
+    if not dry_run:
+        return fly_fleet(plan, settings)
+    refused: PerchError | None = None
+    try:
+        refuse_before_start(plan, settings)
+    except PerchError as error:
+        refused = error
+    print_result(add_problem(plan.record(), refused) if as_json else plan_text(plan))
+    if refused is None:
+        return 0
+    say(f"fly would refuse this: {refused}")
+    return refused.exit_code
 
 
 def plan_text(plan: fleets.FleetPlan) -> str:

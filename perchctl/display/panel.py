@@ -119,7 +119,7 @@ class FlightPanel:
         self._stream = stream
         self._live: Live | None = None
         if stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
-            self._live = _new_live(stream)
+            self._live = new_live(stream)
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
@@ -178,7 +178,13 @@ class FlightPanel:
             self._live.update(status_panel(tick, *self.help), refresh=True)
 
 
-def _new_live(stream: TextIO) -> Live:
+def phase_style(phase: str) -> str:
+    """How a phase is written on a terminal."""
+    return _STYLES.get(phase, "bold")
+
+
+def new_live(stream: TextIO) -> Live:
+    """A live display on a terminal, drawn by `update` only."""
     console = Console(
         file=stream,
         force_terminal=True,
@@ -197,7 +203,7 @@ def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")
     for name, text in status_rows(tick):
-        style = _STYLES.get(tick.state.phase.value, "bold") if name == "phase" else ""
+        style = phase_style(tick.state.phase.value) if name == "phase" else ""
         style = "bold yellow" if name == "held" else style
         table.add_row(Text(name, style="dim"), Text(text, style=style))
     return Panel(

@@ -253,8 +253,12 @@ _KEYS_AT_ONCE = 1024
 
 
 @contextlib.contextmanager
-def cut_key(switch: OperatorSwitch, terminal: int) -> Iterator[bool]:
+def cut_key(
+    switch: OperatorSwitch, terminal: int, on_keys: Callable[[bytes], None] = lambda keys: None
+) -> Iterator[bool]:
     """Let the space bar cut the motors while the block runs; yield True if it does.
+
+    `on_keys` is then called with all keys, in another thread; it must return at once.
 
     It needs the file descriptor of a terminal in whose foreground this process runs; otherwise
     nothing is changed. Keys come without Enter and are not echoed; Ctrl-C and Ctrl-Z go on making
@@ -267,7 +271,10 @@ def cut_key(switch: OperatorSwitch, terminal: int) -> Iterator[bool]:
         return
     waker, wakes = os.pipe()
     keys = threading.Thread(
-        target=_read_keys, args=(switch, terminal, waker), name="perchctl-keys", daemon=True
+        target=_read_keys,
+        args=(switch, terminal, waker, on_keys),
+        name="perchctl-keys",
+        daemon=True,
     )
     try:
         _set_mode(terminal, _keys_mode(before))
@@ -304,7 +311,9 @@ def _set_mode(terminal: int, mode: list[Any]) -> None:
         termios.tcflush(terminal, termios.TCIFLUSH)
 
 
-def _read_keys(switch: OperatorSwitch, terminal: int, waker: int) -> None:
+def _read_keys(
+    switch: OperatorSwitch, terminal: int, waker: int, on_keys: Callable[[bytes], None]
+) -> None:
     with contextlib.suppress(OSError, ValueError):  # the terminal is closed
         while True:
             ready, _, _ = select.select([terminal, waker], [], [])
@@ -315,3 +324,4 @@ def _read_keys(switch: OperatorSwitch, terminal: int, waker: int) -> None:
                 switch.cut()
             if not keys:
                 return
+            on_keys(keys)

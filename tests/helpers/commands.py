@@ -44,7 +44,11 @@ def run(*arguments: str) -> Said:
 
 
 def run_apart(
-    *arguments: str, before: str = "", stdout: Any = subprocess.PIPE, **environment: str
+    *arguments: str,
+    before: str = "",
+    stdout: Any = subprocess.PIPE,
+    timeout_s: float = 60.0,
+    **environment: str,
 ) -> Said:
     """The console script in a process of its own, on pipes, without a terminal; `before` is
     Python that is run first."""
@@ -57,7 +61,7 @@ def run_apart(
         stdout=stdout,
         stderr=subprocess.PIPE,
         text=True,
-        timeout=60,
+        timeout=timeout_s,
     )
     assert "Traceback" not in done.stderr
     return Said(done.returncode, done.stdout or "", done.stderr)

@@ -1,0 +1,297 @@
+"""The work behind `perchctl fleet fly`: processes, the operator, the display, and the outcome."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+# By its package, whose names load as they are used.
+from perchctl import fleet as fleets
+from perchctl.commands.interrupt import ignore_signals
+from perchctl.commands.output import (
+    ask_to_confirm,
+    print_lines,
+    print_result,
+    say,
+    stdin_number,
+)
+from perchctl.display import FleetPanel, FleetRow
+from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.extensions import error_at
+from perchctl.files import write_files
+from perchctl.flight import (
+    KEY_HELP,
+    STOP_HELP,
+    FlyOptions,
+    OperatorSwitch,
+    cut_key,
+    operator_signals,
+)
+
+LOOK_S = 0.1
+"""Between two looks at the vehicles, for display and record. The orders do not wait for it."""
+ENDING_TIMEOUT_S = 90.0
+"""For vehicles to land and their processes to end by themselves after the fleet's own failure.
+Longer than a landing and the closing of link and log take. Shorter, and a process is ended whose
+vehicle may still fly; longer, and a command that has failed ends later."""
+NUMBER_KEYS = 9
+"""Vehicles that have a key of their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetSettings:
+    """The options of the command line. `log_dir`, `record`: None if they are not given."""
+
+    seed: int
+    log_dir: Path | None
+    record: bool | None
+    yes: bool
+    as_json: bool
+
+
+def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
+    """Fly a fleet by its plan; return the exit code. Errors: the tree of `perchctl.errors`."""
+    started, started_s = datetime.now(UTC), time.monotonic()
+    folder = fleets.make_folder(_parent_folder(plan, settings), plan, started)
+    with fleets.open_radios(plan) as uris:
+        options = fleets.flight_options(plan, uris, folder, settings.seed, settings.record)
+        for warning in fleets.warnings_before_fleet(options):
+            say(f"check: {warning}")
+        asks = not (settings.yes or all(each.simulated for each in options.values()))
+        if asks and not sys.stdin.isatty():
+            raise UsageError(
+                f"about to arm {len(options)} vehicles, and there is nobody to ask: add --yes"
+            )
+        session = FleetSession(plan, options, folder, started, started_s)
+        try:
+            outcome = session.fly(asks)
+        finally:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # of a flight that was refused on the ground nothing is left
+    written = print_lines(outcome.text(), stdout=not settings.as_json)
+    print_lines(f"{'folder':<12}{folder}", stdout=not settings.as_json)
+    if settings.as_json:
+        print_result(outcome.record() | {"folder": str(folder)})
+    return outcome.exit_code or (0 if written else InvalidValue.exit_code)
+
+
+def refuse_before_start(plan: fleets.FleetPlan, settings: FleetSettings) -> None:
+    """Raises the error with which `fly_fleet` would refuse this plan before it starts anything."""
+    with fleets.open_radios(plan) as uris:
+        folder = _parent_folder(plan, settings) / plan.fleet.name
+        options = fleets.flight_options(plan, uris, folder, settings.seed, settings.record)
+        fleets.warnings_before_fleet(options)
+
+
+def _parent_folder(plan: fleets.FleetPlan, settings: FleetSettings) -> Path:
+    return settings.log_dir or Path(plan.fleet.vehicles[0].profile.log.directory)
+
+
+class FleetSession:
+    """One flight of a fleet on this terminal."""
+
+    def __init__(
+        self,
+        plan: fleets.FleetPlan,
+        options: Mapping[str, FlyOptions],
+        folder: Path,
+        started: datetime,
+        started_s: float,
+    ) -> None:
+        self._plan, self._options, self._folder = plan, options, folder
+        self._started, self._started_s = started, started_s
+        self._switch = OperatorSwitch()
+        self._children: dict[str, fleets.VehicleProcess] = {}
+        self._panel: FleetPanel | None = None
+        self._told: dict[str, str] = {}
+        self._recorded = 0
+        self._failure: str | None = None
+        self._unwritten: str | None = None
+
+    def fly(self, asks: bool) -> fleets.FleetOutcome:
+        """Start all, wait until all are ready, ask, and fly. Raises a vehicle's failure before the
+        first take-off as an error of its kind."""
+        with ignore_signals(), contextlib.ExitStack() as stack:
+            stack.callback(self._close_panel)
+            stack.enter_context(operator_signals(self._switch, say))
+            try:
+                coordinator = stack.enter_context(self._coordinated())
+                self._wait_until_ready(coordinator)
+                if asks:
+                    self._ask(coordinator)
+                self._fly(coordinator)
+            except BaseException as error:
+                self._end(error)
+                raise
+        return self._outcome(coordinator)
+
+    @contextlib.contextmanager
+    def _coordinated(self) -> Iterator[fleets.Coordinator]:
+        """Start the vehicles' processes and the thread that orders them about."""
+        over = threading.Event()
+        with contextlib.ExitStack() as stack:
+            for name, each in self._options.items():
+                child = self._children[name] = fleets.VehicleProcess(name, each)
+                stack.callback(child.close)
+            names = ", ".join(self._options)
+            say(f"connecting to {len(self._options)} vehicles: {names}")
+            coordinator = fleets.Coordinator(self._plan, self._children, self._switch)
+            thread = threading.Thread(
+                target=self._coordinate, args=(coordinator, over), name="fleet", daemon=True
+            )
+            thread.start()
+            stack.callback(thread.join, 1.0)
+            stack.callback(over.set)
+            yield coordinator
+
+    def _coordinate(self, coordinator: fleets.Coordinator, over: threading.Event) -> None:
+        try:
+            coordinator.run(over)
+        except BaseException as error:  # no more orders: every vehicle lands by itself
+            self._failure = error_at(error)
+
+    def _wait_until_ready(self, coordinator: fleets.Coordinator) -> None:
+        while not coordinator.are_ready:
+            self._look(coordinator)
+            self._refuse_failed(coordinator)
+            time.sleep(LOOK_S)
+        self._look(coordinator)
+
+    def _refuse_failed(self, coordinator: fleets.Coordinator) -> None:
+        """Once all have ended: raises the failure that has kept the fleet on the ground."""
+        results = {v.name: v.result for v in coordinator.views if v.result is not None}
+        if len(results) == len(self._options):
+            name = fleets.worst_of(results)
+            error = fleets.as_error(name, results[name])
+            raise type(error)(f"{error}; no vehicle was armed")
+
+    def _ask(self, coordinator: fleets.Coordinator) -> None:
+        names = ", ".join(self._options)
+        question = f"About to arm and fly {len(self._options)} vehicles: {names}. "
+        if not ask_to_confirm(f"{question}Is the space under the targets clear?"):
+            raise UsageError("not confirmed: nothing was started")
+
+    def _fly(self, coordinator: fleets.Coordinator) -> None:
+        names = list(self._options)
+
+        def on_keys(keys: bytes) -> None:
+            for key in keys:
+                number = key - ord("0")
+                if 1 <= number <= min(len(names), NUMBER_KEYS):
+                    coordinator.land(names[number - 1])
+
+        self._switch.listening = True
+        with cut_key(self._switch, stdin_number(), on_keys) as has_keys:
+            one = f"Press 1 to {min(len(names), NUMBER_KEYS)} to land one."
+            help_lines = STOP_HELP, f"{KEY_HELP} {one}" if has_keys else ""
+            print_lines("\n".join(filter(None, help_lines)))
+            self._panel = FleetPanel(sys.stderr, help_lines)
+            coordinator.confirm()
+            while not coordinator.has_ended:
+                self._look(coordinator)
+                if not coordinator.started:
+                    self._refuse_failed(coordinator)
+                time.sleep(LOOK_S)
+        self._look(coordinator)
+        if not coordinator.started:
+            self._refuse_failed(coordinator)
+
+    def _look(self, coordinator: fleets.Coordinator) -> None:
+        """Show what is new, and keep the record. Raises PerchError if nobody orders any more."""
+        if self._failure is not None:
+            raise PerchError(
+                f"the fleet's orders have stopped ({self._failure}): every vehicle lands by itself"
+            )
+        views = coordinator.views
+        for view in views:
+            stage, reason = _stage_and_reason(view)
+            # What has kept a fleet on the floor is one sentence, at its end.
+            is_told = coordinator.started or view.result is None
+            if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
+                self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
+            self._told[view.name] = stage
+        if self._panel is not None:
+            self._panel.show([_row(number, view) for number, view in enumerate(views, 1)])
+        ended = sum(view.result is not None for view in views)
+        if coordinator.started and ended > self._recorded:
+            self._recorded = ended
+            self._write_record(coordinator)
+
+    def _tell(self, line: str) -> None:
+        if self._panel is None:
+            say(line)
+        else:
+            self._panel.event(f"[{time.monotonic() - self._started_s:7.2f} s] {line}")
+
+    def _write_record(self, coordinator: fleets.Coordinator) -> None:
+        """Write what is known so far. A full disk is no reason to land."""
+        record = json.dumps(self._outcome(coordinator).record(), indent=1)
+        try:
+            write_files({self._folder / fleets.RECORD_NAME: f"{record}\n".encode()})
+            self._unwritten = None
+        except (OSError, PerchError) as error:
+            self._unwritten = f"{fleets.RECORD_NAME} cannot be written: {error}"
+
+    def _outcome(self, coordinator: fleets.Coordinator) -> fleets.FleetOutcome:
+        return fleets.FleetOutcome(
+            plan=self._plan,
+            options=self._options,
+            started=self._started,
+            started_s=self._started_s,
+            results={v.name: v.result for v in coordinator.views if v.result is not None},
+        )
+
+    def _end(self, error: BaseException) -> None:
+        """Land what flies, and wait until the processes have ended by themselves; not for flights
+        that hang after the operator's stop."""
+        self._switch.land()
+        hung = isinstance(error, Interrupted) and self._switch.listening
+        end_s = time.monotonic() + (0.0 if hung else ENDING_TIMEOUT_S)
+        while time.monotonic() < end_s and not all(map(_has_ended, self._children.values())):
+            time.sleep(LOOK_S)
+
+    def _close_panel(self) -> None:
+        if self._panel is not None:
+            self._panel.close()
+            if self._panel.failure is not None:
+                say(self._panel.failure)
+        if self._unwritten is not None:
+            say(self._unwritten)
+
+
+def _has_ended(child: fleets.VehicleProcess) -> bool:
+    return child.result() is not None or child.end_of_process() is not None
+
+
+def _stage_and_reason(view: fleets.VehicleView) -> tuple[str, str]:
+    result, status = view.result, view.status
+    if result is not None:
+        return ("hangs" if result.hangs else result.outcome), result.reason
+    if status is None:
+        return fleets.Stage.STARTING.value, ""
+    return status.phase or status.stage.value, status.reason
+
+
+def _row(number: int, view: fleets.VehicleView) -> FleetRow:
+    phase, reason = _stage_and_reason(view)
+    status = view.status
+    if status is None:
+        return FleetRow(number=number, name=view.name, phase=phase, reason=reason)
+    silent = view.result is None and view.silent_s > 1.0
+    return FleetRow(
+        number=number,
+        name=view.name,
+        phase=phase,
+        reason=f"its process is silent for {view.silent_s:.0f} s" if silent else reason,
+        height_m=status.height_m,
+        error_m=status.error_m,
+        battery_v=status.battery_v,
+        link_s=status.telemetry_age_s,
+    )
