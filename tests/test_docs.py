@@ -97,6 +97,8 @@ def cheap(line: str) -> list[str]:
     match words[:2]:
         case ["perchctl", "fly"] if "--dry-run" not in words:
             words.append("--dry-run")
+        case ["perchctl", "fleet"] if "fly" in words and "--dry-run" not in words:
+            words.append("--dry-run")
         case ["perchctl", "log"] if "--set" in words:  # that something differs is the answer
             words.append("--help")
         case ["perchctl", "check"]:  # its verdict is this computer's; tests/check has it

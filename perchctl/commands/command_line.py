@@ -66,8 +66,7 @@ COMMANDS: dict[str, str] = {
     ),
     "fly": "Fly a perching mission: find the target, align, ascend, perch, stop the motors.",
     "fleet": (
-        "Plan and simulate the flight of several vehicles in one room, and convert lists of other "
-        "programs."
+        "Plan, fly and simulate several vehicles in one room, and convert lists of other programs."
     ),
     "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
     "log": "Show, plot, compare, export, replay, film or report a flight from its log.",

@@ -24,8 +24,9 @@ from perchctl.display.panel import (
     phase_style,
 )
 
-_WIDTHS = {"": 2, "name": 10, "phase": 9, "height": 6, "error": 7, "battery": 6, "link": 6}
-"""Columns of the fields; what is left of the panel is the reason's."""
+_WIDTHS = {"": 2, "name": 10, "phase": 8, "height": 7, "error": 8, "battery": 7, "link": 6}
+_REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
+"""What the frame and the other fields, with a blank after each, leave."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ def fleet_table(rows: Sequence[FleetRow], below: str = "", above: str = "") -> P
             width=width,
             justify="left" if is_text else "right",
         )
-    table.add_column(no_wrap=True, overflow="ellipsis")
+    table.add_column(no_wrap=True, overflow="ellipsis", width=_REASON_COLUMNS)
     table.add_row(*(Text(name, style="dim") for name in (*_WIDTHS, "reason")))
     for row in rows:
         table.add_row(

@@ -1,5 +1,5 @@
-"""Several vehicles in one room: the fleet file, the radio budget, corridors, and the order of
-flight.
+"""Several vehicles in one room: the fleet file, the radio budget, corridors, the order of flight,
+and the flight.
 
 The plan is a pure function of the fleet file and the profiles that it names: nothing is connected,
 opened or armed. For those who fly, simulate or show a fleet:
@@ -19,6 +19,20 @@ opened or armed. For those who fly, simulate or show a fleet:
     draw_text(fleet, groups), draw_svg(fleet, groups)
     fly_fleet(plan, faults, seed)       # FleetResult of one seed, in lockstep: a unit of work
     fleet_summary(results), fleet_table(results)
+
+A flight is a process for each vehicle, and a parent that orders them:
+
+    with open_radios(plan) as uris:     # the seam for radio hubs: a URI for each vehicle's process
+        options = flight_options(plan, uris, folder, seed, record)
+        children = {name: VehicleProcess(name, each) for name, each in options.items()}
+        coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
+        coordinator.run(until)          # in a thread of its own; or step() by step
+        coordinator.confirm(), .land(name), .views, .has_ended
+
+messages: all that parent and vehicle say. vehicle_process: the vehicle's side; parent_watch: its
+operator, which lands without a parent. dispatch: who may take off and who lands, as pure functions.
+coordinator, children: the parent's side. prepare: what is refused before anything starts. outcome:
+exit code and ``fleet.json``.
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
 assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and

@@ -64,8 +64,8 @@ def test_the_panel_has_a_line_for_each_in_80_columns() -> None:
             name=f"vehicle-{number}",
             phase="ESTIMATE",
             reason="steady again, trying once more, and a reason that is longer than the panel",
-            height_m=-12.34,
-            error_m=123.45,
+            height_m=12.34,
+            error_m=1.234,
             battery_v=3.78,
             link_s=9.99,
         )
@@ -77,6 +77,10 @@ def test_the_panel_has_a_line_for_each_in_80_columns() -> None:
     lines = captured.get().splitlines()
     assert max(map(len, lines)) <= 80
     assert len(lines) == len(rows) + 3
+    shown = lines[3]
+    assert all(
+        part in shown for part in ("vehicle-2", "ESTIMATE", "12.34 m", "123.4 cm", "3.78 V")
+    )
 
 
 @pytest.mark.long
