@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import http.client
+import math
 import os
 import re
 import select
@@ -30,6 +31,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -42,8 +44,12 @@ from perchctl.sim import SimProcess, draw_scenario
 from perchctl.vehicle import LOCKED
 
 TIMEOUT_S = 120.0
+SHOWN = 2000
+"""Characters of a terminal that are shown of a flight that has failed."""
 CTRL_C, SPACE = "\x03", " "
 EMERGENCY_STOP = Packet(Port.SUPERVISOR, 1, bytes((3,)))
+POSITION, LAND_2 = 7, 8
+"""First bytes of a position setpoint, and of the high-level commander's landing order."""
 WAYS: dict[str, tuple[tuple[float, str], ...]] = {
     "space bar": ((0.0, SPACE),),
     "Cut motors on the page": ((0.0, "cut"),),
@@ -80,7 +86,8 @@ def interrupt_in(phase: str, seed: int, folder: Path) -> tuple[int, str, bool]:
 
 
 class Wire:
-    """UDP between cflib and the vehicle; `stopped_s` is when the first emergency stop passed."""
+    """UDP between cflib and the vehicle; `stopped_s` is when the first emergency stop passed,
+    `orders_s` has when each order to be at a height passed, the vehicle's own landing included."""
 
     def __init__(self, vehicle_uri: str) -> None:
         host, _, port = vehicle_uri.removeprefix("udp://").rpartition(":")
@@ -89,6 +96,7 @@ class Wire:
         self._near.bind(("127.0.0.1", 0))
         self.uri = f"udp://127.0.0.1:{self._near.getsockname()[1]}"
         self.stopped_s: float | None = None
+        self.orders_s: list[float] = []
         self._closed = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -109,33 +117,47 @@ class Wire:
                         self._near.sendto(datagram, client)
                     elif end is self._near:
                         client = sender
-                        if self.stopped_s is None and Packet.decode(datagram) == EMERGENCY_STOP:
-                            self.stopped_s = time.monotonic()
+                        self._note(Packet.decode(datagram))
                         self._far.sendto(datagram, self._vehicle)
+
+    def _note(self, packet: Packet | None) -> None:
+        if self.stopped_s is None and packet == EMERGENCY_STOP:
+            self.stopped_s = time.monotonic()
+        if packet is None or not packet.data:
+            return
+        kind = packet.port, packet.data[0]
+        if kind in ((Port.HIGH_LEVEL, LAND_2), (Port.COMMANDER_GENERIC, POSITION)):
+            self.orders_s.append(time.monotonic())
+
+    def ordered_after_s(self, t_s: float) -> float:
+        """When the first order to be at a height passed at `t_s` or later; inf if none did."""
+        return next((at_s for at_s in list(self.orders_s) if at_s >= t_s), math.inf)
 
 
 class TerminalFlight:
-    """`perchctl fly --view` in a terminal of its own, which is read until the flight ends."""
+    """`perchctl` with `words` in a terminal of its own, which is read until the flight ends, except
+    while `paused` is set."""
 
     def __init__(self, *words: str) -> None:
         self._ours, theirs = os.openpty()
         take_terminal = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
         run = "import sys; from perchctl.__main__ import main; sys.exit(main())"
         self.process = subprocess.Popen(
-            [sys.executable, "-c", f"{take_terminal}\n{run}", "fly", "--view", *words],
+            [sys.executable, "-c", f"{take_terminal}\n{run}", *words],
             stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
         )  # fmt: skip
         os.close(theirs)
-        self._shown = ""
+        self.shown = ""
+        self.paused = threading.Event()
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
     def wait_for(self, pattern: str) -> str:
         """The first text shown that fits."""
         end_s = time.monotonic() + TIMEOUT_S
-        while (found := re.search(pattern, self._shown)) is None:
+        while (found := re.search(pattern, self.shown)) is None:
             if time.monotonic() > end_s or self.process.poll() is not None:
-                raise SystemExit(f"{pattern!r} never came:\n{self._shown}")
+                raise SystemExit(f"{pattern!r} never came:\n{self.shown[-SHOWN:]}")
             time.sleep(0.01)
         return found.group()
 
@@ -153,14 +175,21 @@ class TerminalFlight:
     def _read(self) -> None:
         with contextlib.suppress(OSError):
             while piece := os.read(self._ours, 65536):
-                self._shown += piece.decode(errors="replace")
+                self.shown += piece.decode(errors="replace")
+                while self.paused.is_set():
+                    time.sleep(0.01)
 
 
 @contextlib.contextmanager
-def started_vehicle(seed: int) -> Iterator[tuple[Wire, str]]:
-    """A wire to a simulated vehicle, and the address of its camera's stream."""
+def started_vehicle(
+    seed: int, target_xy_m: tuple[float, float] | None = None
+) -> Iterator[tuple[Wire, str]]:
+    """A wire to a simulated vehicle, and the address of its camera's stream. `target_xy_m`: where
+    its target hangs, instead of where the seed says."""
     profile = load_profile("sim")
     scenario, camera = draw_scenario(profile, seed), profile_camera(profile.camera)
+    if target_xy_m is not None:
+        scenario = replace(scenario, target_xy_m=target_xy_m)
     with (
         SimProcess.start(scenario, camera=camera, target=profile.target) as vehicle,
         contextlib.closing(Wire(vehicle.uri)) as wire,
@@ -171,9 +200,8 @@ def started_vehicle(seed: int) -> Iterator[tuple[Wire, str]]:
 def key_to_packet_ms(way: str, seed: int, folder: Path) -> tuple[float, int]:
     """From the deciding press to the packet, ms, and the flight's exit code."""
     with started_vehicle(seed) as (wire, stream):
-        flight = TerminalFlight(
-            "--yes", "--uri", wire.uri, "--source", stream, "--log-dir", str(folder)
-        )
+        words = ("--yes", "--uri", wire.uri, "--source", stream, "--log-dir", str(folder))
+        flight = TerminalFlight("fly", "--view", *words)
         flight.wait_for(r"\] SEARCH:")
         begun_s = pressed_s = time.monotonic()
         for at_s, what in WAYS[way]:
