@@ -41,10 +41,13 @@ def main(channel: Channel) -> None:
     with operator_signals(switch, _say):
         try:
             options: FlyOptions = channel.receive(OPTIONS_TIMEOUT_S)
-        except (EOFError, OSError):  # the parent is gone; TimeoutError is an OSError
+            line = ParentLine(channel, switch)
+        except (EOFError, OSError, Interrupted):  # the parent is gone, or wants no flight any more
             return
-        line = ParentLine(channel, switch)
-        result = fly_vehicle(options, switch, line)
+        try:
+            result = fly_vehicle(options, switch, line)
+        except BaseException as error:  # a signal while another failure was being dealt with
+            result = StatusReporter(line, switch).result_of_error(error, None, lost=switch.lost)
         line.finish(result)
     sys.stdout.flush()
     os._exit(0)  # a library's thread that hangs must not keep the process
@@ -55,6 +58,7 @@ def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> 
     reporter = StatusReporter(line, switch)
     log: LogWatcher | None = None
     try:
+        line.may_interrupt = True
         seed = options.seed if options.simulated else None
         log = LogWatcher.open_real_time(
             options.log_dir, options.profile, options.uri, options.source, seed, options.record
@@ -73,6 +77,7 @@ def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> 
             _say(sentence)
         return reporter.result_of(summary, str(log.path), hangs=hangs, lost=switch.lost)
     except BaseException as error:
+        line.may_interrupt = False
         if log is not None:
             log.abandon(str(error) or type(error).__name__)
         return reporter.result_of_error(error, log, lost=switch.lost)
@@ -83,9 +88,13 @@ class ParentLine:
 
     If the parent is gone or sends nonsense, the vehicle lands. Before the flight loop listens, a
     word ends the process's start as a signal would.
+
+    Attributes:
+        may_interrupt: the main thread can take an `Interrupted` now.
     """
 
     def __init__(self, channel: Channel, switch: ParentSwitch) -> None:
+        self.may_interrupt = False
         self._channel, self._switch = channel, switch
         self._status = Status()
         self._turned_s: float | None = None
@@ -115,7 +124,7 @@ class ParentLine:
             while True:
                 if self._channel.poll(POLL_S):
                     self._take_orders()
-                    self._interrupt_start()
+                self._interrupt_start()
                 result = self._result
                 if result is not None:
                     self._channel.send(result)
@@ -128,7 +137,8 @@ class ParentLine:
                     self._channel.send(replace(self._status, loop_age_s=age_s))
         except Exception:  # EOFError, OSError; or bytes that are no message
             self._switch.lose_parent()
-            self._interrupt_start()
+            self._ended.set()
+            self._interrupt_start_alone()
         finally:
             self._ended.set()
 
@@ -141,10 +151,16 @@ class ParentLine:
             order = self._channel.recv()
         self._switch.take(order)
 
+    def _interrupt_start_alone(self) -> None:
+        """Without a parent: wait until the start can be interrupted, or the loop listens."""
+        while self._result is None and not (self._has_interrupted or self._switch.listening):
+            self._interrupt_start()
+            time.sleep(POLL_S)
+
     def _interrupt_start(self) -> None:
         """While vehicle and camera are being connected, nobody reads the word. Once only: a second
         signal would interrupt what the first one ends."""
-        starts = not self._switch.listening and self._status.stage is Stage.STARTING
+        starts = self.may_interrupt and not self._switch.listening
         if starts and self._switch.landing_requested and not self._has_interrupted:
             self._has_interrupted = True
             os.kill(os.getpid(), signal.SIGTERM)  # `operator_signals` makes an Interrupted of it

@@ -78,9 +78,7 @@ def test_the_panel_has_a_line_for_each_in_80_columns() -> None:
     assert max(map(len, lines)) <= 80
     assert len(lines) == len(rows) + 3
     shown = lines[3]
-    assert all(
-        part in shown for part in ("vehicle-2", "ESTIMATE", "12.34 m", "123.4 cm", "3.78 V")
-    )
+    assert all(part in shown for part in ("vehicle-2", "ESTIMATE", "12.34 m", "123.4 cm", "3.78 V"))
 
 
 @pytest.mark.long
