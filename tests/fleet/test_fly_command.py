@@ -82,12 +82,13 @@ def test_the_panel_has_a_line_for_each_in_80_columns() -> None:
 
 
 @pytest.mark.long
-def test_one_bad_uri_and_nothing_arms(tmp_path: Path) -> None:
+def test_one_that_does_not_answer_and_nothing_arms(tmp_path: Path) -> None:
+    """Its camera does not either, and is asked first."""
     bad = two(tmp_path, ", uri: 'udp://127.0.0.1:9', source: 'http://127.0.0.1:9/'")
     done = run_apart("fleet", "fly", str(bad), "--yes", "--log-dir", str(tmp_path / "logs"))
     sentence = done.stderr.splitlines()[-1]
-    assert done.code == 10, done.stderr
-    assert sentence.startswith("perchctl: east: ")
+    assert done.code == 40, done.stderr
+    assert sentence.startswith("perchctl: east: http://127.0.0.1:9/ gave no picture")
     assert sentence.endswith("no vehicle was armed")
     assert "APPROACH" not in done.stderr
     assert not list(tmp_path.glob("logs/*"))
