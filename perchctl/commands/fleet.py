@@ -65,7 +65,7 @@ def check(
     as_json: JsonOption = False,
     force: ForceOption = False,
 ) -> None:
-    """Plan, fly and simulate several vehicles in one room, and convert lists of other programs.
+    """Plan, fly and simulate several vehicles in one room, and convert other lists.
 
     By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
     vehicles, decides who flies together and in which order, and draws the room from above. It
