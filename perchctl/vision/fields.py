@@ -108,7 +108,7 @@ def classify_fields(frame: Frame) -> Frame:
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
-def field_frames(frame: Frame) -> tuple[Frame, Frame]:
+def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
     """Return the top and the bottom field of a woven frame, both with the frame's time."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
@@ -140,7 +140,7 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
     )
     if frame.fields != "woven" or state.is_top_first is None:
         return state, (frame,)
-    top, bottom = field_frames(frame)
+    top, bottom = interpolate_fields(frame)
     early, late = (top, bottom) if state.is_top_first else (bottom, top)
     apart_s = _estimate_period_s(state.periods_s) / 2.0
     return state, (

@@ -535,9 +535,9 @@ def _outward_normals(corners: Array) -> Array:
 
 def _side_sigma_px(d: Detection, corners: Array) -> Array:
     """Return the standard deviation of each side, (4,): larger for a side along the rows."""
-    way = corners.take(_SIDE_END, axis=0) - corners
-    lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
-    rows = 0.5 * math.pi * np.abs(way[:, 1])
+    sides = corners.take(_SIDE_END, axis=0) - corners
+    lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
+    rows = 0.5 * math.pi * np.abs(sides[:, 1])
     return np.asarray(
         np.hypot(d.sigma_px, d.horizontal_side_sigma_px * lying / np.hypot(1.0, rows))
     )

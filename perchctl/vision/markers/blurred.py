@@ -236,7 +236,7 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool
     the marker, it is above 0.95.
     """
     return (
-        found.pattern > _MIN_INNER_CORRELATION
+        found.pattern_correlation > _MIN_INNER_CORRELATION
         and found.fit_correlation > _MIN_CORRELATION
         and _MIN_PATTERN_CONTRAST < found.pattern_contrast < _MAX_PATTERN_CONTRAST
         and found.cell_deviation < _MAX_CELL_DEVIATION

@@ -236,13 +236,13 @@ _MIN_PAPER_NODES = 200  # least number of nodes on paper
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """Nodes of a pinhole camera's picture, `step` apart in normalised coordinates, starting at
-    `first`. `x` and `y` are the positions of their samples in the picture reduced to `size` (width,
-    height).
+    `first_node` (2,). `x` and `y` are the positions of their samples in the picture reduced to
+    `size` (width, height).
 
     `inside` marks the nodes in the picture. Beyond `reach`, a lens model may fold back.
     """
 
-    first: Array
+    first_node: Array
     step: float
     reach: float
     x: Grey
@@ -253,8 +253,8 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A reduced picture: grey values (rows, columns) at the nodes of a lattice; `seen` is True for
-    nodes in view and uncovered."""
+    """A reduced picture: grey values (rows, columns) at the nodes of a lattice; `is_visible` is
+    True for nodes in view and uncovered."""
 
     lattice: Lattice
     grey: Grey
@@ -291,7 +291,7 @@ def make_lattice(camera: CameraModel) -> Lattice:
     shape = (int(nodes[1]), _SAMPLES_PER_NODE, int(nodes[0]), _SAMPLES_PER_NODE)
     flat = x.shape
     return Lattice(
-        first=rays.min(axis=0) + step / 2.0,
+        first_node=rays.min(axis=0) + step / 2.0,
         step=step,
         reach=reach,
         x=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
@@ -329,7 +329,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
     """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes
     around."""
     step = lattice.step / _SAMPLES_PER_NODE
-    start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
+    start = lattice.first_node - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
         [[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step], [0.0, 0.0, 1.0]]
     )
@@ -353,7 +353,7 @@ def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float
     grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.is_visible)
-    at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
+    at = lattice.first_node + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
     on = (
         np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1)
         < LARGE_PAPER_HALF_SIDES
@@ -529,14 +529,14 @@ class PoseFit:
 class _EdgePoints:
     """Edge points of an outline in the picture: `points` (n, 2) px and unit normal (n, 2) from
     black to white. `J` (n, 7) is their motion along the normal with rotation, translation and the
-    shift of all edges (white over black), `px_per_unit` (n,) the scale across the edge, and `index`
-    (n,) their index in the outline."""
+    shift of all edges (white over black), `px_per_unit` (n,) the scale across the edge, and
+    `outline_index` (n,) their index in the outline."""
 
     points: Array
     normal: Array
     J: Array
     px_per_unit: Array
-    index: NDArray[np.intp]
+    outline_index: NDArray[np.intp]
 
 
 _FitStep = tuple[Array, Array, Array, float]
@@ -555,9 +555,11 @@ def fit_pose(
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _PROFILE_HALF_LENGTHS_PX:
         places = _edge_points_in_view(pose, outline, reach_px, image.shape, camera, mask)
-        if len(places.index) < _MIN_EDGE_POINTS:
+        if len(places.outline_index) < _MIN_EDGE_POINTS:
             return None
-        reach_cells_px = _PROFILE_REACH_CELLS * outline.cell[places.index] * places.px_per_unit
+        reach_cells_px = (
+            _PROFILE_REACH_CELLS * outline.cell[places.outline_index] * places.px_per_unit
+        )
         half_px = np.minimum(reach_px, reach_cells_px)
         offset_px, shows = _measure_offsets(image, places, half_px)
         if np.count_nonzero(shows) < _MIN_EDGE_POINTS:
@@ -585,7 +587,7 @@ def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseF
     places = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTHS_PX[0], camera.size_px[::-1], camera, None
     )
-    n = len(places.index)
+    n = len(places.outline_index)
     if n < _MIN_EDGE_POINTS:
         return None
     found = _solve_step(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
@@ -637,8 +639,8 @@ def _edge_points_in_view(
     turn = np.cross(X - pose.t, move)  # (w x r) . m = w . (r x m)
     free = np.ones(len(near), dtype=np.bool_)
     if mask is not None:
-        for way in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            x_px, y_px = np.rint(at + way * reach_px * normal).astype(np.intp).T
+        for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
+            x_px, y_px = np.rint(at + fraction * reach_px * normal).astype(np.intp).T
             free &= mask[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
     return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
@@ -687,8 +689,10 @@ def _make_pose_fit(
     pose: RigidPose, found: _FitStep, places: _EdgePoints, outline: Outline
 ) -> PoseFit:
     J, (_, inverse, w, variance) = places.J, found
-    line = outline.line[places.index]
-    common_px = np.hypot(outline.print_sigma[places.index] * places.px_per_unit, _LINE_SIGMA_PX)
+    line = outline.line[places.outline_index]
+    common_px = np.hypot(
+        outline.print_sigma[places.outline_index] * places.px_per_unit, _LINE_SIGMA_PX
+    )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
@@ -699,6 +703,6 @@ def _make_pose_fit(
         cov=cov[:6, :6],
         points_in_view=len(shown),
         points_shown=int(np.count_nonzero(shown)),
-        small_points=int(np.count_nonzero(shown & outline.small[places.index])),
+        small_points=int(np.count_nonzero(shown & outline.small[places.outline_index])),
         residual_px=math.sqrt(variance),
     )

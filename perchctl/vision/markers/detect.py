@@ -22,7 +22,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
 from perchctl.values import replace
-from perchctl.vision.fields import field_frames, interpolated_sigma_px
+from perchctl.vision.fields import interpolate_fields, interpolated_sigma_px
 from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
 from perchctl.vision.markers.corners import (
     DERIVED_CORNER_SIGMA_PX,
@@ -289,7 +289,10 @@ search is used."""
 
 
 def find_corners(picture: Picture, prior: Prior) -> CornerFindings:
-    """Apply the methods to a picture; each one that is used starts from the previous findings."""
+    """Find the markers' corners with each applicable method of `CORNER_METHODS` in turn.
+
+    Each method starts from the findings of the methods before it.
+    """
     found = CornerFindings()
     for method in CORNER_METHODS:
         if method.is_used(picture, prior, found):
@@ -315,7 +318,7 @@ def detect_markers(
     """
     prior = make_prior(frame, previous, setup, camera, expected, empty_frames, own)
     if frame.fields == "woven":
-        first, second = (_detect(each, setup, camera, prior) for each in field_frames(frame))
+        first, second = (_detect(each, setup, camera, prior) for each in interpolate_fields(frame))
         return add_marker_flow(average_fields(first, second), previous)
     return add_marker_flow(_detect(frame, setup, camera, prior), previous)
 
@@ -677,8 +680,10 @@ def average_fields(first: Detections, second: Detections) -> Detections:
         one, other = first.get(name), second.get(name)
         if one is None or other is None:
             continue
-        way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
-        if float(np.linalg.norm(way_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(one.corners_px):
+        offset_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
+        if float(np.linalg.norm(offset_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(
+            one.corners_px
+        ):
             expected_both[name] = _average_detections(one, other)
     if not expected_both:
         alone = first if first.markers else second

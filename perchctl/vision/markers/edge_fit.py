@@ -376,8 +376,8 @@ def _is_accepted(
     lines &= (contrast > _MIN_CONTRAST * PROFILES_PER_SIDE) & (
         sides.blur_px < 0.9 * sides.window_half_px
     )
-    way = corners_px - markers.raw_px
-    moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
+    displacement = corners_px - markers.raw_px
+    moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
     good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
     return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
 

@@ -94,10 +94,12 @@ def fit_partly_visible(
     if not mean_side_px(start_px) / pattern.rim.cells >= MIN_PARTIAL_CELL_PX:
         return None
     # Enough cells must be in the picture, wherever the fit may end.
-    spots = _is_point_in_picture(
-        _project_spots_px(start_px, pattern, camera), picture.image.shape, _MAX_CORNER_MOTION_PX
+    in_picture = _is_point_in_picture(
+        _project_sample_points_px(start_px, pattern, camera),
+        picture.image.shape,
+        _MAX_CORNER_MOTION_PX,
     )
-    if not _has_enough_known_cells(_is_cell_known(spots, pattern), pattern, identified_by):
+    if not _has_enough_known_cells(_is_cell_known(in_picture, pattern), pattern, identified_by):
         return None
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
@@ -220,25 +222,25 @@ def _has_matching_visible_cells(
     must."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
-    at = _project_spots_px(corners_px, pattern, picture.camera)
+    at = _project_sample_points_px(corners_px, pattern, picture.camera)
     near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
     seen = _is_point_in_picture(at, image.shape, 0.0)
     if hidden is not None:
         seen &= ~hidden[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_spots = pattern.is_white[pattern.spot_cells]
-    if not ((seen & white_spots).any() and (seen & ~white_spots).any()):
+    white_samples = pattern.is_white[pattern.sample_cells]
+    if not ((seen & white_samples).any() and (seen & ~white_samples).any()):
         return False
-    high = float(np.median(grey[seen & white_spots]))
-    low = float(np.median(grey[seen & ~white_spots]))
+    high = float(np.median(grey[seen & white_samples]))
+    low = float(np.median(grey[seen & ~white_samples]))
     contrast = high - low
     if contrast < MIN_CONTRAST:
         return False
     seen &= grey <= high + _GLARE * contrast
     if high < _BRIGHTEST_GREY - _GLARE * contrast:
         seen &= grey < _BRIGHTEST_GREY
-    count = np.bincount(pattern.spot_cells, weights=seen)
-    means = np.bincount(pattern.spot_cells, weights=grey * seen) / np.maximum(count, 1.0)
+    count = np.bincount(pattern.sample_cells, weights=seen)
+    means = np.bincount(pattern.sample_cells, weights=grey * seen) / np.maximum(count, 1.0)
     known = _is_cell_known(seen, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_white, 1.0, -1.0)
     wrong = np.count_nonzero(known & (share < CELL_THRESHOLD_MARGIN))
@@ -250,16 +252,17 @@ def _has_matching_visible_cells(
     return bool(wrong <= most_wrong) and _has_enough_known_cells(known, pattern, identified_by)
 
 
-def _project_spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """Return the spots of a marker with corners (4, 2) in the distorted picture, (n, 2); NaN
+def _project_sample_points_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
+    """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted picture; NaN
     outside the lens model. A marker that fills the picture is not a quadrilateral in it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
-        return np.full((len(pattern.spots), 2), np.nan)
-    spots = apply_homography(homography_from_unit_square(rays), pattern.spots)
-    at = distort(spots, camera)
+        return np.full((len(pattern.sample_points), 2), np.nan)
+    undistorted = apply_homography(homography_from_unit_square(rays), pattern.sample_points)
+    at = distort(undistorted, camera)
     near = (
-        np.abs(undistort(at, camera) - spots).max(axis=1) * camera.K[0, 0] < _MAX_INVERSION_ERROR_PX
+        np.abs(undistort(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
+        < _MAX_INVERSION_ERROR_PX
     )
     return np.where(near[:, None], at, np.nan)
 
@@ -274,9 +277,9 @@ def _is_point_in_picture(
 
 
 def _is_cell_known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
-    """Return which cells (cells,) show at least half of their spots (n,)."""
+    """Return which cells (cells,) show at least half of their sample points (n,)."""
     known: NDArray[np.bool_] = (
-        np.bincount(pattern.spot_cells, weights=seen) >= 0.5 * pattern.spots_per_cell
+        np.bincount(pattern.sample_cells, weights=seen) >= 0.5 * pattern.samples_per_cell
     )
     return known
 

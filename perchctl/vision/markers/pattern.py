@@ -18,14 +18,14 @@ from perchctl.vision.markers.corners import (
     is_inside_picture,
 )
 
-MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a spot
+MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a blob
 MIN_CONTRAST = 10.0  # grey levels
 CELL_THRESHOLD_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
 _CENTRAL_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
-_SPOT_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
+_SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +50,24 @@ class BorderCells:
 class Pattern:
     """The appearance of a marker.
 
-    rim: cells inside the border. drawing: all cells. spots (n, 2): points in the marker's
-    coordinates (see `perchctl.vision.markers.corners`) at which cells are read; spot_cells (n,):
-    the cell of each spot; spots_per_cell (cells,); blurred_spots (4, n): expected grey at the spots
-    with a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; is_white,
-    is_inner (cells,): True for a white cell, for a cell within the border.
+    Attributes:
+        rim: cells inside the border.
+        drawing: all cells.
+        sample_points: points (n, 2) at which cells are read, in the marker's coordinates (see
+            `perchctl.vision.markers.corners`).
+        sample_cells: the cell (n,) of each sample point.
+        samples_per_cell: number of sample points in each cell, (cells,).
+        templates: expected grey (4, n) at the sample points with a blur of half a cell, zero-mean
+            and of unit norm, for corners rolled by 0 to 3.
+        is_white, is_inner: True for a white cell, for a cell within the border, (cells,).
     """
 
     rim: BorderCells
     drawing: Drawing
-    spots: Array
-    spot_cells: NDArray[np.intp]
-    spots_per_cell: Array
-    blurred_spots: Array
+    sample_points: Array
+    sample_cells: NDArray[np.intp]
+    samples_per_cell: Array
+    templates: Array
     is_white: NDArray[np.bool_]
     is_inner: NDArray[np.bool_]
 
@@ -86,18 +91,19 @@ def make_border_cells(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Border
 
 
 def make_pattern(rim: BorderCells, drawing: Drawing) -> Pattern:
-    """Return the pattern of a marker, with spots in all cells that no central marker hides."""
+    """Return the pattern of a marker. It has sample points in all cells that no central marker
+    hides."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    spots = (centres[:, None] + _SPOT_OFFSETS * 2.0 / n).reshape(-1, 2)
-    owner = np.repeat(np.arange(n * n), len(_SPOT_OFFSETS))
-    free = np.abs(spots).max(axis=1) > _CENTRAL_COVER_HALF_SIDES * drawing.ratio
+    sample_points = (centres[:, None] + _SAMPLE_OFFSETS * 2.0 / n).reshape(-1, 2)
+    owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS))
+    free = np.abs(sample_points).max(axis=1) > _CENTRAL_COVER_HALF_SIDES * drawing.ratio
     kept = np.unique(owner[free])
-    turns, at = [], spots[free]
+    turns, at = [], sample_points[free]
     for _ in range(4):
-        soft = _blur_spots(drawing, at)
+        soft = _sample_blurred_drawing(drawing, at)
         soft -= soft.mean()
         turns.append(soft / math.sqrt(float(soft @ soft)))
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
@@ -105,10 +111,10 @@ def make_pattern(rim: BorderCells, drawing: Drawing) -> Pattern:
     return Pattern(
         rim=rim,
         drawing=drawing,
-        spots=np.ascontiguousarray(spots[free]),
-        spot_cells=own,
-        spots_per_cell=np.bincount(own).astype(np.float64),
-        blurred_spots=np.stack(turns),
+        sample_points=np.ascontiguousarray(sample_points[free]),
+        sample_cells=own,
+        samples_per_cell=np.bincount(own).astype(np.float64),
+        templates=np.stack(turns),
         is_white=drawing.cells.ravel()[kept] > 0.5,
         is_inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
@@ -153,40 +159,40 @@ def is_correlated_with_pattern(
 def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
     rolled by 0 to 3; 0 without contrast."""
-    grey = _read_spots(image, corners_px, pattern)
+    grey = _read_samples(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
     grey -= grey.mean()
     spread = float(np.linalg.norm(grey))
-    # With black and white on about half of the spots each, they differ by two standard deviations.
+    # If half of the samples are black and half are white, they differ by two standard deviations.
     if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
         return np.zeros(4)
-    return np.asarray(pattern.blurred_spots @ grey / spread)
+    return np.asarray(pattern.templates @ grey / spread)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    grey = _read_spots(image, corners_px, pattern)
+    grey = _read_samples(image, corners_px, pattern)
     if grey is None:
         return None
-    return np.asarray(np.bincount(pattern.spot_cells, weights=grey) / pattern.spots_per_cell)
+    return np.asarray(np.bincount(pattern.sample_cells, weights=grey) / pattern.samples_per_cell)
 
 
-def _read_spots(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the spots; None outside the picture."""
-    at = apply_homography(homography_from_unit_square(corners_px), pattern.spots)
-    # Spots are inside the corners.
+def _read_samples(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Return the grey values (k,) at the sample points; None outside the picture."""
+    at = apply_homography(homography_from_unit_square(corners_px), pattern.sample_points)
+    # The sample points are inside the corners.
     if not (is_inside_picture(corners_px, image.shape) or is_inside_picture(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
 
 
-def _blur_spots(drawing: Drawing, spots: Array) -> Array:
-    """Return the whiteness at the spots with a blur of half a cell."""
+def _sample_blurred_drawing(drawing: Drawing, sample_points: Array) -> Array:
+    """Return the whiteness of the drawing at the sample points, with a blur of half a cell."""
     n, fine = len(drawing.cells), 8
     sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
     white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
-    at = (((spots + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
+    at = (((sample_points + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
     return np.asarray(white[at[:, 1], at[:, 0]])
 
 

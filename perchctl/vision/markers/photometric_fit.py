@@ -12,7 +12,7 @@ by cell, does not show the marker.
 
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
 the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
-same with that blur; `Alignment.flip` says how close one is.
+same with that blur; `Alignment.wrong_bit_degree` says how close one is.
 
 Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
 grids are (n, n) nodes, stored as rows of n * n.
@@ -95,8 +95,8 @@ class Alignment:
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
         fit_correlation: correlation of the picture with the drawing.
-        pattern, pattern_contrast: correlation and contrast of the inner bits, beyond a black square
-            of the same size; the contrast is relative to the border's.
+        pattern_correlation, pattern_contrast: correlation and contrast of the inner bits, beyond a
+            black square of the same size; the contrast is relative to the border's.
         cell_deviation: largest mean deviation of a cell, in units of the gain.
         wrong_bit_degree, wrong_bit_sigma: how far the worst-fitting cell has the opposite colour, 0
             (as drawn) to 1 (wrong bit), and the standard deviation of the least certain cell.
@@ -107,7 +107,7 @@ class Alignment:
     corners_px: Array
     sigma_px: float
     fit_correlation: float
-    pattern: float
+    pattern_correlation: float
     pattern_contrast: float
     cell_deviation: float
     wrong_bit_degree: float
@@ -199,7 +199,7 @@ def align_drawing(
     # Residuals of the last round, whose step was negligible.
     gain, error = equations.gain, equations.error
     corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
-    pattern, pattern_contrast = _measure_inner_pattern(seen, grey, gain)
+    pattern_correlation, pattern_contrast = _measure_inner_pattern(seen, grey, gain)
     many = _count_redundant_nodes(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
     wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, many)
@@ -209,7 +209,7 @@ def align_drawing(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
         fit_correlation=fit_correlation(grey, error),
-        pattern=pattern,
+        pattern_correlation=pattern_correlation,
         pattern_contrast=pattern_contrast,
         cell_deviation=_cell_deviation(error / gain, grid, len(drawing.cells)),
         wrong_bit_degree=wrong_bit_degree,
@@ -257,9 +257,13 @@ def fit_correlation(grey: Array, error: Array) -> float:
 def _measure_wrong_bits(
     seen: RenderedDrawing, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`, using the inverse of N. A
-    wrong bit is tested in the form in which it would appear: blurred, and without the part that the
-    unknowns of the fit explain."""
+    """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`.
+
+    Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
+    cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
+    1 for a flipped one. `inverse` is the inverse of the normal matrix N of `equations`, and `many`
+    the number of nodes that share the same information.
+    """
     soft, noise, gain = seen.blurred_cell_coverage, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
@@ -448,7 +452,7 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A drawing at a grid's nodes, blurred by `sigma` nodes."""
+    """A marker's drawing, rendered at the nodes of a grid with a Gaussian blur of `sigma` nodes."""
 
     drawing: Drawing
     grid: Grid

@@ -183,8 +183,10 @@ def choose_markers(
         _, i, j = wholes[0]
         if expected:
             centre = next(iter(expected.values())).mean(axis=0)
-            away_px = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
-            _, i, j = wholes[int(np.argmin(away_px))]
+            distances_px = [
+                float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes
+            ]
+            _, i, j = wholes[int(np.argmin(distances_px))]
         elif own is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = _nearest_candidate("large", [large[i]], expected, ratio) is None
@@ -215,9 +217,9 @@ def _sort_by_distance(
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
     for name, quads in candidates.items():
-        away_m = [own(name, quad) for quad in quads]
-        order = np.argsort(away_m, kind="stable").tolist()
-        kept[name] = [quads[k] for k in order if math.isfinite(away_m[k])]
+        distances_m = [own(name, quad) for quad in quads]
+        order = np.argsort(distances_m, kind="stable").tolist()
+        kept[name] = [quads[k] for k in order if math.isfinite(distances_m[k])]
     return kept if any(kept.values()) else candidates
 
 

@@ -176,7 +176,7 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.is_inner & ~LARGE.is_white)[0]
     spots = apply_homography(
-        homography_from_unit_square(true), LARGE.spots[LARGE.spot_cells == black]
+        homography_from_unit_square(true), LARGE.sample_points[LARGE.sample_cells == black]
     )
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
