@@ -95,7 +95,7 @@ def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "rows": [list(row) for row in status_rows(tick) if row[0] != "phase"],
-        "note": f"held: {state.pause}" if state.pause else "",
+        "note": f"held: {state.pause_reason}" if state.pause_reason else "",
         "over": state.phase.is_over,
         "steps": STEPS,
         "height_m": tick.telemetry.position_m[2] - ground_m,

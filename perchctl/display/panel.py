@@ -44,7 +44,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),
         ("ages", ages),
         *([] if tick.outside is None else [("outside", _outside_text(tick.outside))]),
-        ("held" if state.pause else "reason", state.pause or state.reason),
+        ("held" if state.pause_reason else "reason", state.pause_reason or state.reason),
     ]
 
 

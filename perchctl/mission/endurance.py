@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
     MIN_LOADED_S,
@@ -45,16 +46,16 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     seconds = None if energy.no_reading_s > MAX_READING_GAP_S else counted_s
     if c.belief.target.world_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, (attempt_s, again_s, landing_s) = seconds, predict_durations_s(c)
+    enough_s, predicted = seconds, predict_durations(c)
     if enough_s is None:
         enough_s = (
             _no_reading_grace_s(c) if counted_s is None else min(counted_s, _no_reading_grace_s(c))
         )
-    spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
+    spare_s = enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.attempt_s
     left = c.planner.attempts - c.state.attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
-        attempts = 1 + math.floor(min(spare_s / again_s, max(0, left)))
+        attempts = 1 + math.floor(min(spare_s / predicted.retry_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
@@ -80,9 +81,18 @@ def predict_hover_time_s(
     )
 
 
-def predict_durations_s(c: Context) -> tuple[float, float, float]:
-    """Return the times, s, that this attempt, each retry and the landing take, in this order, from
-    the height of the known target."""
+@dataclass(frozen=True)
+class MissionDurations:
+    """Predicted times that parts of a mission take, s."""
+
+    attempt_s: float  # the rest of this attempt
+    retry_s: float  # each further attempt
+    landing_s: float
+
+
+def predict_durations(c: Context) -> MissionDurations:
+    """Predict how long this attempt, each retry and the landing take, from the height of the known
+    target."""
     planner = c.planner
     up_m = max(0.0, c.belief.target.contact_body_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCH_DURATION_S
@@ -92,13 +102,12 @@ def predict_durations_s(c: Context) -> tuple[float, float, float]:
         aligned_s = (
             BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
         )
-    again_m = planner.recover.descend_m + planner.ascend.standoff_m
-    attempt_s = aligned_s + _climb_duration_s(c.profile, up_m) + touch_s
-    again_s = 2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, again_m) + touch_s
-    return (
-        attempt_s,
-        again_s,
-        max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps + LANDING_END_DURATION_S,
+    retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
+    descent_s = max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps
+    return MissionDurations(
+        attempt_s=aligned_s + _climb_duration_s(c.profile, up_m) + touch_s,
+        retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
+        landing_s=descent_s + LANDING_END_DURATION_S,
     )
 
 
@@ -111,12 +120,13 @@ def is_charge_too_low(c: Context) -> bool:
 def battery_shortfall_text(c: Context) -> str:
     """Return the remaining time, and the times that an attempt, the landing and the reserve
     take."""
-    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, predict_durations_s(c)
+    seconds, predicted = c.state.battery.left_s, predict_durations(c)
     has = "the remaining battery time is unknown"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
     return (
-        f"{has}; an attempt takes {attempt_s:.0f} s, the landing {landing_s:.0f} s, "
+        f"{has}; an attempt takes {predicted.attempt_s:.0f} s, "
+        f"the landing {predicted.landing_s:.0f} s, "
         f"and the reserve is {c.safety.energy_reserve_s:g} s"
     )
 

@@ -294,13 +294,13 @@ def _is_overdue(c: Context) -> bool:
     state, b = c.state, c.belief
     if b.dead_reckoned_s is None and not b.diverged:
         return False
-    way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
+    descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
     measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_S
     spare_s = DESCENT_MARGIN_S if measured else UNMEASURED_DESCENT_MARGIN_S
     if not measured and b.hover.is_imprecise:
         spare_s += MAX_SETPOINT_DESCENT_S
-    return c.t_s - began_s > spare_s + way_m / MIN_MEAN_SINK_MPS
+    return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_SINK_MPS
 
 
 def _compute_braking_attitude(c: Context) -> tuple[float, float]:
@@ -323,10 +323,10 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     x_mps, y_mps, _ = reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if b.dead_reckoned_s is None else c.t_s - b.dead_reckoned_s
-    felt_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
+    visual_age_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
     unsure_mps = min(
         MAX_LATERAL_SIGMA_MPS,
-        INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, felt_s),
+        INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
     )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, MAX_FULL_BRAKE_AGE_S / max(1e-3, b.attitude_age_s))
@@ -341,7 +341,7 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
         reckoning.mean_lateral_mps2,
     )
     known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_TIME_CONSTANT_S)
-    counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / MAX_ATTITUDE_ERROR_AGE_S)
+    counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_ATTITUDE_ERROR_AGE_S)
     ahead_mps2, left_mps2 = _rotate_to_heading(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
     )

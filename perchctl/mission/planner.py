@@ -13,7 +13,7 @@ without a successor, the firmware levels out after 0.5 s and cuts the motors aft
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import is_pressing
-from perchctl.mission.belief.evidence import update_since
+from perchctl.mission.belief.evidence import update_start_times
 from perchctl.mission.belief.quality import hold_reason
 from perchctl.mission.belief.update import reset_evidence
 from perchctl.mission.context import Context
@@ -66,7 +66,7 @@ def _update_before_decision(
         measured = target is not None and target.measured and target.world_m is not None
         confirmed_frames = confirmed_frames + 1 if measured else 0
     hold = hold_reason(state.belief, maneuver)
-    since = update_since(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
+    since = update_start_times(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
     state = replace(
         state, confirmed_frames=confirmed_frames, hold=hold, since={} if hold else since
     )

@@ -67,8 +67,8 @@ class Event:
         if state.phase is not before.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
             events.append(cls(obs.t_s, *entered, claims=state.entry.claims))
-        elif state.pause and not before.pause:
-            held = EventKind.HOLD, state.pause, state.phase
+        elif state.pause_reason and not before.pause_reason:
+            held = EventKind.HOLD, state.pause_reason, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif (
             state.belief.last_stale_s == obs.t_s

@@ -81,8 +81,8 @@ def _find_rest_state_by_falls(c: Context) -> RestState:
     """Return the rest state from the falls since the vehicle came within the magnet's reach, if
     ever, and from silences that could hide a fall."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_reach_since_s
-    felt_s = c.state.descent.floor_detected_s
-    down_s = max(b.imu.fell_s, -math.inf if felt_s is None else felt_s)
+    floor_s = c.state.descent.floor_detected_s
+    down_s = max(b.imu.fell_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt
     unsure = reckoning.doubtful_gap_s > max(down_s, reckoning.sighting_s)
     if since_s is None or down_s > since_s:

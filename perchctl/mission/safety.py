@@ -260,8 +260,8 @@ def is_held_elsewhere(c: Context) -> bool:
     touched = last_touch_offset(c.belief)
     offset = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
-    beside = offset.lateral_offset_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
-    return c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S and (beside or not at_its_height)
+    is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
+    return c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S and (is_off_axis or not at_its_height)
 
 
 def is_blocked(c: Context) -> bool:

@@ -94,8 +94,9 @@ class PlannerState:
         return self.entry.reason
 
     @property
-    def pause(self) -> str:
-        """Why the mission pauses, by a hold or by your own row; empty if it does not."""
+    def pause_reason(self) -> str:
+        """Why the mission pauses: the reason of the hold or of your own row. Empty if it does not
+        pause."""
         return self.hold or self.waiting_reason
 
     @property

@@ -144,7 +144,7 @@ def tick_record(
         "phase": tick.state.phase.value,
         "stage": None if seen is None else seen.stage.value,
         "reason": tick.state.reason,
-        "hold": tick.state.pause or None,
+        "hold": tick.state.pause_reason or None,
         "attempts": tick.state.attempts,
         "tel_age_s": tick.telemetry_age_s,
         "cam_age_s": tick.camera_age_s,

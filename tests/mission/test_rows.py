@@ -440,14 +440,14 @@ def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     state = waiting = remembering(state_in(P.ALIGN), since={ALIGNED: 10.0})
     for t_s in range(11, 50):
         waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
-    assert (waiting.phase, waiting.pause, waiting.hold) == (P.ALIGN, "mine", "")
+    assert (waiting.phase, waiting.pause_reason, waiting.hold) == (P.ALIGN, "mine", "")
     assert isinstance(command, PositionSetpoint)
     assert waiting.waited_s == 39.0 > PROFILE.planner.align.timeout_s
     after, _ = planner.step_mission(waiting, observation(50.0), PROFILE, table)
-    assert (after.phase, after.pause) == (P.ALIGN, "")  # it has yet to stay aligned
+    assert (after.phase, after.pause_reason) == (P.ALIGN, "")  # it has yet to stay aligned
     for tick in range(1, 25):
         after, _ = planner.step_mission(after, observation(50.0 + TICK_S * tick), PROFILE, table)
-    assert (after.phase, after.pause, after.waited_s) == (P.ASCEND, "", 0.0)
+    assert (after.phase, after.pause_reason, after.waited_s) == (P.ASCEND, "", 0.0)
     lost = observation(11.0, target=None)
     assert planner.step_mission(state, lost, PROFILE, table)[0].phase is P.SEARCH
     stopped = observation(11.0, operator=Operator.LAND)

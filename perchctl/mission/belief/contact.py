@@ -67,7 +67,7 @@ MIN_PRESS_SETPOINT_HEIGHT_M = 0.08
 climb is detected late."""
 TOUCH_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
-IMPACT_SIGMA_M = 0.002
+DECK_IMPACT_SIGMA_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 DECK_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
@@ -111,7 +111,7 @@ def contact_offset(b: Belief) -> ContactOffset:
     reckoning = b.reckoning
     sigma_m = math.hypot(reckoning.lateral_sigma_m, TOUCH_SIGMA_M, *reckoning.position_step_sum_m)
     if b.profile.positioning.source.is_deck and b.is_position_valid:
-        sigma_m = math.hypot(sigma_m, IMPACT_SIGMA_M, DECK_SIGMA_GROWTH_MPS * b.sighting_age_s)
+        sigma_m = math.hypot(sigma_m, DECK_IMPACT_SIGMA_M, DECK_SIGMA_GROWTH_MPS * b.sighting_age_s)
     return ContactOffset(math.hypot(*reckoning.lateral_offset_m), sigma_m)
 
 
@@ -247,12 +247,12 @@ def _is_in_contact(b: Belief) -> bool:
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS and b.is_position_valid
-    felt_s = b.obs.t_s - b.imu.steady_s
+    motionless_s = b.obs.t_s - b.imu.steady_s
     return (
         abs(b.target.error_z_m)
         <= perch.contact_z_m
         + (PRESS_HEIGHT_DRIFT_MPS * b.sighting_age_s if b.is_target_positioned else 0)
-        and (steady or felt_s >= perch.contact_dwell_s)
+        and (steady or motionless_s >= perch.contact_dwell_s)
         and b.is_reading_one_g
         and b.hover_thrust > 0
         and b.is_thrust_known

@@ -1,8 +1,8 @@
 """Conditions that become evidence after they have been true for some time.
 
 A condition is true or false in one tick. It counts as evidence only after it has been true without
-interruption for a dwell time, so that a single wrong sample proves nothing. `Since` maps each true
-condition to the time at which it became true.
+interruption for a dwell time, so that a single wrong sample proves nothing. `StartTimes` maps each
+true condition to the time at which it became true.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ class Condition(Generic[Knowledge]):
         return f"<condition: {self.name}>"
 
 
-Since = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of several types
+StartTimes = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of several types
 
 
-def update_since(
-    old: Since, conditions: Iterable[Condition[Knowledge]], seen: Knowledge, now_s: float
+def update_start_times(
+    old: StartTimes, conditions: Iterable[Condition[Knowledge]], seen: Knowledge, now_s: float
 ) -> dict[Condition[Knowledge], float]:
     """Return the start time of each condition that is true for `seen`: the time in `old` if the
     condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
     return {each: old.get(each, now_s) for each in conditions if each.holds(seen)}
 
 
-def keep_independent(since: Since) -> dict[Condition, float]:  # type: ignore[type-arg]
+def keep_independent(since: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the entries that survive a change of phase or a hold."""
     return {each: began_s for each, began_s in since.items() if each.is_phase_independent}

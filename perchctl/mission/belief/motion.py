@@ -439,12 +439,14 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
 def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
-    way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
+    unexplained_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
     if max(last.behind_s, new.behind_s) > MAX_TELEMETRY_GAP_S:
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return new.velocity_mps[2] > GAP_FALL_MPS and sunk_m > -MAX_GAP_UNEXPLAINED_M
-    return abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS and abs(way_m) <= MAX_GAP_UNEXPLAINED_M
+    return (
+        abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS and abs(unexplained_m) <= MAX_GAP_UNEXPLAINED_M
+    )
 
 
 def _integrate(

@@ -74,7 +74,7 @@ UNMEASURED_VELOCITY_TIME_CONSTANT_S = 0.5
 MIN_POSITION_STEP_M = 0.005
 """Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
 counts as a step."""
-MIN_POSITION_STEP_MPS = 0.2
+MIN_POSITION_STEP_GROWTH_MPS = 0.2
 """Increase of that threshold for each second between two samples, m/s."""
 MAX_STEP_INTERVAL_S = 0.15
 """Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
@@ -90,8 +90,8 @@ claimed too precisely."""
 DISTANCE_SIGMA_FRACTION = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
-WRONG_POSITION_GAIN_PER_S = 1.5
-"""Apparent acceleration, m/s^2, that positions in wrong axes cause per m/s of
+WRONG_POSITION_BIAS_GAIN_PER_S = 1.5
+"""Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
 `estimate_only_mps`."""
 MAX_HEIGHT_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a silence."""
@@ -223,7 +223,7 @@ def _integrate_sample(
     estimated, dt_s = sample.velocity_mps, imu.t_s - before.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, beside, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    velocity, bias, estimate_only_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
     remembers = math.exp(-dt_s / MISSED_VELOCITY_TIME_CONSTANT_S) if corrected else 1.0
     keeps = math.exp(-dt_s / UNMEASURED_VELOCITY_TIME_CONSTANT_S)
     calm = believed and imu.t_s - imu.pushed_s > MAX_PUSH_DELAY_S
@@ -247,7 +247,7 @@ def _integrate_sample(
             wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
             if calm and i < 2:
                 more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
-                beside[i] = keeps * old.estimate_only_mps[i] + more
+                estimate_only_mps[i] = keeps * old.estimate_only_mps[i] + more
             if abs(wrong) <= MAX_BIAS_INNOVATION_MPS2:
                 share = min(1.0, dt_s / BIAS_TIME_CONSTANT_S)
                 b = max(-MAX_BIAS_MPS2, min(MAX_BIAS_MPS2, b + share * (wrong - b)))
@@ -270,7 +270,7 @@ def _integrate_sample(
         bias_mps2=(bias[0], bias[1], bias[2]),
         mean_lateral_mps2=(mean_lateral_mps2[0], mean_lateral_mps2[1]),
         estimated_mps=estimated,
-        estimate_only_mps=(beside[0], beside[1]),
+        estimate_only_mps=(estimate_only_mps[0], estimate_only_mps[1]),
         imu_only_mps=(missed[0], missed[1]),
         distance_below_m=math.inf
         if fell
@@ -344,8 +344,8 @@ def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     return replace(
         old,
         bias_mps2=(
-            bx + WRONG_POSITION_GAIN_PER_S * x_mps,
-            by + WRONG_POSITION_GAIN_PER_S * y_mps,
+            bx + WRONG_POSITION_BIAS_GAIN_PER_S * x_mps,
+            by + WRONG_POSITION_BIAS_GAIN_PER_S * y_mps,
             bz,
         ),
     )
@@ -364,7 +364,7 @@ def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) ->
         - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
         for i in range(2)
     )
-    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + MIN_POSITION_STEP_MPS * dt_s:
+    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + MIN_POSITION_STEP_GROWTH_MPS * dt_s:
         return old
     sx_m, sy_m = old.position_step_sum_m
     return replace(

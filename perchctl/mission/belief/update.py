@@ -33,7 +33,7 @@ from perchctl.mission.belief.contact import (
     is_hover_thrust,
     is_thrust_too_low_to_fly,
 )
-from perchctl.mission.belief.evidence import Condition, keep_independent, update_since
+from perchctl.mission.belief.evidence import Condition, keep_independent, update_start_times
 from perchctl.mission.belief.maneuver import SentOrders
 from perchctl.mission.belief.motion import ZERO, Vector
 from perchctl.mission.belief.mounting import MountingMonitor, make_mounting_sample, update_monitor
@@ -273,10 +273,12 @@ def _stop_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     touched = b.contact_z_m is not None or hangs
     if not touched or not new.distance_below_m < MAGNET_REACH_M or not rests:
         return new
-    blown = obs.t_s - obs.imu.steady_aside_s < REST_DWELL_S
+    is_laterally_unsteady = obs.t_s - obs.imu.steady_aside_s < REST_DWELL_S
     x_mps, y_mps, _ = new.velocity_mps
-    new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
-    if not blown:
+    new = replace(
+        new, velocity_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
+    )
+    if not is_laterally_unsteady:
         new = learn_bias_at_rest(new, b.reckoning.imu, obs.imu)
     if obs.telemetry.thrust < 1:  # a hanging vehicle stays in place
         old = b.reckoning
@@ -381,7 +383,7 @@ def _update_estimators(b: Belief) -> Belief:
     obs, maneuver = b.obs, b.sent.maneuver
     held = bool(hold_reason(b, maneuver))
     fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]
-    since: dict[Condition[Any], float] = update_since(b.since, fresh, b, obs.t_s)
+    since: dict[Condition[Any], float] = update_start_times(b.since, fresh, b, obs.t_s)
     if held:
         since = keep_independent(since)  # a hold interrupts the evidence
     dt_s = max(0.0, obs.t_s - b.t_s)
