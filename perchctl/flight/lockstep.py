@@ -205,7 +205,7 @@ def fly_lockstep(
         source,
         LockstepClock(link),
         profile,
-        replace(make_pipeline(profile, model), own_step=perception),
+        replace(make_pipeline(profile, model), custom_step=perception),
         watchers,
         operator,
         positions,

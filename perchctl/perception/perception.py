@@ -92,7 +92,7 @@ class Perception:
         for picture in found:
             at = picture.t_s
             attitude = self.attitude(at) if self.attitude else attitude_at(self.history, at)
-            run = self.pipeline.own_step or step
+            run = self.pipeline.custom_step or step
             self.state, output = run(self.state, picture, attitude, self.pipeline)
             if output.detections.mirrored:
                 self._mirrored += 1

@@ -87,7 +87,7 @@ Step = Callable[
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's constants, made by `make_pipeline`. If set, `own_step` replaces `step`."""
+    """The pipeline's constants, made by `make_pipeline`. If set, `custom_step` replaces `step`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -95,8 +95,8 @@ class Pipeline:
     tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
-    own_detector: Detector | None = None
-    own_step: Step | None = None
+    custom_detector: Detector | None = None
+    custom_step: Step | None = None
 
 
 def make_pipeline(
@@ -132,15 +132,15 @@ def make_pipeline(
         pose=pose,
         merge=profile.merge,
         tracks=TrackSetup(
-            level=make_filter(profile.kalman, in_world=False),
-            world=make_filter(profile.kalman, in_world=True),
+            level_filter=make_filter(profile.kalman, in_world=False),
+            world_filter=make_filter(profile.kalman, in_world=True),
             pose=pose,
             has_gate=profile.kalman.gate,
             own_target=own,
         ),
         kalman=profile.kalman,
         camera=camera,
-        own_detector=None
+        custom_detector=None
         if profile.detector.own is None
         else load_extension(profile.detector.own, "detector.own"),
     )
@@ -181,8 +181,8 @@ def step(
     """
     frame = classify_fields(_grey_frame(frame, pipeline.camera))
     expected, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
-    if pipeline.own_detector is not None:
-        detections = _own_detections(frame, pipeline.own_detector)
+    if pipeline.custom_detector is not None:
+        detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
         # The first picture is searched by all methods.
         first = state.last_detections is None and state.rival is None and state.empty_frames == 0
@@ -216,7 +216,7 @@ def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
     return frame
 
 
-def _own_detections(frame: Frame, detect: Detector) -> Detections:
+def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
     """Return the detections of `detect`. Raises InvalidValue for values that cannot be corners."""
     found: dict[MarkerName, Detection] = {}
     try:
@@ -311,7 +311,7 @@ def estimate(
     if target is None or attitude is None or target.world_m is None:
         return target
     if state.tracks and state.in_world:
-        world = pipeline.tracks.world
+        world = pipeline.tracks.world_filter
         tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
         merged = merge_tracks(tracks, state.measured.used_poses, pipeline.merge.weights)
         assert merged is not None
@@ -387,7 +387,7 @@ def _convert_to_frames(
         seen["world_velocity_mps"] = merged.velocity_mps
         if spread:
             cov_m2 = turn.dot(cov_m2).dot(turn.T)
-            bias_m = relative_bias_m(bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+            bias_m = relative_bias_m(bias_m, attitude, pipeline.tracks.world_filter, pipeline.pose)
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
         if attitude is not None:

@@ -53,9 +53,9 @@ def marker_offset_m(
     `place.max_distance_m`."""
     seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    away_m = _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, place, setup)
+    offset_m = _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, place, setup)
     is_bounded = attitude is not None and math.isfinite(place.max_distance_m)
-    return away_m if not is_bounded or away_m <= place.max_distance_m else math.inf
+    return offset_m if not is_bounded or offset_m <= place.max_distance_m else math.inf
 
 
 def target_offset_m(
@@ -76,11 +76,11 @@ def refusal_text(
     target."""
     if attitude is None or place.xy_m is None:
         return None
-    away_m = target_offset_m(pose, attitude, place, setup)
-    if away_m <= place.max_distance_m:
+    offset_m = target_offset_m(pose, attitude, place, setup)
+    if offset_m <= place.max_distance_m:
         return None
     return (
-        f"a target {away_m:.2f} m from target.expected_xy_m is ignored "
+        f"a target {offset_m:.2f} m from target.expected_xy_m is ignored "
         f"(target.expected_within_m is {place.max_distance_m:g} m)"
     )
 
@@ -99,8 +99,8 @@ def to_world(
 ) -> tuple[Array, float]:
     """Convert a target's position (3,) and heading, relative to the gear in the level frame, to the
     world frame of the state estimate."""
-    way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
-    position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
+    body_to_target_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
+    position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(body_to_target_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
 
 
@@ -110,8 +110,8 @@ def to_level(
     """Convert a target's position (3,) and heading in the world to the level frame, relative to the
     gear; the inverse of `to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
-    way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
-    return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
+    body_to_target_m = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
+    return body_to_target_m - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
 
 
 def track_measurement(
@@ -122,13 +122,13 @@ def track_measurement(
     setup: PoseSetup,
 ) -> Measurement:
     """Return a pose as a measurement for the filter, in the world or the level frame."""
-    z, way_m = np.empty(4), pose.e_m
+    z, body_to_target_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
         assert attitude is not None
-        way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
+        body_to_target_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
-        z[1:] = attitude.R_world_level.dot(way_m) + attitude.position_m
+        z[1:] = attitude.R_world_level.dot(body_to_target_m) + attitude.position_m
     if constants.process is None or pose.cov is None:
         return Measurement(z)
     noise = pose.cov.copy()
@@ -136,7 +136,7 @@ def track_measurement(
     bias = np.zeros((4, 4))
     bias[1:, PRINT] = pose.print_shift_m
     if attitude is not None:
-        bias[1:, TILTS] = tilt_jacobian(way_m) * constants.tilt_sigma_rad
+        bias[1:, TILTS] = tilt_jacobian(body_to_target_m) * constants.tilt_sigma_rad
     if in_world and attitude is not None:
         turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level

@@ -41,15 +41,15 @@ class TrackSetup:
     """The constants of the filters in the level and the world frame and of the pose estimation,
     whether the gate is enabled, and the position of the vehicle's own target."""
 
-    level: FilterSetup
-    world: FilterSetup
+    level_filter: FilterSetup
+    world_filter: FilterSetup
     pose: PoseSetup
     has_gate: bool
     own_target: OwnTargetPosition
 
     def select_filter(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the world or the level frame."""
-        return self.world if in_world else self.level
+        return self.world_filter if in_world else self.level_filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,8 +485,8 @@ def update_last_pose(
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the line of sight, because the distance of a far target is uncertain along it.
     residual = [
-        R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2]
-        for way_m in _camera_displacements_m(then, attitude, setup)
+        R.T.dot(displacement_m - seen_m)[:2] / pose.tvec_m[2]
+        for displacement_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
         old + _ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
@@ -498,11 +498,11 @@ def update_last_pose(
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
-    way_m = R.T @ (place_m - attitude.position_m - _camera_offset_m(attitude, setup))
+    tvec_m = R.T @ (place_m - attitude.position_m - _camera_offset_m(attitude, setup))
     # Further off the axis, a lens model may fold back into the picture.
-    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > make_lattice(setup.camera).reach * way_m[2]:
+    if tvec_m[2] <= 0.0 or np.hypot(*tvec_m[:2]) > make_lattice(setup.camera).reach * tvec_m[2]:
         return False
-    (at_px,) = project(np.zeros((1, 3)), np.zeros(3), way_m, setup.camera)
+    (at_px,) = project(np.zeros((1, 3)), np.zeros(3), tvec_m, setup.camera)
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
