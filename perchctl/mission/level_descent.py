@@ -340,7 +340,7 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,
     )
-    known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_TIME_CONSTANT_S)
+    known = 0.0 if b.diverged else min(1.0, reckoning.position_control_s / BIAS_TIME_CONSTANT_S)
     counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_ATTITUDE_ERROR_AGE_S)
     ahead_mps2, left_mps2 = _rotate_to_heading(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad

@@ -65,7 +65,7 @@ FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
 """Phases in which nothing but air should touch the vehicle: their maneuver is `in_free_air`."""
 MAGNET_ATTACH_PHASES = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
-PAPER_PHASES = (
+PUBLISHED_PHASES = (
     Phase.APPROACH,
     Phase.SEARCH,
     Phase.ESTIMATE,
@@ -74,7 +74,7 @@ PAPER_PHASES = (
     Phase.PERCH,
     Phase.COMPLETE,
 )
-"""The seven phases of the paper, in their order."""
+"""The seven phases of the published method, in their order."""
 
 
 class Severity(IntEnum):

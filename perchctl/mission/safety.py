@@ -91,10 +91,10 @@ HELD_BY_OTHER_DWELL_S = 2.0
 """Time after which the magnet has been distinguished from other supports, s."""
 MAX_BLIND_VARIANCE_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
-MIN_CONTRADICTION_M = 0.3
+MIN_CONTRADICTING_SIGHTING_OFFSET_M = 0.3
 """Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
 position control moves the vehicle further off. Smaller: an oscillation ends the flight."""
-MIN_CONTRADICTION_AGE_S = 0.35
+MIN_CONTRADICTED_POSITION_AGE_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings are not a
 single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection ends
 the flight."""
@@ -172,7 +172,10 @@ def is_position_lost(c: Context) -> bool:
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
         return True
-    if b.position_age_s > MIN_CONTRADICTION_AGE_S and c.obs.position_beside_m > MIN_CONTRADICTION_M:
+    if (
+        b.position_age_s > MIN_CONTRADICTED_POSITION_AGE_S
+        and c.obs.position_beside_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
+    ):
         return True
     unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VARIANCE_M2PS2
     return b.is_target_positioned and b.is_position_stale and unsure

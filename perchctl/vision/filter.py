@@ -39,7 +39,9 @@ _RATE_TO_VALUE[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_PAPER_UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # units of the paper, per state
+_PUBLISHED_UNITS = np.array(
+    [_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM]
+)  # units of the paper, per state
 
 _ACCELERATION_DURATION_S = 0.1
 """Duration of an acceleration, s: the density of the white noise is its square times this,
@@ -115,7 +117,7 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
     first[RATES] = (5.0 if in_world else level_rate) ** 2  # cm/s and deg/s
-    squares = _PAPER_UNITS**2
+    squares = _PUBLISHED_UNITS**2
     process = None
     if measured:
         process = (

@@ -168,8 +168,9 @@ frame earlier."""
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the markers with their corners moved to the frame's time.
 
-    If `setup.readout_s` is None, the corners stay, and `common_px` is their shift for a typical
-    readout time. Otherwise `common_px`, `sigma_px` and `cov_px2` contain the error of the shift.
+    If `setup.readout_s` is None, the corners stay, and `common_shift_px` is their shift for a
+    typical readout time. Otherwise `common_shift_px`, `sigma_px` and `cov_px2` contain the error of
+    the shift.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
@@ -187,7 +188,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
-            out.append(replace(d, common_px=moved_px))
+            out.append(replace(d, common_shift_px=moved_px))
         else:
             turned_px = FLOW_ROTATION_SIGMA * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
@@ -197,7 +198,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    common_px=FLOW_SIGMA_FRACTION * moved_px,
+                    common_shift_px=FLOW_SIGMA_FRACTION * moved_px,
                 )
             )
     return out

@@ -255,13 +255,13 @@ class TiltPrior:
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the better of the two possible poses of a planar marker; None if neither is valid."""
-    candidates = [_refine(points, c) for c in _closed_form(points)]
+    candidates = [_refine(points, c) for c in _solve_closed_form(points)]
     scored = [_score(c, points) for c in candidates if _is_valid(c)]
     if not scored:
         return None
     best = _choose_likeliest(scored, points, prior)
     if prior.normal_cam is None or prior.contradicts(best):
-        best = _choose_likeliest([best, *_flipped_candidates(best, points)], points, prior)
+        best = _choose_likeliest([best, *_find_flipped_candidates(best, points)], points, prior)
     # The unweighted optimum is so close that the errors are linear.
     return refine_pose(points, best) or best
 
@@ -351,7 +351,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
+def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
     """Return the candidates of OpenCV's SQPNP; none for collinear corners."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
@@ -385,7 +385,7 @@ def _score(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
     return ScoredPose(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
 
 
-def _flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
+def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
     """Return the best candidate near the normal mirrored at the line of sight, if it is a different
     one."""
     R = rotation_matrix(scored.rvec)
@@ -463,9 +463,9 @@ class WeightedCorners:
     """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole camera K, with
     standard deviations sigma_px (n,). whitening (2n, 2n) makes the errors independent and of unit
     variance. shift (2n, k) holds one whitened standard deviation of each common error: the shift of
-    all edges, the detections' `common_px`, and the jitter of a detection's rows. `curl_lift_m` (2n,
-    2) is the result of `curl_lift`, and `is_curled` is True if the curl changes the weights of the
-    corners."""
+    all edges, the detections' `common_shift_px`, and the jitter of a detection's rows.
+    `curl_lift_m` (2n, 2) is the result of `curl_lift`, and `is_curled` is True if the curl changes
+    the weights of the corners."""
 
     object_m: Array
     image_px: Array
@@ -508,8 +508,8 @@ def weigh_corners(
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
-        if d.common_px is not None:
-            shift[rows, 1] = d.common_px.ravel()
+        if d.common_shift_px is not None:
+            shift[rows, 1] = d.common_shift_px.ravel()
         if d.row_sigma_px > 0.0:
             # As for a line: half to all of its rows shift alike, and they slant.
             down = corners[:, 1] - corners[:, 1].mean()

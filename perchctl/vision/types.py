@@ -152,7 +152,7 @@ class Detection:
     refined: bool
     shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
     # (4, 2): one standard deviation of a shift common to all corners
-    common_px: Array | None = None
+    common_shift_px: Array | None = None
     cov_px2: Array | None = None
     row_sigma_px: float = 0.0  # standard deviation due to the jitter of rows in analogue video
     # for sides along the rows, if every second one is interpolated

@@ -19,7 +19,7 @@ from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import EventKind, Operator, Outcome, Phase, planner
 from perchctl.mission.context import Context
-from perchctl.mission.phase import PAPER_PHASES
+from perchctl.mission.phase import PUBLISHED_PHASES
 from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.record.fields import tick_record
@@ -27,7 +27,7 @@ from perchctl.sim import Neighbour, SimulatedVehicle, draw_scenario
 from tests.helpers.flights import DATA_SHEET, SEED, SHORT, Flown, fly_short, short_profile
 from tests.helpers.loop_rig import Watcher
 
-SEVEN_NAMES = [phase.value for phase in PAPER_PHASES]
+SEVEN_NAMES = [phase.value for phase in PUBLISHED_PHASES]
 MISS_LIMIT_M = 0.020
 ON_THE_FLOOR_M = 0.05
 SLIPPERY_N = 0.1  # a quarter of the weight
@@ -180,7 +180,7 @@ SOFT_MPS = 0.35
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("phase", PAPER_PHASES, ids=lambda p: p.value)
+@pytest.mark.parametrize("phase", PUBLISHED_PHASES, ids=lambda p: p.value)
 def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     """On the floor; or, where the magnet has it already, peeled off in vain and left hanging,
     and reported so."""

@@ -335,7 +335,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
         imu=imu,
         bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
         mean_lateral_mps2=(reads_mps2 * cos, reads_mps2 * sin),
-        held_s=held_s,
+        position_control_s=held_s,
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)

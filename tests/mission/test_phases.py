@@ -11,8 +11,8 @@ from perchctl.mission.phase import (
     FINAL_PHASES,
     FLYING_PHASES,
     FREE_AIR_PHASES,
-    PAPER_PHASES,
     PRE_CONTACT_PHASES,
+    PUBLISHED_PHASES,
 )
 from perchctl.mission.table import PHASES, TABLE
 
@@ -45,9 +45,9 @@ def test_what_the_camera_steers_and_what_flies_in_the_open_is_declared_once() ->
 
 def test_the_sets_are_those_of_the_paper_s_phases() -> None:
     """By name: a phase that is put between others must not push one out."""
-    names = " ".join(phase.value for phase in PAPER_PHASES)
+    names = " ".join(phase.value for phase in PUBLISHED_PHASES)
     assert names == "APPROACH SEARCH ESTIMATE ALIGN ASCEND PERCH COMPLETE"
-    assert {*PAPER_PHASES, Phase.RECOVER} <= FLYING_PHASES
+    assert {*PUBLISHED_PHASES, Phase.RECOVER} <= FLYING_PHASES
     assert {Phase.COMPLETE} == FLYING_PHASES - PRE_CONTACT_PHASES
     assert not FINAL_PHASES & AIRBORNE_PHASES
 

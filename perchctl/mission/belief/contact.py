@@ -85,8 +85,8 @@ MAX_STANDING_HEIGHT_M = 0.1
 """Height below which a vehicle may still stand on the ground instead of pressing, m."""
 MAX_HANGING_ERROR_Z_M = 0.15
 """Largest height difference to the target at which the vehicle may hang on its magnet, m."""
-FLOOR_EXCLUDED_ERROR_Z_M = 0.3
-"""Height difference to the target within which the vehicle cannot stand on the floor, m."""
+MIN_ON_FLOOR_ERROR_Z_M = 0.3
+"""Least height difference to the target of a vehicle that stands on the floor, m."""
 RELEASED_FALL_MPS = -0.05
 """Vertical speed below which a released vehicle with a low specific force is falling, m/s."""
 FULL_THRUST_FALL_MPS = -0.15
@@ -307,7 +307,7 @@ def _has_stopped_motors(b: Belief) -> bool:
 def _is_on_floor(b: Belief) -> bool:
     """True if the vehicle is motionless at a thrust too small to support it, and is low or has come
     down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
-    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= FLOOR_EXCLUDED_ERROR_Z_M
+    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= MIN_ON_FLOOR_ERROR_Z_M
     came_down_m = b.sent.maneuver_start_m[2] - b.telemetry.position_m[2]
     came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_M
     handover_m = b.profile.planner.landing.handover_m

@@ -96,14 +96,14 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     proportional to force."""
     tel, old = b.telemetry, estimate_hover_thrust(b)
     thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
-    first, sigma = old.first or (old.thrust, max(MIN_DESCENT_SIGMA, old.sigma))
-    old = replace(old, first=(first, sigma))
+    first, sigma = old.before_descent or (old.thrust, max(MIN_DESCENT_SIGMA, old.sigma))
+    old = replace(old, before_descent=(first, sigma))
     shows = (
         MIN_SPECIFIC_FORCE_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_G
         and thrust >= MIN_PROPORTIONAL_FRACTION * first
     )
-    felt_floor = b.sent.floor_detected_s is not None
-    if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or felt_floor:
+    is_on_floor = b.sent.floor_detected_s is not None
+    if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or is_on_floor:
         return old
     new = old.propagate(dt_s, DESCENT_RANDOM_WALK).with_measurement(thrust / tel.acc_z_g, dt_s)
     most = MAX_DESCENT_CORRECTION_SIGMAS * sigma

@@ -38,9 +38,9 @@ TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 distance plus twice the vehicle's motion within the time was moved. `JUMP_PAUSE_S` is the pause
 after a move, s."""
 ESTIMATE_JUMP_M = 0.05
-"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_MPS`, above which the
-estimate has jumped. Larger: sightings from before and after a jump are compared."""
-ESTIMATE_JUMP_MPS = 1.5
+"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_GROWTH_MPS`, above which
+the estimate has jumped. Larger: sightings from before and after a jump are compared."""
+ESTIMATE_JUMP_GROWTH_MPS = 1.5
 """Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
 fast vehicle are dropped."""
 _MAX_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
@@ -119,7 +119,7 @@ def update_monitor(old: MountingMonitor, sight: MountingSample) -> MountingMonit
 
 def _is_jump(before: tuple[MountingSample, ...], sight: MountingSample) -> bool:
     last = before[-1]
-    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_MPS * (sight.t_s - last.t_s)
+    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_GROWTH_MPS * (sight.t_s - last.t_s)
     if abs(sight.vehicle_m - last.vehicle_m) > far:
         return True
     for s in reversed(before):

@@ -128,7 +128,7 @@ class DeadReckoning:
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
     mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
-    held_s: float = 0.0  # total time in the open under position control
+    position_control_s: float = 0.0  # total time in the open under position control
 
 
 def advance_reckoning(
@@ -308,7 +308,7 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
         velocity_bias_mps=(part * bias[0], part * bias[1]),
         mean_velocity_mps=(velocity[0], velocity[1]),
         mean_position_m=(position[0], position[1]),
-        held_s=old.held_s + dt_s,
+        position_control_s=old.position_control_s + dt_s,
     )
 
 

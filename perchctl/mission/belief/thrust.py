@@ -27,7 +27,7 @@ the filter learns a lasting push. Smaller: it follows a sagging battery late."""
 ACCELEROMETER_SIGMA = 0.03
 """Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
 error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
-MAX_PRECISE_SIGMA = 0.05
+MAX_PRECISE_THRUST_SIGMA = 0.05
 """Standard deviation, as a share, above which the estimate is too rough for a descent without
 telemetry. Larger: the vehicle descends too fast. Smaller: it waits in the air for longer."""
 
@@ -39,17 +39,17 @@ class HoverThrust:
     Attributes:
         thrust: 0..65535; 0 while unknown.
         sigma: standard deviation, as a share of `thrust`.
-        first: `thrust` and `sigma` at the start of a descent by thrust; None before one.
+        before_descent: `thrust` and `sigma` at the start of a descent by thrust; None before one.
     """
 
     thrust: float = 0.0
     sigma: float = math.inf
-    first: tuple[float, float] | None = None
+    before_descent: tuple[float, float] | None = None
 
     @property
     def is_imprecise(self) -> bool:
         """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
-        return self.sigma > MAX_PRECISE_SIGMA
+        return self.sigma > MAX_PRECISE_THRUST_SIGMA
 
     def propagate(self, dt_s: float, drift: float) -> HoverThrust:
         """Return the estimate `dt_s` later, with a random walk of `drift` in between."""

@@ -22,7 +22,7 @@ MAX_SETPOINT_LEAD_M = 0.15
 far ahead of a weak vehicle."""
 MIN_CLIMB_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
-MAX_LOST_S = 1.5
+MAX_TARGET_LOST_S = 1.5
 """Time since the last sighting of the target after which an ascent is given up, s, while a
 positioning system keeps the vehicle in its place meanwhile. Larger: a target that has moved, or is
 covered, is waited for. Smaller: a burst of lost pictures ends an attempt that would succeed."""
@@ -59,7 +59,7 @@ def _is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, every moment without it is too long, since the position drifts."""
     b = c.belief
-    patience_s = 0.0 if b.is_target_positioned else MAX_LOST_S
+    patience_s = 0.0 if b.is_target_positioned else MAX_TARGET_LOST_S
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 

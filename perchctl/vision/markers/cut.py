@@ -382,15 +382,15 @@ _TEXTURE_SIZE = 320
 @dataclass(frozen=True, eq=False)
 class Outline:
     """Points along the drawing's edges: `points` (n, 2) and `normal` (n, 2) from black to white.
-    Per point (n,): number of its `line`, standard deviation of that line's print error, width of
-    the adjacent `cell`, and whether the edge belongs to the `small` marker."""
+    Per point (n,): index of its line, standard deviation of that line's print error, width of the
+    adjacent cell, and whether the edge belongs to the small marker."""
 
     points: Array
     normal: Array
-    line: NDArray[np.intp]
+    line_index: NDArray[np.intp]
     print_sigma: Array
-    cell: Array
-    small: NDArray[np.bool_]
+    cell_width: Array
+    is_small_marker: NDArray[np.bool_]
 
 
 Texture = tuple[NDArray[np.float32], Array]
@@ -419,10 +419,10 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
     return Outline(
         points=np.concatenate(at),
         normal=np.repeat(normals, places, axis=0),
-        line=np.repeat([numbers[name] for name in names], places),
+        line_index=np.repeat([numbers[name] for name in names], places),
         print_sigma=np.where(small, small_tolerance, large_tolerance) * cell,
-        cell=cell,
-        small=small,
+        cell_width=cell,
+        is_small_marker=small,
     )
 
 
@@ -558,7 +558,7 @@ def fit_pose(
         if len(places.outline_index) < _MIN_EDGE_POINTS:
             return None
         reach_cells_px = (
-            _PROFILE_REACH_CELLS * outline.cell[places.outline_index] * places.px_per_unit
+            _PROFILE_REACH_CELLS * outline.cell_width[places.outline_index] * places.px_per_unit
         )
         half_px = np.minimum(reach_px, reach_cells_px)
         offset_px, shows = _measure_offsets(image, places, half_px)
@@ -689,7 +689,7 @@ def _make_pose_fit(
     pose: RigidPose, found: _FitStep, places: _EdgePoints, outline: Outline
 ) -> PoseFit:
     J, (_, inverse, w, variance) = places.J, found
-    line = outline.line[places.outline_index]
+    line = outline.line_index[places.outline_index]
     common_px = np.hypot(
         outline.print_sigma[places.outline_index] * places.px_per_unit, _LINE_SIGMA_PX
     )
@@ -703,6 +703,6 @@ def _make_pose_fit(
         cov=cov[:6, :6],
         points_in_view=len(shown),
         points_shown=int(np.count_nonzero(shown)),
-        small_points=int(np.count_nonzero(shown & outline.small[places.outline_index])),
+        small_points=int(np.count_nonzero(shown & outline.is_small_marker[places.outline_index])),
         residual_px=math.sqrt(variance),
     )

@@ -140,7 +140,7 @@ def _linearize_edges(seen: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array
     by the shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
     variance."""
     u, v = seen.points[..., 0], seen.points[..., 1]
-    nx, ny = OUTWARD_NORMALS[seen.side].T[..., None] * seen.scale_px[:, None]
+    nx, ny = OUTWARD_NORMALS[seen.side_index].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
@@ -313,7 +313,7 @@ class VisibleEdges:
     """Edges measured in one round of the fit.
 
     Per profile (rows, n): point in the marker's coordinates (rows, n, 2), outward offset from the
-    square's edge, weight. Per row (rows,): number of the side, distance of the edge from the centre
+    square's edge, weight. Per row (rows,): index of the side, distance of the edge from the centre
     in half sides, pixels per half side across it, blur in units of the window. `white_grey` is the
     grey level of white paper.
     """
@@ -321,7 +321,7 @@ class VisibleEdges:
     points: Array
     offset_px: Array
     weight: Array
-    side: NDArray[np.intp]
+    side_index: NDArray[np.intp]
     side_distance: Array
     scale_px: Array
     blur: Array
@@ -380,7 +380,7 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         points=own,
         offset_px=far * scale_px[:, None],
         weight=weight,
-        side=side,
+        side_index=side,
         side_distance=at,
         scale_px=scale_px,
         blur=blur_px / window_half_px,

@@ -251,8 +251,11 @@ def _extend_axis(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the whiteness at n by n nodes and, if the sheet ends, the share of each node beyond
-    its end."""
+    """Render the drawing at n by n nodes.
+
+    Returns the whiteness of the nodes, 0 to 1, and, if the paper around the marker ends inside the
+    compared square, the share of each node that lies outside the paper.
+    """
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)

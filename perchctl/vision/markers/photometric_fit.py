@@ -200,11 +200,11 @@ def align_drawing(
     gain, error = equations.gain, equations.error
     corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
     pattern_correlation, pattern_contrast = _measure_inner_pattern(seen, grey, gain)
-    many = _count_redundant_nodes(error.reshape(n, n))
+    redundancy = _count_redundant_nodes(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
-    wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, many)
+    wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, redundancy)
     J = homography_jacobian(H)
-    variance = float(np.trace(J @ (inverse[_SHAPE_SLICE, _SHAPE_SLICE] * many) @ J.T)) / 8.0
+    variance = float(np.trace(J @ (inverse[_SHAPE_SLICE, _SHAPE_SLICE] * redundancy) @ J.T)) / 8.0
     return Alignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
@@ -255,14 +255,14 @@ def fit_correlation(grey: Array, error: Array) -> float:
 
 
 def _measure_wrong_bits(
-    seen: RenderedDrawing, equations: _Equations, inverse: Array, many: float
+    seen: RenderedDrawing, equations: _Equations, inverse: Array, redundancy: float
 ) -> tuple[float, float]:
     """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped one. `inverse` is the inverse of the normal matrix N of `equations`, and `many`
-    the number of nodes that share the same information.
+    1 for a flipped one. `inverse` is the inverse of the normal matrix N of `equations`, and
+    `redundancy` the number of neighbouring nodes that share the same information.
     """
     soft, noise, gain = seen.blurred_cell_coverage, equations.noise, equations.gain
     n, m = soft.shape
@@ -273,7 +273,7 @@ def _measure_wrong_bits(
     taken = np.einsum("ij,ij->j", shared, (inverse / noise).dot(shared))
     own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
     flips = np.where(seen.drawing.cells.ravel() > 0.5, -1.0, 1.0) * found / own
-    return float(flips.max()), math.sqrt(many * noise / float(own.min()))
+    return float(flips.max()), math.sqrt(redundancy * noise / float(own.min()))
 
 
 def _measure_inner_pattern(
