@@ -215,8 +215,8 @@ def detected_stage(large: bool, small: bool) -> Stage:
 
 
 def make_weight_matrix(weights: WeightsConfig) -> Array:
-    """Return the weights W (4, 8) of equation 9; columns: x, y, z, yaw, each for large and
-    small."""
+    """Return the weight matrix W (4, 8) of the paper's equation 9. The columns are x, y, z and yaw,
+    each for the large and the small marker."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -224,7 +224,8 @@ def make_weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8, with the yaws as angles."""
+    """Merge (x, y, z, yaw) of both markers, each (4,), by the paper's equation 8. The yaws are
+    merged as angles."""
     W = make_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))

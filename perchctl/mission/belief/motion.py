@@ -218,8 +218,8 @@ class FallDetector:
             max(CEILING_IMPACT_G * GRAVITY_MPS2, min(-CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2))
             - self.offset_mps2
         ) * min(1.0, dt_s / OFFSET_TIME_CONSTANT_S)
-        felt_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
-        sink = self.sink_mps + felt_mps2 * dt_s
+        corrected_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
+        sink = self.sink_mps + corrected_mps2 * dt_s
         sink = min(0.0, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
         light = min(self.light_since_s, t_s) if reads_g < FREE_FALL_G else math.inf
         fell = sink < FALL_SINK_MPS or t_s - light >= FREE_FALL_S
@@ -513,9 +513,11 @@ def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
         or not 0.8 <= sample.acc_z_g <= 1.2
     ):
         return old
-    felt = sample.thrust / sample.acc_z_g
+    measured = sample.thrust / sample.acc_z_g
     return (
-        felt if old == 0.0 else old + (felt - old) * min(1.0, dt_s / HOVER_THRUST_TIME_CONSTANT_S)
+        measured
+        if old == 0.0
+        else old + (measured - old) * min(1.0, dt_s / HOVER_THRUST_TIME_CONSTANT_S)
     )
 
 

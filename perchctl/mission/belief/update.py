@@ -290,16 +290,16 @@ def _stop_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Adopt the velocity on which pictures and accelerometer agree, once per new result."""
-    felt, before = b.obs.felt, b.reckoning.imu
-    if felt is None or not (before is None or felt.t_s > before.t_s):
+    motion, before = b.obs.felt, b.reckoning.imu
+    if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
     # Late pictures make the estimated height diverge, too.
-    climb_mps = felt.climb_mps if b.mismatch.later_s != 0.0 else None
+    climb_mps = motion.climb_mps if b.mismatch.later_s != 0.0 else None
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
         new,
-        velocity_mps=(*felt.velocity_mps, climb_mps),
-        bias_mps2=(*felt.bias_mps2, new.bias_mps2[2]),
+        velocity_mps=(*motion.velocity_mps, climb_mps),
+        bias_mps2=(*motion.bias_mps2, new.bias_mps2[2]),
     )
 
 

@@ -236,8 +236,8 @@ _MIN_PAPER_NODES = 200  # least number of nodes on paper
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """Nodes of a pinhole camera's picture, `step` apart in normalised coordinates, starting at
-    `first_node` (2,). `x` and `y` are the positions of their samples in the picture reduced to
-    `size` (width, height).
+    `first_node` (2,). `map_x` and `map_y` are the pixel positions of their samples in the
+    picture reduced to `size` (width, height).
 
     `inside` marks the nodes in the picture. Beyond `reach`, a lens model may fold back.
     """
@@ -245,8 +245,8 @@ class Lattice:
     first_node: Array
     step: float
     reach: float
-    x: Grey
-    y: Grey
+    map_x: Grey
+    map_y: Grey
     size: tuple[int, int]
     inside: NDArray[np.bool_]
 
@@ -294,8 +294,8 @@ def make_lattice(camera: CameraModel) -> Lattice:
         first_node=rays.min(axis=0) + step / 2.0,
         step=step,
         reach=reach,
-        x=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
-        y=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
+        map_x=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
+        map_y=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
         size=size,
         inside=inside.reshape(shape).all(axis=(1, 3)),
     )
@@ -316,7 +316,7 @@ def make_overview(
 
 def _sample_at_nodes(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
     small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
+    fine = cv2.remap(small, lattice.map_x, lattice.map_y, cv2.INTER_LINEAR)
     return _downsample(np.asarray(fine, np.float32))
 
 
