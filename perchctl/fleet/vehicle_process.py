@@ -274,7 +274,7 @@ def flight_status(tick: Tick) -> Status:
     return Status(
         stage=Stage.ENDING if state.phase.is_over else Stage.FLYING,
         phase=state.phase.value,
-        reason=state.pause or state.reason,
+        reason=state.pause_reason or state.reason,
         height_m=z_m - state.belief.ground_z_m,
         error_m=None if target is None else math.hypot(*target.e_m[:2]),
         battery_v=telemetry.battery_v if telemetry.battery_v >= NO_BATTERY_READING_V else None,
