@@ -12,7 +12,8 @@ leans into:
 The integral removes the offset that a steady wind leaves; `near` grows from 0 to 1 as the target
 comes closer. The lateral correction is state feedback on the whole chain from setpoint to position:
 a setpoint acts through the attitude, so the lean of now is the velocity of a tenth of a second
-later. With it, the gains can be higher without oscillation.
+later. With it, the gains can be higher without oscillation. They hold for prompt telemetry; the
+feedback fades out as it ages, and the onboard controllers, which know no delay, are left alone.
 """
 
 from __future__ import annotations
@@ -35,15 +36,20 @@ HEIGHT_DAMPING_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
 MAX_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
-LATERAL_ERROR_GAIN = 1.5
+LATERAL_ERROR_GAIN = 2.0
 """Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate.
 Smaller: the thrust's fluctuation moves the vehicle further."""
-LATERAL_DAMPING_S = 0.6
+LATERAL_DAMPING_S = 0.8
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
 velocity moves the vehicle. Smaller: it oscillates."""
-LEAN_DAMPING_S2 = 0.06
+LEAN_DAMPING_S2 = 0.08
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
+MAX_FULL_FEEDBACK_AGE_S = 0.06
+"""Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: the vehicle
+oscillates by late telemetry. Smaller: telemetry at 25 Hz weakens the feedback."""
+MAX_FEEDBACK_AGE_S = 0.16
+"""Age of the telemetry from which the onboard controllers are left alone, s."""
 LATERAL_FEEDBACK_START_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_RANGE_M = 0.4
@@ -202,9 +208,13 @@ def correct_setpoint(
 
 
 def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Return the lateral feedback on top of the onboard controllers, near the target only."""
+    """Return the lateral feedback on top of the onboard controllers, near the target only and by
+    prompt telemetry only."""
     near = (LATERAL_FEEDBACK_START_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_RANGE_M
-    gain = max(0.0, min(1.0, near))
+    prompt = (MAX_FEEDBACK_AGE_S - c.belief.attitude_age_s) / (
+        MAX_FEEDBACK_AGE_S - MAX_FULL_FEEDBACK_AGE_S
+    )
+    gain = max(0.0, min(1.0, near, prompt))
     if gain == 0.0:
         return 0.0, 0.0
     (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps

@@ -68,9 +68,9 @@ MAX_THRUST_MISMATCH_FRACTION = 0.12
 """Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
 KEEPALIVE_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
-LEAN_TIME_CONSTANT_S = 1.0
-"""Time constant of the mean lean, s. Larger: a vehicle that enters a gust leaves its axis. Smaller:
-the damping by the lean is lost."""
+LEAN_TIME_CONSTANT_S = 0.5
+"""Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
+moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
 SPREAD_DECAY_FACTOR = 0.9
 """Share of the target's spread that remains after each frame."""
 
