@@ -60,8 +60,8 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
     """Fly a fleet by its plan; return the exit code. Errors: the tree of `perchctl.errors`."""
     started, started_s = datetime.now(UTC), time.monotonic()
     folder = fleets.make_folder(_parent_folder(plan, settings), plan, started)
-    with fleets.open_radios(plan) as uris:
-        options = fleets.flight_options(plan, uris, folder, settings.seed, settings.record)
+    with fleets.open_radios(plan):
+        options = fleets.flight_options(plan, folder, settings.seed, settings.record)
         for warning in fleets.warnings_before_fleet(options):
             say(f"check: {warning}")
         asks = not (settings.yes or all(each.simulated for each in options.values()))
@@ -84,9 +84,9 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
 
 def refuse_before_start(plan: fleets.FleetPlan, settings: FleetSettings) -> None:
     """Raises the error with which `fly_fleet` would refuse this plan before it starts anything."""
-    with fleets.open_radios(plan) as uris:
+    with fleets.open_radios(plan):
         folder = _parent_folder(plan, settings) / plan.fleet.name
-        options = fleets.flight_options(plan, uris, folder, settings.seed, settings.record)
+        options = fleets.flight_options(plan, folder, settings.seed, settings.record)
         fleets.warnings_before_fleet(options)
 
 

@@ -22,8 +22,8 @@ opened or armed. For those who fly, simulate or show a fleet:
 
 A flight is a process for each vehicle, and a parent that orders them:
 
-    with open_radios(plan) as uris:     # the seam for radio hubs: a URI for each vehicle's process
-        options = flight_options(plan, uris, folder, seed, record)
+    options = flight_options(plan, folder, seed, record)
+    with open_radios(plan):
         children = {name: VehicleProcess(name, each) for name, each in options.items()}
         coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
         coordinator.run(until)          # in a thread of its own; or step() by step

@@ -25,7 +25,6 @@ from .plan import make_plan as make_plan
 from .prepare import flight_options as flight_options
 from .prepare import make_folder as make_folder
 from .prepare import open_radios as open_radios
-from .prepare import vehicle_seed as vehicle_seed
 from .prepare import warnings_before_fleet as warnings_before_fleet
 from .radio import DongleLoad as DongleLoad
 from .radio import RadioPlace as RadioPlace

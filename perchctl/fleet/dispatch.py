@@ -131,5 +131,5 @@ def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:
         return False
-    away_m = math.dist(vehicle.to_room(result.place_m), vehicle.home_m)
+    away_m = math.dist(vehicle.as_flown.to_room(result.place_m), vehicle.home_m)
     return result.outcome == "landed" and away_m <= OBSTACLE_M

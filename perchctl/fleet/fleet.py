@@ -17,6 +17,14 @@ Assign = Literal["fixed", "nearest"]
 
 ONE_AT_A_TIME = "one-at-a-time"
 TOGETHER = "together"
+MOST_VEHICLES = 32
+"""In one fleet; with more of them a plan would take longer to work out than anyone waits."""
+
+
+def vehicle_seed(fleet_seed: int, number: int) -> int:
+    """The seed of the vehicle with this number, from 0 on: no two vehicles of any two fleets have
+    the same."""
+    return MOST_VEHICLES * fleet_seed + number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +70,14 @@ class FleetVehicle:
     def simulated(self) -> bool:
         """True for a vehicle of perchctl's own simulator."""
         return self.uri.startswith("sim://")
+
+    @property
+    def as_flown(self) -> FleetVehicle:
+        """The vehicle as a process of its own flies it. The axes of a simulated one begin where it
+        stands, also if its position comes from a simulated motion capture."""
+        if not self.simulated or self.frame == "home":
+            return self
+        return replace(self, frame="home").with_target(self.target_m)
 
     def to_room(self, estimate_m: Point) -> Point:
         """A place in the axes of the vehicle's state estimate, in those of the room."""

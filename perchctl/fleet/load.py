@@ -16,7 +16,7 @@ from perchctl.camera import parse_source
 from perchctl.corridor import Point
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.fleet.assignment import assign_nearest
-from perchctl.fleet.fleet import Fleet, FleetVehicle, Frame
+from perchctl.fleet.fleet import MOST_VEHICLES, Fleet, FleetVehicle, Frame
 from perchctl.fleet.radio import choose_dongles
 from perchctl.link import check_uri, is_own_uri
 from perchctl.places import data_file, file_names
@@ -34,8 +34,6 @@ from perchctl.profile import (
 
 EXAMPLE = "four"
 """The shipped fleet that is used where none is named."""
-MOST_VEHICLES = 32
-"""In one fleet; with more of them a plan would take longer to work out than anyone waits."""
 FARTHEST_M = 50.0
 """Of a home or target from the room's origin: farther off, millimetres were meant."""
 _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]

@@ -40,9 +40,10 @@ from perchctl.faults import (
     lasts_s,
 )
 from perchctl.fleet.coroutine import ThreadCoroutine
+from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.results import FleetResult, fleet_outcome, refused_vehicle
-from perchctl.fleet.room import PlacedVehicle, Room, place_fleet, vehicle_seed
+from perchctl.fleet.room import PlacedVehicle, Room, place_fleet
 from perchctl.fleet.schedule import OBSTACLE_M
 
 TICK_S = 0.02

@@ -116,10 +116,7 @@ class FleetOutcome:
         vehicle, options = self.plan.fleet.vehicle(name), self.options[name]
         place_m = None
         if result.place_m is not None:
-            # A simulated vehicle's own axes begin at its home, whatever its frame.
-            from perchctl.fleet.prepare import as_flown
-
-            place_m = [round(part, 3) for part in as_flown(vehicle).to_room(result.place_m)]
+            place_m = [round(part, 3) for part in vehicle.as_flown.to_room(result.place_m)]
         ended_s = None if result.ended_s is None else round(result.ended_s - self.started_s, 3)
         return {
             "name": name,

@@ -10,16 +10,10 @@ from pathlib import Path
 
 from perchctl.check import warnings_before_flight
 from perchctl.errors import PerchError, UsageError
-from perchctl.fleet.fleet import FleetVehicle
-from perchctl.fleet.load import MOST_VEHICLES
+from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
+from perchctl.fleet.schedule import flown_profile
 from perchctl.flight import FlyOptions, check_options
-
-
-def vehicle_seed(fleet_seed: int, number: int) -> int:
-    """The seed of the vehicle with this number, from 0 on: no two vehicles of any two fleets have
-    the same."""
-    return fleet_seed * MOST_VEHICLES + number
 
 
 def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
@@ -52,20 +46,20 @@ def open_radios(plan: FleetPlan) -> Iterator[Mapping[str, str]]:
 
 
 def flight_options(
-    plan: FleetPlan, uris: Mapping[str, str], folder: Path, seed: int, record: bool | None
+    plan: FleetPlan, folder: Path, seed: int, record: bool | None
 ) -> dict[str, FlyOptions]:
-    """The options of each vehicle's flight, checked as `perchctl fly` checks them. The errors of
-    `check_options`, with the vehicle's name.
+    """The options of each vehicle's flight, its corridor as a safety row, checked as `perchctl fly`
+    checks them. The errors of `check_options`, with the vehicle's name.
 
     `record`: keep the pictures; None: those of real vehicles.
     """
     options = {}
     for number, vehicle in enumerate(plan.fleet.vehicles):
-        flown = as_flown(vehicle)
+        flown = vehicle.as_flown
         each = FlyOptions(
-            profile=flown.profile,
+            profile=flown_profile(vehicle, flown),
             profile_path=plan.fleet.path or Path(vehicle.name),
-            uri=uris[vehicle.name],
+            uri=vehicle.uri,
             source=flown.source,
             seed=vehicle_seed(seed, number),
             log_dir=folder,
@@ -91,14 +85,6 @@ def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
         for warning in found:
             names.setdefault(warning, []).append(name)
     return [f"{', '.join(who)}: {warning}" for warning, who in names.items()]
-
-
-def as_flown(vehicle: FleetVehicle) -> FleetVehicle:
-    """The vehicle as its process flies it. The room of a simulated one begins where it stands, also
-    if its position comes from a simulated motion capture."""
-    if not vehicle.simulated or vehicle.frame == "home":
-        return vehicle
-    return replace(vehicle, frame="home").with_target(vehicle.target_m)
 
 
 @contextlib.contextmanager

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.fleet.fleet import Fleet, FleetVehicle
-from perchctl.fleet.load import MOST_VEHICLES
+from perchctl.fleet.fleet import Fleet, FleetVehicle, vehicle_seed
 from perchctl.fleet.schedule import flown_profile
 from perchctl.profile import Profile
 from perchctl.sim import (
@@ -60,11 +59,6 @@ class PlacedVehicle:
     true: FleetVehicle
     profile: Profile
     scenario: Scenario
-
-
-def vehicle_seed(seed: int, number: int) -> int:
-    """The seed of the vehicle with that number (from 0) in the fleet: no two flights share one."""
-    return MOST_VEHICLES * seed + number
 
 
 def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:

@@ -18,9 +18,9 @@ from perchctl.fleet import (
     load_fleet,
     make_plan,
     open_radios,
-    vehicle_seed,
     worst_of,
 )
+from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.messages import Pace
 from perchctl.fleet.outcome import fleet_exit_code
 from tests.fleet.rig import same_channel
@@ -68,8 +68,7 @@ def test_a_failure_on_the_ground_is_an_error_of_its_own_kind() -> None:
 
 def test_the_record_says_who_hangs_where_and_when(tmp_path: Path) -> None:
     plan = make_plan(load_fleet())
-    with open_radios(plan) as uris:
-        options = flight_options(plan, uris, tmp_path, 3, None)
+    options = flight_options(plan, tmp_path, 3, None)
     outcome = FleetOutcome(
         plan=plan,
         options=options,
@@ -88,8 +87,7 @@ def test_the_record_says_who_hangs_where_and_when(tmp_path: Path) -> None:
 
 def test_each_simulated_vehicle_has_a_seed_and_a_target_of_its_own(tmp_path: Path) -> None:
     plan = make_plan(load_fleet())
-    with open_radios(plan) as uris:
-        options = flight_options(plan, uris, tmp_path, 0, None)
+    options = flight_options(plan, tmp_path, 0, None)
     assert options["east"].sim_target_xy_m == pytest.approx((0.3, 0.1))
     seeds = {vehicle_seed(fleet, number) for fleet in range(20) for number in range(32)}
     assert len(seeds) == 20 * 32

@@ -18,7 +18,6 @@ from perchctl.fleet.room import (
     START_ERROR_M,
     Room,
     place_fleet,
-    vehicle_seed,
 )
 from perchctl.sim import downwash_mps
 from tests.fleet.rig import fleet
@@ -74,11 +73,6 @@ def test_a_neighbour_s_target_is_where_it_hangs() -> None:
     assert (-0.1 + c * x_m - s * y_m, 1.5 + s * x_m + c * y_m) == pytest.approx((1.5, 0.1))
     theirs_rad = math.radians(east.true.heading_deg) + east.scenario.target_yaw_rad
     assert turn_rad == pytest.approx(theirs_rad - heading_rad)
-
-
-def test_no_two_flights_of_a_campaign_have_one_seed() -> None:
-    seeds = {vehicle_seed(seed, number) for seed in range(20) for number in range(32)}
-    assert len(seeds) == 20 * 32
 
 
 def test_a_vehicle_flies_by_its_own_corridor() -> None:
