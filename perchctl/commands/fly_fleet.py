@@ -60,16 +60,16 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
     """Fly a fleet by its plan; return the exit code. Errors: the tree of `perchctl.errors`."""
     started, started_s = datetime.now(UTC), time.monotonic()
     folder = fleets.make_folder(_parent_folder(plan, settings), plan, started)
-    with fleets.open_radios(plan):
-        options = fleets.flight_options(plan, folder, settings.seed, settings.record)
-        for warning in fleets.warnings_before_fleet(options):
-            say(f"check: {warning}")
-        asks = not (settings.yes or all(each.simulated for each in options.values()))
-        if asks and not sys.stdin.isatty():
-            raise UsageError(
-                f"about to arm {len(options)} vehicles, and there is nobody to ask: add --yes"
-            )
-        session = FleetSession(plan, options, folder, started, started_s)
+    options = fleets.flight_options(plan, folder, settings.seed, settings.record)
+    for warning in fleets.warnings_before_fleet(options):
+        say(f"check: {warning}")
+    asks = not (settings.yes or all(each.simulated for each in options.values()))
+    if asks and not sys.stdin.isatty():
+        raise UsageError(
+            f"about to arm {len(options)} vehicles, and there is nobody to ask: add --yes"
+        )
+    with fleets.open_radios(plan) as radios:
+        session = FleetSession(plan, radios.route(options), radios, folder, started, started_s)
         try:
             outcome = session.fly(asks)
         finally:
@@ -83,11 +83,11 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
 
 
 def refuse_before_start(plan: fleets.FleetPlan, settings: FleetSettings) -> None:
-    """Raises the error with which `fly_fleet` would refuse this plan before it starts anything."""
-    with fleets.open_radios(plan):
-        folder = _parent_folder(plan, settings) / plan.fleet.name
-        options = fleets.flight_options(plan, folder, settings.seed, settings.record)
-        fleets.warnings_before_fleet(options)
+    """Raises the error with which `fly_fleet` would refuse this plan before it opens or starts
+    anything."""
+    folder = _parent_folder(plan, settings) / plan.fleet.name
+    options = fleets.flight_options(plan, folder, settings.seed, settings.record)
+    fleets.warnings_before_fleet(options)
 
 
 def _parent_folder(plan: fleets.FleetPlan, settings: FleetSettings) -> Path:
@@ -101,16 +101,20 @@ class FleetSession:
         self,
         plan: fleets.FleetPlan,
         options: Mapping[str, FlyOptions],
+        radios: fleets.Radios,
         folder: Path,
         started: datetime,
         started_s: float,
     ) -> None:
         self._plan, self._options, self._folder = plan, options, folder
+        self._radios = radios
         self._started, self._started_s = started, started_s
         self._switch = OperatorSwitch()
         self._children: dict[str, fleets.VehicleProcess] = {}
         self._panel: FleetPanel | None = None
         self._told: dict[str, str] = {}
+        self._radio_problems: dict[str, str] = {}
+        self._problems: list[str] = []
         self._recorded = 0
         self._failure: str | None = None
         self._unwritten: str | None = None
@@ -217,12 +221,23 @@ class FleetSession:
             if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
+        self._look_at_radios()
         if self._panel is not None:
             self._panel.show([_row(number, view) for number, view in enumerate(views, 1)])
         ended = sum(view.result is not None for view in views)
         if coordinator.started and ended > self._recorded:
             self._recorded = ended
             self._write_record(coordinator)
+
+    def _look_at_radios(self) -> None:
+        """Tell of a dongle that is of no use any more, or again."""
+        before, self._radio_problems = self._radio_problems, self._radios.problems()
+        for dongle in before.keys() - self._radio_problems.keys():
+            self._tell(f"dongle {dongle}: it works again")
+        for dongle, problem in self._radio_problems.items():
+            if dongle not in before:
+                self._problems.append(f"dongle {dongle}: {problem}")
+                self._tell(self._problems[-1])
 
     def _tell(self, line: str) -> None:
         if self._panel is None:
@@ -246,6 +261,7 @@ class FleetSession:
             started=self._started,
             started_s=self._started_s,
             results={v.name: v.result for v in coordinator.views if v.result is not None},
+            problems=tuple(self._problems),
         )
 
     def _end(self, error: BaseException) -> None:

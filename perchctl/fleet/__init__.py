@@ -23,7 +23,8 @@ opened or armed. For those who fly, simulate or show a fleet:
 A flight is a process for each vehicle, and a parent that orders them:
 
     options = flight_options(plan, folder, seed, record)
-    with open_radios(plan):
+    with open_radios(plan) as radios:   # a RadioHub for each dongle that several vehicles share
+        options = radios.route(options)
         children = {name: VehicleProcess(name, each) for name, each in options.items()}
         coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
         coordinator.run(until)          # in a thread of its own; or step() by step

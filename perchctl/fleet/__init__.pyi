@@ -22,6 +22,7 @@ from .outcome import as_error as as_error
 from .outcome import worst_of as worst_of
 from .plan import FleetPlan as FleetPlan
 from .plan import make_plan as make_plan
+from .prepare import Radios as Radios
 from .prepare import flight_options as flight_options
 from .prepare import make_folder as make_folder
 from .prepare import open_radios as open_radios

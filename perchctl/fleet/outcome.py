@@ -73,6 +73,7 @@ class FleetOutcome:
     Attributes:
         started, started_s: when it began, as a date, and on `time.monotonic`.
         results: of the vehicles that have ended, by name.
+        problems: what has befallen several of them, such as a dead dongle, a sentence each.
     """
 
     plan: FleetPlan
@@ -80,6 +81,7 @@ class FleetOutcome:
     started: datetime
     started_s: float
     results: Mapping[str, Result]
+    problems: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -107,6 +109,7 @@ class FleetOutcome:
             "exit_code": code,
             "error": None if code == 0 else EXIT_CODES[code],
             "hanging": self.hanging,
+            "problems": list(self.problems),
             "ratio": None if ratio is None else round(ratio, 3),
             "vehicles": vehicles,
             "plan": self.plan.record(),
@@ -142,7 +145,7 @@ class FleetOutcome:
 
     def text(self) -> str:
         """The outcome for people, a line for each vehicle."""
-        lines = []
+        lines = [f"{'radio':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
             miss = "" if result.miss_m is None else f", {1e3 * result.miss_m:.1f} mm from centre"
             state = "hangs" if result.hangs else result.outcome

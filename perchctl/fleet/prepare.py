@@ -9,11 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from perchctl.check import warnings_before_flight
-from perchctl.errors import PerchError, UsageError
+from perchctl.errors import PerchError
 from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.schedule import flown_profile
 from perchctl.flight import FlyOptions, check_options
+from perchctl.link import RadioHub
 
 
 def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
@@ -27,22 +28,48 @@ def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
     return path
 
 
-@contextlib.contextmanager
-def open_radios(plan: FleetPlan) -> Iterator[Mapping[str, str]]:
-    """Yield the URI that each vehicle's process opens, by the vehicle's name.
+class Radios:
+    """The radio hubs of the dongles that several vehicles share, by dongle.
 
-    Vehicles that share a dongle need a hub: one process that owns the dongle, and that gives each
-    vehicle a ``udp://127.0.0.1:PORT`` while this block runs. There is none yet, so a shared dongle
-    is refused. Raises UsageError.
+    The vehicles' own processes notice by themselves if their hub or dongle is of no use any more;
+    `problems` is for people.
     """
-    for load in plan.dongles:
-        if len(load.vehicles) > 1:
-            first, second = load.vehicles[:2]
-            raise UsageError(
-                f"{first} and {second} share dongle {load.dongle}, which perchctl fleet fly cannot "
-                f"do yet: give each vehicle a dongle of its own, on channels at least 2 apart"
-            )
-    yield {vehicle.name: vehicle.uri for vehicle in plan.fleet.vehicles}
+
+    def __init__(self, hubs: Mapping[str, RadioHub]) -> None:
+        self._hubs = hubs
+
+    def route(self, options: Mapping[str, FlyOptions]) -> dict[str, FlyOptions]:
+        """The options of each flight, through its hub if it has one. Its `uri` stays the vehicle's:
+        log, lock and the comparison with the motion capture go by it."""
+        ways = {uri: way for hub in self._hubs.values() for uri, way in hub.uris.items()}
+        return {name: replace(each, link_uri=ways.get(each.uri)) for name, each in options.items()}
+
+    def problems(self) -> dict[str, str]:
+        """Why a dongle is of no use now, by dongle. Never waits."""
+        found = {}
+        for dongle, hub in self._hubs.items():
+            reported = (report.problem for report in hub.reports.values())
+            problem = hub.update() or next(filter(None, reported), None)
+            if problem is not None:
+                found[dongle] = problem
+        return found
+
+
+@contextlib.contextmanager
+def open_radios(plan: FleetPlan) -> Iterator[Radios]:
+    """Open a radio hub for each dongle that several vehicles share, until the block ends. A vehicle
+    alone on its dongle needs none.
+
+    Raises the errors of `RadioHub`, with the dongle's name. No packet was sent to a vehicle then.
+    """
+    with contextlib.ExitStack() as stack:
+        hubs = {}
+        for load in plan.dongles:
+            if len(load.vehicles) > 1:
+                uris = [plan.fleet.vehicle(name).uri for name in load.vehicles]
+                with naming(f"dongle {load.dongle}"):
+                    hubs[load.dongle] = stack.enter_context(RadioHub(uris))
+        yield Radios(hubs)
 
 
 def flight_options(
@@ -89,7 +116,7 @@ def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
 
 @contextlib.contextmanager
 def naming(name: str) -> Iterator[None]:
-    """Begin the sentence of each failure of the block with the vehicle's name."""
+    """Begin the sentence of each failure of the block with the name of what it concerns."""
     try:
         yield
     except PerchError as error:

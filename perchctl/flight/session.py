@@ -55,6 +55,8 @@ class FlyOptions:
     record: bool = False
     sim_target_xy_m: tuple[float, float] | None = None
     """Where a simulated target hangs, from where the vehicle stands; None: drawn from the seed."""
+    link_uri: str | None = None
+    """What the link opens instead of `uri`: the vehicle behind a radio hub."""
 
     @property
     def simulated(self) -> bool:
@@ -127,7 +129,7 @@ def fly_session(
     pipeline = make_pipeline(profile, camera)
     table = add_rows(rows, load_table(profile.planner.rows))
     with contextlib.ExitStack() as stack:
-        uri, spec, simulated = options.uri, options.source, None
+        uri, spec, simulated = options.link_uri or options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
         if options.simulated:
             simulated = stack.enter_context(start_simulated_vehicle(options, camera))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.errors import EXIT_CODES, ConnectionFailed, UsageError
+from perchctl.errors import EXIT_CODES, ConnectionFailed
 from perchctl.fleet import (
     FleetOutcome,
     Result,
@@ -17,13 +17,11 @@ from perchctl.fleet import (
     flight_options,
     load_fleet,
     make_plan,
-    open_radios,
     worst_of,
 )
 from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.messages import Pace
 from perchctl.fleet.outcome import fleet_exit_code
-from tests.fleet.rig import same_channel
 
 PACE = Pace(flown_s=20.0, wall_s=40.0, gap_p50_s=0.02, gap_p99_s=0.05, gap_max_s=0.1, cores=0.4)
 PERCHED = Result(
@@ -91,9 +89,3 @@ def test_each_simulated_vehicle_has_a_seed_and_a_target_of_its_own(tmp_path: Pat
     assert options["east"].sim_target_xy_m == pytest.approx((0.3, 0.1))
     seeds = {vehicle_seed(fleet, number) for fleet in range(20) for number in range(32)}
     assert len(seeds) == 20 * 32
-
-
-def test_vehicles_that_share_a_dongle_are_refused_in_one_sentence() -> None:
-    plan = make_plan(same_channel(2))
-    with pytest.raises(UsageError, match="v0 and v1 share dongle 0"), open_radios(plan):
-        pass

@@ -8,7 +8,9 @@ is the device that pyusb would return.
 from __future__ import annotations
 
 import array
+import contextlib
 import itertools
+import socket
 import struct
 import threading
 import time
@@ -58,6 +60,28 @@ class Talker:
     def _take(self, data: bytes) -> None:
         self.heard.append(bytes((data[0] | 0x0C,)) + data[1:])
         self._chip.waiting.append(self.heard[-1])
+
+
+class OnLoopback:
+    """A vehicle whose packets cflib's `udp://` would carry, as a simulated one's in a process of
+    its own."""
+
+    def __init__(self, uri: str) -> None:
+        host, _, port = uri.removeprefix("udp://").partition(":")
+        self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._wire.connect((host, int(port)))
+        self._wire.setblocking(False)
+        self._chip = Chip(self._take)
+
+    def exchange(self, data: bytes) -> bytes | None:
+        with contextlib.suppress(OSError):  # nothing has come
+            while True:
+                self._chip.waiting.append(self._wire.recv(64))
+        return self._chip.acknowledge(data)
+
+    def _take(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            self._wire.send(data)
 
 
 class UsbPort:
