@@ -222,6 +222,7 @@ class FleetSession:
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
         self._look_at_radios()
+        self._look_at_distances(coordinator)
         if self._panel is not None:
             self._panel.show([_row(number, view) for number, view in enumerate(views, 1)])
         ended = sum(view.result is not None for view in views)
@@ -238,6 +239,19 @@ class FleetSession:
             if dongle not in before:
                 self._problems.append(f"dongle {dongle}: {problem}")
                 self._tell(self._problems[-1])
+
+    def _look_at_distances(self, coordinator: fleets.Coordinator) -> None:
+        """Tell once of each pair that came too near, and of each vehicle whose distance to the
+        others became unknown."""
+        near = [f"{pair}: both land" for pair in coordinator.near_pairs]
+        unknown = [
+            f"{name}: its position is unknown, and so is its distance to the others"
+            for name in coordinator.unwatched
+        ]
+        for problem in (*near, *unknown):
+            if problem not in self._problems:
+                self._problems.append(problem)
+                self._tell(problem)
 
     def _tell(self, line: str) -> None:
         if self._panel is None:

@@ -31,9 +31,9 @@ A flight is a process for each vehicle, and a parent that orders them:
         coordinator.confirm(), .land(name), .views, .has_ended
 
 messages: all that parent and vehicle say. vehicle_process: the vehicle's side; parent_watch: its
-operator, which lands without a parent. dispatch: who may take off and who lands, as pure functions.
-coordinator, children: the parent's side. prepare: what is refused before anything starts. outcome:
-exit code and ``fleet.json``.
+operator, which lands without a parent. dispatch: who may take off, who lands, and who is too near,
+as pure functions. coordinator, children: the parent's side. prepare: what is refused before
+anything starts, and radio hubs. outcome: exit code and ``fleet.json``.
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
 assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and

@@ -13,8 +13,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from perchctl.errors import PerchError, SafetyAbort
-from perchctl.fleet.dispatch import Decision, VehicleView, are_all_ready, decide
+from perchctl.errors import Interrupted, PerchError, SafetyAbort
+from perchctl.fleet.dispatch import (
+    Decision,
+    NearPair,
+    VehicleView,
+    are_all_ready,
+    decide,
+    find_near_pairs,
+    find_unwatched,
+)
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status
 from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import OperatorSwitch
@@ -57,6 +65,8 @@ class Coordinator:
     Attributes:
         started: permission to take off has been given to the first group.
         reasons: why vehicles were ordered to land, other than by the operator.
+        near_pairs: pairs that were ordered to land, as they came too near each other.
+        unwatched: vehicles in the air whose distance to another one is not known now.
     """
 
     def __init__(
@@ -68,9 +78,12 @@ class Coordinator:
     ) -> None:
         self.started = False
         self.reasons: dict[str, str] = {}
+        self.near_pairs: tuple[NearPair, ...] = ()
+        self.unwatched: tuple[str, ...] = ()
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
         self._landed: frozenset[str] = frozenset()
+        self._were_near: frozenset[str] = frozenset()
         self._results: dict[str, Result] = {}
         self._views = tuple(VehicleView(name=name) for name in children)
         self._sent: dict[str, Order] = {}
@@ -113,8 +126,10 @@ class Coordinator:
         )
         if self._confirmed and are_all_ready(self._views) and self._word() is Operator.NONE:
             self.started = True
+        self._watch_distances()
+        landed = self._landed | self._were_near
         decision = decide(
-            self._plan, self._views, started=self.started, word=self._word(), landed=self._landed
+            self._plan, self._views, started=self.started, word=self._word(), landed=landed
         )
         for name, why in decision.reasons.items():
             self.reasons.setdefault(name, why)
@@ -124,6 +139,17 @@ class Coordinator:
         """Repeat `step` until `until` is set."""
         while not until.wait(ROUND_S):
             self.step()
+
+    def _watch_distances(self) -> None:
+        """Land both of two that are too near each other; they do not go on once they are apart."""
+        self.unwatched = find_unwatched(self._plan, self._views)
+        for pair in find_near_pairs(self._plan, self._views):
+            both = {pair.first, pair.second}
+            if not any(both == {each.first, each.second} for each in self.near_pairs):
+                self.near_pairs = (*self.near_pairs, pair)
+            for name in both - self._were_near:
+                self.reasons.setdefault(name, pair.why(name))
+            self._were_near |= both
 
     def _word(self) -> Operator:
         return self._switch.read()
@@ -136,8 +162,9 @@ class Coordinator:
         if name not in self._results:
             result = child.result() or self._lost(name, child, status, silent_s)
             if result is not None:
-                why = self.reasons.get(name)
-                self._results[name] = _explained(result, why)
+                if name in self._were_near and result.exit_code == Interrupted.exit_code:
+                    result = replace(result, exit_code=SafetyAbort.exit_code)
+                self._results[name] = _explained(result, self.reasons.get(name))
         return VehicleView(
             name=name, status=status, silent_s=silent_s, result=self._results.get(name)
         )

@@ -4,26 +4,43 @@
     groups fly in the order of the schedule, each once all of the group before have ended
     whoever has ended in another's corridor, or nobody knows where, keeps it on the floor
     a failure before the first take-off ends all; later it ends all with ``on_failure: land-all``
+    two in the air that are known to be too near each other land
 
-The vehicles' places are those of the plan. Only one that measures its position in the room's axes
-is believed to stand at its home again after a flight.
+Only a vehicle that measures its position in the room's axes (``frame: room``) is believed where it
+says it is. For all others, the places are those of the plan.
+
+What if a position is old, or cannot be trusted? Then a distance is unknown, and unknown lands
+nobody: one vehicle's lost link would end its neighbours' flights. Nor does it count as far enough:
+`find_unwatched` names it for people. What keeps two such vehicles apart is the corridor that each
+enforces by itself, for which no message has to arrive.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from perchctl.corridor import Point
 from perchctl.fleet.fleet import FleetVehicle
 from perchctl.fleet.messages import Order, Result, Stage, Status
 from perchctl.fleet.plan import FleetPlan
-from perchctl.fleet.schedule import OBSTACLE_M
+from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M
 from perchctl.mission import Operator
 
 FRESH_S = 1.0
 """A vehicle whose process has sent nothing for so long is not ready. Longer, and one that hangs
 counts as ready; shorter, and a busy computer puts off the start."""
+
+NEAR_MARGIN_M = 2.0 * ROOM_ERROR_M
+"""Two vehicles that are so much nearer to each other than the plan promises land, m: both positions
+may be wrong by `ROOM_ERROR_M`. Larger, and two that approach each other are noticed later; smaller,
+and such errors land vehicles that keep apart."""
+FRESH_PLACE_S = 0.5
+"""A position older than this is unknown, s. Longer, and two that fly 0.4 m/s towards each other
+come 0.4 m nearer unnoticed; shorter, and with slow telemetry, and a status ten times a second,
+distances are unknown all the time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +61,20 @@ class VehicleView:
     @property
     def stage(self) -> Stage:
         return Stage.STARTING if self.status is None else self.status.stage
+
+    @property
+    def is_in_air(self) -> bool:
+        """True from its first setpoint to the end of its mission, as far as it has said so."""
+        return self.result is None and self.stage is Stage.FLYING
+
+    @property
+    def place_age_s(self) -> float:
+        """Age of the position in its newest status, by all parts that may hang: telemetry, flight
+        loop and process. Infinite if one is unknown."""
+        status = self.status
+        if status is None or status.telemetry_age_s is None or status.loop_age_s is None:
+            return math.inf
+        return status.telemetry_age_s + status.loop_age_s + self.silent_s
 
     @property
     def is_ready(self) -> bool:
@@ -101,6 +132,57 @@ def decide(
     return Decision(orders=orders, reasons=reasons)
 
 
+@dataclass(frozen=True, kw_only=True)
+class NearPair:
+    """Two vehicles in the air that are nearer to each other than the plan allows."""
+
+    first: str
+    second: str
+    distance_m: float
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second} were {self.distance_m:.2f} m apart in the air"
+
+    def why(self, name: str) -> str:
+        """The reason why the vehicle called `name`, one of the two, lands."""
+        other = self.second if name == self.first else self.first
+        return f"{self.distance_m:.2f} m from {other} in the air"
+
+
+def find_near_pairs(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[NearPair, ...]:
+    """All pairs in the air that are known to be nearer to each other, level, than the plan's
+    separation less `NEAR_MARGIN_M`."""
+    least_m = plan.separation_m - NEAR_MARGIN_M
+    known = [(name, place) for name, place in air_places(plan, views).items() if place is not None]
+    return tuple(
+        NearPair(first=first, second=second, distance_m=math.dist(here, there))
+        for (first, here), (second, there) in itertools.combinations(known, 2)
+        if math.dist(here, there) < least_m
+    )
+
+
+def find_unwatched(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[str, ...]:
+    """Those in the air whose distance to another one should be known, and is not."""
+    places = air_places(plan, views)
+    return tuple(name for name, place in places.items() if place is None and len(places) > 1)
+
+
+def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point | None]:
+    """The places, in the room's axes, of all in the air that measure their position there; None if
+    it is unknown now."""
+    places: dict[str, Point | None] = {}
+    for view in views:
+        vehicle = plan.fleet.vehicle(view.name)
+        if view.is_in_air and vehicle.frame == "room":
+            place_m = None if view.status is None else view.status.place_m
+            is_known = place_m is not None and all(map(math.isfinite, place_m))
+            is_fresh = view.place_age_s <= FRESH_PLACE_S
+            places[view.name] = (
+                vehicle.flown_to_room(place_m) if place_m and is_known and is_fresh else None
+            )
+    return places
+
+
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:
     """Why this vehicle must not take off any more: who has ended in the way of its corridor. Those
     that have ended do not move again, so it is for good."""
@@ -131,5 +213,5 @@ def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:
         return False
-    away_m = math.dist(vehicle.as_flown.to_room(result.place_m), vehicle.home_m)
+    away_m = math.dist(vehicle.flown_to_room(result.place_m), vehicle.home_m)
     return result.outcome == "landed" and away_m <= OBSTACLE_M

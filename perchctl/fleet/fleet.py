@@ -79,6 +79,11 @@ class FleetVehicle:
             return self
         return replace(self, frame="home").with_target(self.target_m)
 
+    def flown_to_room(self, estimate_m: Point) -> Point:
+        """A place in the axes in which `as_flown` flies, in those of the room."""
+        axes = replace(self, frame="home") if self.simulated else self
+        return axes.to_room(estimate_m)
+
     def to_room(self, estimate_m: Point) -> Point:
         """A place in the axes of the vehicle's state estimate, in those of the room."""
         if self.frame == "room":

@@ -57,7 +57,8 @@ class Status:
         error_m: the target's level distance from the gear.
         telemetry_age_s: age of the oldest part of the newest telemetry.
         loop_age_s: time since the last turn of its flight loop; None before the first.
-        place_m: where it is, in the axes of its estimate.
+        place_m: where it is, in the axes of its estimate; None while the estimate cannot be
+            trusted.
     """
 
     stage: Stage = Stage.STARTING

@@ -119,7 +119,7 @@ class FleetOutcome:
         vehicle, options = self.plan.fleet.vehicle(name), self.options[name]
         place_m = None
         if result.place_m is not None:
-            place_m = [round(part, 3) for part in vehicle.as_flown.to_room(result.place_m)]
+            place_m = [round(part, 3) for part in vehicle.flown_to_room(result.place_m)]
         ended_s = None if result.ended_s is None else round(result.ended_s - self.started_s, 3)
         return {
             "name": name,
@@ -145,7 +145,7 @@ class FleetOutcome:
 
     def text(self) -> str:
         """The outcome for people, a line for each vehicle."""
-        lines = [f"{'radio':<12}{problem}" for problem in self.problems]
+        lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
             miss = "" if result.miss_m is None else f", {1e3 * result.miss_m:.1f} mm from centre"
             state = "hangs" if result.hangs else result.outcome

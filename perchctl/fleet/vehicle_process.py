@@ -279,7 +279,7 @@ def flight_status(tick: Tick) -> Status:
         error_m=None if target is None else math.hypot(*target.e_m[:2]),
         battery_v=telemetry.battery_v if telemetry.battery_v >= NO_BATTERY_READING_V else None,
         telemetry_age_s=tick.telemetry_age_s,
-        place_m=(x_m, y_m),
+        place_m=(x_m, y_m) if state.belief.is_position_trusted else None,
     )
 
 

@@ -213,6 +213,45 @@ def test_one_far_away_flies_on_unless_a_failure_lands_all() -> None:
     assert rig.fleet.reasons["v1"] == "v0 has failed"
 
 
+# --- Distances ---
+
+
+def test_two_that_come_too_near_land_and_the_others_fly_on() -> None:
+    rig = Rig(order="together").started()
+    for name, x_m in (("v0", 2.0), ("v1", -1.8), ("v2", 0.0), ("v3", 0.0)):  # from its home
+        rig[name].tell(
+            Stage.FLYING, phase="ALIGN", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(x_m, 0.0)
+        )
+    rig.pass_s()
+    assert rig.words == [Operator.LAND, Operator.LAND, Operator.NONE, Operator.NONE]
+    rig["v0"].tell(
+        Stage.FLYING, phase="LANDING", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
+    )
+    rig.pass_s()
+    assert rig.words[:2] == [Operator.LAND] * 2, "also once they are apart again"
+    assert [str(pair) for pair in rig.fleet.near_pairs] == [
+        "v0 and v1 were 0.20 m apart in the air"
+    ]
+    rig.end("v0", Result(exit_code=130, outcome="landed", reason="operator", has_flown=True))
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert (result.exit_code, result.reason) == (52, "0.20 m from v1 in the air: operator")
+
+
+def test_a_position_that_grows_old_lands_nobody_and_is_named() -> None:
+    rig = Rig(order="together").started()
+    for name in ("v0", "v1"):
+        rig[name].tell(
+            Stage.FLYING, phase="ALIGN", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
+        )
+    rig.pass_s()
+    assert rig.fleet.unwatched == ()
+    rig["v0"].hangs = True
+    rig.pass_s(0.6)
+    assert rig.fleet.unwatched == ("v0",)
+    assert rig.words == [Operator.NONE] * 4
+
+
 # --- Stop ---
 
 

@@ -74,7 +74,7 @@ def test_a_dead_dongle_and_its_return_are_told_once(
     plan = make_plan(load_fleet())
     radios: Any = SimpleNamespace(problems=lambda: dict(problems))
     session = FleetSession(plan, {}, radios, tmp_path, datetime.now(UTC), 0.0)
-    nobody: Any = SimpleNamespace(views=(), started=False)
+    nobody: Any = SimpleNamespace(views=(), started=False, near_pairs=(), unwatched=())
     session._look(nobody)
     problems["0"] = "the radio hub has not reported for 1.1 s"
     session._look(nobody)
