@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import os
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -39,13 +39,21 @@ TITLES = {
 GRADES = {"perched": "good", "landed": "warn"}
 
 
-def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = False) -> Report:
+def write_report(
+    log_paths: Sequence[Path],
+    output: Path,
+    with_film: bool = False,
+    names: Mapping[Path, str] | None = None,
+) -> Report:
     """Write the HTML report of the logs atomically, and return its content. `with_film` embeds a
-    film of each flight.
+    film of each flight. `names`: the vehicles of a fleet, by their logs.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
-    report = Report(tuple(read_reported_flight(path) for path in log_paths))
+    of = names or {}
+    report = Report(
+        tuple(replace(read_reported_flight(path), name=of.get(path, "")) for path in log_paths)
+    )
     write_files({output: report_html(report.flights, with_film).encode("utf-8")})
     return report
 
@@ -68,6 +76,7 @@ class Report:
         return [
             {
                 "log": str(told.flight.log.path),
+                **({"name": told.name} if told.name else {}),
                 "outcome": told.outcome,
                 "miss_m": told.flight.summary.miss_m,
                 "used_mah": told.flight.measures.battery_used_mah,
@@ -80,11 +89,12 @@ class Report:
 @dataclass(frozen=True, eq=False)
 class ReportedFlight:
     """One flight of a report. `pictures` is None without a recording; `picture_problem` says why
-    pictures could not be read."""
+    pictures could not be read. `name`: the vehicle's, in a fleet."""
 
     flight: FlightAnalysis
     pictures: tuple[DecisionPicture, ...] | None = None
     picture_problem: str = ""
+    name: str = ""
 
     @cached_property
     def story(self) -> tuple[Sentence, ...]:
@@ -109,9 +119,9 @@ class ReportedFlight:
 
     @property
     def title(self) -> str:
-        """The outcome and, if known, the miss distance."""
+        """The vehicle's name in a fleet, the outcome and, if known, the miss distance."""
         miss_m = self.flight.summary.miss_m
-        title = TITLES.get(self.outcome, self.outcome)
+        title = (f"{self.name}: " if self.name else "") + TITLES.get(self.outcome, self.outcome)
         return title if miss_m is None else f"{title}, {length_text(miss_m)} off centre"
 
     @property

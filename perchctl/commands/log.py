@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+# By its package, whose names load as they are used.
+from perchctl import fleet as fleets
 from perchctl.analysis import (
     FlightAnalysis,
     FlightComparison,
@@ -26,7 +28,7 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.output import print_result, say
-from perchctl.errors import ReplayDiffers
+from perchctl.errors import NotFound, ReplayDiffers
 from perchctl.files import check_output, write_files
 from perchctl.profile import Profile, apply_settings, load_profile
 from perchctl.record import (
@@ -229,12 +231,15 @@ def replay(
     app,
     "perchctl log report",
     "perchctl log report perchctl-logs/*.jsonl -o session.html",
+    "perchctl log report perchctl-logs/fleet_20261130_120000_atrium",
     "perchctl log report flight.jsonl --film --force",
 )
 def report(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Flight logs. Default: the newest in perchctl-logs."),
+        typer.Argument(
+            help="Flight logs, or folders of fleets. Default: the newest in perchctl-logs."
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Page to write: .html.")
@@ -243,12 +248,28 @@ def report(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page that describes one or more flights in sentences and plots."""
-    logs = [_log_file(file) for file in files or (None,)]
-    if output is None and len(logs) > 1:
-        output = logs[0].with_name("session.html")
+    """Write a page that describes one or more flights in sentences and plots.
+
+    The folder of a fleet's flight (with a fleet.json) gives one page of all its vehicles.
+    """
+    logs: list[Path] = []
+    names: dict[Path, str] = {}
+    for file in files or (None,):
+        fleet = fleets.read_fleet_folder(file) if file is not None and file.is_dir() else None
+        if fleet is None:
+            logs.append(_log_file(file))
+            continue
+        for name, line in fleet.lines.items():
+            where = fleet.logs.get(name)
+            say(f"{line} ({'no log' if where is None else where.name})")
+        logs += fleet.logs.values()
+        names |= {log: name for name, log in fleet.logs.items()}
+    if not logs:
+        raise NotFound("no vehicle of this fleet has left a log: there is nothing to report")
+    if output is None and (names or len(logs) > 1):
+        output = logs[0].with_name("fleet.html" if names else "session.html")
     place = _place(logs[0], output, PAGES, force)
-    page = write_report(logs, place, with_film)
+    page = write_report(logs, place, with_film, names)
     say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)
 

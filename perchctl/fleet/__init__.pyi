@@ -7,6 +7,7 @@ from .drawing import draw_svg as draw_svg
 from .drawing import draw_text as draw_text
 from .fleet import Fleet as Fleet
 from .fleet import FleetVehicle as FleetVehicle
+from .folder import read_fleet_folder as read_fleet_folder
 from .load import EXAMPLE as EXAMPLE
 from .load import find_fleet as find_fleet
 from .load import load_fleet as load_fleet

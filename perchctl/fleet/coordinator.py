@@ -189,7 +189,7 @@ class Coordinator:
             outcome="failed",
             reason=f"{problem}: look where the vehicle is before you reach for it",
             has_flown=True,
-            place_m=None,
+            log=None if status is None else status.log,
         )
 
     def _send(self, decision: Decision, now_s: float) -> None:

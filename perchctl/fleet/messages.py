@@ -59,6 +59,7 @@ class Status:
         loop_age_s: time since the last turn of its flight loop; None before the first.
         place_m: where it is, in the axes of its estimate; None while the estimate cannot be
             trusted.
+        log: the file of its log, once the flight has begun: should it end without a `Result`.
     """
 
     stage: Stage = Stage.STARTING
@@ -70,6 +71,7 @@ class Status:
     telemetry_age_s: float | None = None
     loop_age_s: float | None = None
     place_m: Point | None = None
+    log: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

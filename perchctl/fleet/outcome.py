@@ -66,6 +66,12 @@ def as_error(name: str, result: Result) -> PerchError:
     return kinds.get(result.exit_code, PerchError)(f"{name}: {result.reason}")
 
 
+def vehicle_line(name: str, hangs: bool, outcome: str, miss_m: float | None, reason: str) -> str:
+    """How one vehicle ended, for people."""
+    miss = "" if miss_m is None else f", {1e3 * miss_m:.1f} mm from centre"
+    return f"{name:<12}{'hangs' if hangs else outcome}{miss}: {reason}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class FleetOutcome:
     """A fleet's flight that has ended, or has come so far.
@@ -147,9 +153,9 @@ class FleetOutcome:
         """The outcome for people, a line for each vehicle."""
         lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
-            miss = "" if result.miss_m is None else f", {1e3 * result.miss_m:.1f} mm from centre"
-            state = "hangs" if result.hangs else result.outcome
-            lines.append(f"{name:<12}{state}{miss}: {result.reason}")
+            lines.append(
+                vehicle_line(name, result.hangs, result.outcome, result.miss_m, result.reason)
+            )
         ratio = self.ratio
         if ratio is not None and any(each.simulated for each in self.options.values()):
             lines.append(f"{'pace':<12}{ratio:.2f} s of simulated time per second")

@@ -63,6 +63,7 @@ def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> 
         log = LogWatcher.open_real_time(
             options.log_dir, options.profile, options.uri, options.source, seed, options.record
         )
+        reporter.log = str(log.path)
         report, miss_m = fly_session(
             options,
             (log, reporter),
@@ -167,12 +168,17 @@ class ParentLine:
 
 
 class StatusReporter(Watcher):
-    """A flight's watcher that tells the parent where it is, and remembers what the result needs."""
+    """A flight's watcher that tells the parent where it is, and remembers what the result needs.
+
+    Attributes:
+        log: the file of the flight's log, once it is open.
+    """
 
     name = "the status for the fleet"
     problem: str | None = None
 
     def __init__(self, line: ParentLine, switch: ParentSwitch) -> None:
+        self.log: str | None = None
         self._line, self._switch = line, switch
         self._first: tuple[float, float, float] | None = None  # loop, wall and computing time, s
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -199,7 +205,7 @@ class StatusReporter(Watcher):
             self._setpoint_s = now_s
         else:
             self._setpoint_s = None
-        self._line.tell(flight_status(tick))
+        self._line.tell(replace(flight_status(tick), log=self.log))
 
     def event(self, event: Event) -> None:
         if event.rest is not None:

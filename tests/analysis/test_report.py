@@ -222,3 +222,37 @@ def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) 
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"
     assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]
+
+
+@words_only
+def test_a_fleets_folder_gives_one_page_with_all_vehicles(tmp_path: Path) -> None:
+    for name in ("flight_1.jsonl", "flight_2.jsonl"):
+        synthetic.write(tmp_path / name, summary=synthetic.SUMMARY)
+    ended = {"hangs": True, "outcome": "perched", "miss_m": 0.002, "reason": "hanging still"}
+    lost = {"hangs": False, "outcome": "failed", "miss_m": None, "reason": "killed", "log": None}
+    record = {
+        "vehicles": [
+            {"name": "north", "log": "flight_2.jsonl", **ended},
+            {"name": "east", "log": "flight_1.jsonl", **ended},
+            {"name": "west", **lost},
+        ]
+    }
+    path = tmp_path / "fleet.json"
+    path.write_text(json.dumps(record), encoding="utf-8")
+    said = run("log", "report", str(tmp_path))
+    assert (said.code, said.stdout.strip()) == (0, str(tmp_path / "fleet.html"))
+    assert said.stderr.splitlines() == [
+        "perchctl: north       hangs, 2.0 mm from centre: hanging still (flight_2.jsonl)",
+        "perchctl: east        hangs, 2.0 mm from centre: hanging still (flight_1.jsonl)",
+        "perchctl: west        failed: killed (no log)",
+        "perchctl: 2 flights: 2 perched",
+    ]
+    page = Page((tmp_path / "fleet.html").read_text(encoding="utf-8"))
+    assert "north: Perched" in page.words
+    path.write_text(json.dumps({"vehicles": [{"name": "west", **lost}]}), encoding="utf-8")
+    assert run("log", "report", str(tmp_path)).code == 20
+    for text in ("", "[]", "{}", '{"vehicles": [1]}', '{"vehicles": [{"name": "north"}]}'):
+        path.write_text(text, encoding="utf-8")
+        refused = run("log", "report", str(tmp_path))
+        assert refused.code == 30
+        assert "fleet.json is not the record of a fleet's flight" in refused.complaint

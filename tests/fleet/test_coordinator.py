@@ -306,10 +306,14 @@ def test_a_loop_that_hangs_for_longer_than_any_landing_is_ended() -> None:
 
 def test_a_process_that_was_killed_in_the_air_counts_as_somewhere() -> None:
     rig = Rig(NEAR).started()
-    rig.fly("v0")
+    rig["v0"].tell(Stage.FLYING, phase="ALIGN", log="logs/flight.jsonl")
+    rig.pass_s()
     rig["v0"].gone = "its process has ended unexpectedly (signal 9)"
     rig.pass_s()
     assert rig["v1"].order.word is Operator.LAND
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert (result.has_flown, result.log) == (True, "logs/flight.jsonl")
 
 
 def test_orders_are_repeated_as_signs_of_life() -> None:
