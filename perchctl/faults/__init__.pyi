@@ -1,12 +1,9 @@
 from .catalogue import FAULTS as FAULTS
 from .catalogue import HEALTHY as HEALTHY
-from .catalogue import NO_FAULT as NO_FAULT
 from .catalogue import Case as Case
 from .catalogue import draw_case as draw_case
 from .catalogue import select_faults as select_faults
 from .common import COMMON_CAUSES as COMMON_CAUSES
-from .common import CommonCause as CommonCause
-from .common import lasts_s as lasts_s
 from .flight import FaultyFlight as FaultyFlight
 from .flight import fly_fault_in_folder as fly_fault_in_folder
 from .oracle import FLAGS as FLAGS

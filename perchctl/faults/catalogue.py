@@ -556,6 +556,11 @@ class Case:
     landed_after_s: float = 0.0
     first_hold_ratio: float | None = None
 
+    @property
+    def lasts_s(self) -> float:
+        """For how long a common cause lasts."""
+        return max(float(effect.keywords["for_s"]) for effect in self.effects)
+
 
 HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())
 """A flight without a fault."""

@@ -43,11 +43,6 @@ class CommonCause:
         return Case(self.fault, Phase.PERCHED, math.inf, (effects(DrawInputs(rng, scenario)),))
 
 
-def lasts_s(case: Case) -> float:
-    """For how long a common cause lasts."""
-    return max(float(effect.keywords["for_s"]) for effect in case.effects)
-
-
 def _capture(how: str) -> partial[e.Effect]:
     return partial(_positions, how)
 

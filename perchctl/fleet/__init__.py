@@ -12,9 +12,6 @@ opened or armed. For those who fly, simulate or show a fleet:
     plan.schedule.groups                # who flies together: (("north", "east"), ("south",))
     plan.schedule.may_fly_together(a, b)
     plan.corridors["north"]             # perchctl.corridor.Corridor, in the room's axes
-    estimate_corridor(vehicle)          # the same in the axes of its own estimate: its fence,
-                                        # estimate_corridor(vehicle).contains(x_m, y_m, z_m)
-    flown_profile(vehicle)              # its profile with that corridor as safety.corridor
     plan.dongles                        # DongleLoad: which vehicles share a Crazyradio
     draw_text(fleet, groups), draw_svg(fleet, groups)
     fly_fleet(plan, faults, seed)       # FleetResult of one seed, in lockstep: a unit of work
@@ -29,17 +26,19 @@ A flight is a process for each vehicle, and a parent that orders them:
         coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
         coordinator.run(until)          # in a thread of its own; or step() by step
         coordinator.confirm(), .land(name), .views, .has_ended
+    read_fleet_folder(folder)           # what such a flight has left
 
 messages: all that parent and vehicle say. vehicle_process: the vehicle's side; parent_watch: its
 operator, which lands without a parent. dispatch: who may take off, who lands, and who is too near,
 as pure functions. coordinator, children: the parent's side. prepare: what is refused before
-anything starts, and radio hubs. outcome: exit code and ``fleet.json``.
+anything starts, and radio hubs. outcome: exit code and ``fleet.json``; folder: read again.
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
-assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and
-who flies when. plan: all of it in one call. drawing: the room from above. convert: lists of
-Crazyflies from other programs. lockstep: a whole fleet's simulated flight. room: what its vehicles
-share. coroutine: how its flights wait for each other. results: how they ended.
+assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, the
+profiles that keep to them, and who flies when. plan: all of it in one call. drawing: the room from
+above. convert: lists of Crazyflies from other programs. lockstep: a whole fleet's simulated flight.
+room: what its vehicles share. coroutine: how its flights wait for each other. results: how they
+ended.
 """
 
 import lazy_loader

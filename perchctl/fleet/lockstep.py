@@ -33,11 +33,9 @@ from perchctl.faults import (
     FAULTS,
     HEALTHY,
     Case,
-    CommonCause,
     FaultResult,
     FaultyFlight,
     draw_case,
-    lasts_s,
 )
 from perchctl.fleet.coroutine import ThreadCoroutine
 from perchctl.fleet.fleet import vehicle_seed
@@ -118,16 +116,16 @@ def draw_trouble(
         return Trouble(name=name, cases={one.name: case})
     cause = _CAUSES[name]
     case = cause.draw(rng, placed[number].scenario)
-    whom = _whom(cause, plan, [each.name for each in placed], number, rng)
+    whom = _whom(cause.whom, plan, [each.name for each in placed], number, rng)
     group = int(rng.integers(len(plan.schedule.groups)))
     at_s = round(float(rng.uniform(*CAUSE_S)), 3)
     return Trouble(name=name, cases=dict.fromkeys(whom, case), group=group, at_s=at_s)
 
 
 def _whom(
-    cause: CommonCause, plan: FleetPlan, names: list[str], number: int, rng: np.random.Generator
+    whom: str, plan: FleetPlan, names: list[str], number: int, rng: np.random.Generator
 ) -> Sequence[str]:
-    match cause.whom:
+    match whom:
         case "pair" if len(names) > 1:
             others = [name for name in names if name != names[number]]
             return names[number], others[int(rng.integers(len(others)))]
@@ -321,7 +319,7 @@ class FleetFlight:
         if trouble.at_s is None or name not in trouble.cases or not self._results:
             return False
         flown = self._plan.group_number(name) - 1 > trouble.group
-        return flown and lasts_s(trouble.cases[name]) > FOR_GOOD_S
+        return flown and trouble.cases[name].lasts_s > FOR_GOOD_S
 
 
 def _finite(value: float) -> float | None:

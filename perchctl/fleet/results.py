@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.campaign import CampaignFlight, align_columns, rate_text
-from perchctl.faults import ENDS, FLAGS, NO_FAULT, FaultResult, fault_summary
+from perchctl.faults import ENDS, FLAGS, HEALTHY, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
@@ -42,7 +42,7 @@ class FleetResult(CampaignFlight):
     @property
     def is_bad(self) -> bool:
         """True if two collided, if a flag counts, or if a vehicle did not perch without a fault."""
-        missed = self.fault == NO_FAULT.name and self.outcome != "perched"
+        missed = self.fault == HEALTHY.fault.name and self.outcome != "perched"
         return self.collisions > 0 or missed or any(v.is_bad for v in self.vehicles)
 
 
@@ -56,7 +56,7 @@ def refused_vehicle(reason: str) -> FaultResult:
     return FaultResult(
         seed=0,
         outcome="refused",
-        fault=NO_FAULT.name,
+        fault=HEALTHY.fault.name,
         phase="",
         moment_s=0.0,
         begin_s=None,
@@ -133,7 +133,7 @@ def _rows(fleet: FleetResult) -> list[tuple[str, ...]]:
         for first, second in fleet.collided
     ]
     for name, vehicle in zip(fleet.names, fleet.vehicles, strict=True):
-        missed = fleet.fault == NO_FAULT.name and vehicle.outcome != "perched"
+        missed = fleet.fault == HEALTHY.fault.name and vehicle.outcome != "perched"
         if vehicle.counted or missed:
             flags = ", ".join(flag.replace("_", " ") for flag in vehicle.counted)
             what = flags or vehicle.reason

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 from perchctl.corridor import Point
-from perchctl.fleet import Fleet, FleetVehicle
+from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.profile import Profile, layered_profile, load_profile
 from perchctl.profile.load import find_profile
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.fleet import Fleet, load_fleet
+from perchctl.fleet import load_fleet
+from perchctl.fleet.fleet import Fleet
 from perchctl.profile import load_profile
 
 ATRIUM = """\

@@ -20,10 +20,8 @@ from perchctl.errors import ConnectionFailed, UsageError
 from perchctl.faults import FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
 from perchctl.faults.effects import FOR_EVER, external_positions
 from perchctl.fleet import (
-    Fleet,
     FleetPlan,
     FleetResult,
-    FleetVehicle,
     fleet_summary,
     fleet_table,
     fly_fleet,
@@ -31,6 +29,7 @@ from perchctl.fleet import (
     make_plan,
     select_fleet_faults,
 )
+from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.fleet.lockstep import TICK_S, FleetFlight, Trouble, draw_trouble
 from perchctl.fleet.results import refused_vehicle
 from perchctl.fleet.room import place_fleet

@@ -10,17 +10,9 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import EXIT_CODES, ConnectionFailed
-from perchctl.fleet import (
-    FleetOutcome,
-    Result,
-    as_error,
-    flight_options,
-    load_fleet,
-    make_plan,
-    worst_of,
-)
+from perchctl.fleet import FleetOutcome, as_error, flight_options, load_fleet, make_plan, worst_of
 from perchctl.fleet.fleet import vehicle_seed
-from perchctl.fleet.messages import Pace
+from perchctl.fleet.messages import Pace, Result
 from perchctl.fleet.outcome import fleet_exit_code
 
 PACE = Pace(flown_s=20.0, wall_s=40.0, gap_p50_s=0.02, gap_p99_s=0.05, gap_max_s=0.1, cores=0.4)

@@ -10,7 +10,8 @@ import pytest
 
 from perchctl.corridor import Corridor
 from perchctl.errors import ConnectionFailed
-from perchctl.fleet import Fleet, flight_options, load_fleet, make_plan, open_radios, prepare
+from perchctl.fleet import flight_options, load_fleet, make_plan, open_radios, prepare
+from perchctl.fleet.fleet import Fleet
 from perchctl.link import HubReport
 from tests.fleet.rig import fleet, on_air, same_channel
 

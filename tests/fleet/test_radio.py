@@ -7,11 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.fleet import Fleet, budget_radio, load_fleet
+from perchctl.fleet import load_fleet
+from perchctl.fleet.fleet import Fleet
 from perchctl.fleet.radio import (
     MOST_ON_A_DONGLE,
     SLOWEST_PERIOD_S,
     USABLE_SHARE,
+    budget_radio,
     carried_per_s,
     needed_per_s,
 )

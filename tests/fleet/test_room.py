@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.fleet import estimate_corridor, flown_profile, load_fleet
+from perchctl.fleet import load_fleet
 from perchctl.fleet.room import (
     COLLISION_HALF_HEIGHT_M,
     COLLISION_RADIUS_M,
@@ -19,6 +19,7 @@ from perchctl.fleet.room import (
     Room,
     place_fleet,
 )
+from perchctl.fleet.schedule import estimate_corridor, flown_profile
 from perchctl.sim import downwash_mps
 from tests.fleet.rig import fleet
 

@@ -13,16 +13,9 @@ from hypothesis import strategies as st
 
 from perchctl.corridor import Point
 from perchctl.errors import InvalidValue
-from perchctl.fleet import (
-    Fleet,
-    FleetVehicle,
-    Schedule,
-    estimate_corridor,
-    load_fleet,
-    make_schedule,
-    vehicle_corridor,
-)
+from perchctl.fleet import load_fleet
 from perchctl.fleet.assignment import assign_nearest
+from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.fleet.schedule import (
     OBSTACLE_M,
     ROOM_ERROR_M,
@@ -30,7 +23,11 @@ from perchctl.fleet.schedule import (
     START_SEPARATION_M,
     TARGET_ALONE_M,
     WANDER_M,
+    Schedule,
     corridor_radius_m,
+    estimate_corridor,
+    make_schedule,
+    vehicle_corridor,
 )
 from tests.fleet.rig import FENCE_M, base, fleet
 from tests.fleet.test_corridor import moved
