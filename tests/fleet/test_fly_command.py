@@ -130,7 +130,7 @@ def test_one_that_does_not_answer_and_nothing_arms(tmp_path: Path) -> None:
     done = run_apart("fleet", "fly", str(bad), "--yes", "--log-dir", str(tmp_path / "logs"))
     sentence = done.stderr.splitlines()[-1]
     assert done.code == 40, done.stderr
-    assert sentence.startswith("perchctl: east: http://127.0.0.1:9/ gave no picture")
+    assert sentence.startswith("perchctl: east: http://127.0.0.1:9/ delivered no picture")
     assert sentence.endswith("no vehicle was armed")
     assert "APPROACH" not in done.stderr
     assert not list(tmp_path.glob("logs/*"))
