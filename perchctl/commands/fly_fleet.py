@@ -115,6 +115,7 @@ class FleetSession:
         self._told: dict[str, str] = {}
         self._radio_problems: dict[str, str] = {}
         self._problems: list[str] = []
+        self._slowed: set[str] = set()
         self._recorded = 0
         self._failure: str | None = None
         self._unwritten: str | None = None
@@ -221,6 +222,10 @@ class FleetSession:
             if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
+        for view in views:
+            if view.result is not None and view.name not in self._slowed:
+                self._slowed.add(view.name)
+                self._radios.slow_down(self._options[view.name].uri)
         self._look_at_radios()
         self._look_at_distances(coordinator)
         if self._panel is not None:

@@ -28,6 +28,11 @@ def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
     return path
 
 
+IDLE_PER_S = 10
+"""Packets a second for a vehicle whose flight has ended, the least that a hub allows. Larger, and
+it takes more from those that fly; smaller is not possible."""
+
+
 class Radios:
     """The radio hubs of the dongles that several vehicles share, by dongle.
 
@@ -43,6 +48,12 @@ class Radios:
         log, lock and the comparison with the motion capture go by it."""
         ways = {uri: way for hub in self._hubs.values() for uri, way in hub.uris.items()}
         return {name: replace(each, link_uri=ways.get(each.uri)) for name, each in options.items()}
+
+    def slow_down(self, uri: str) -> None:
+        """Leave the share of a vehicle whose flight has ended to those that still fly."""
+        for hub in self._hubs.values():
+            if uri in hub.uris:
+                hub.limit(uri, IDLE_PER_S)
 
     def problems(self) -> dict[str, str]:
         """Why a dongle is of no use now, by dongle. Never waits."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -150,6 +151,28 @@ def test_four_vehicles_fly_in_real_time(tmp_path: Path) -> None:
         assert read_log(folder / vehicle["log"]).header["seed"] == vehicle["seed"]
     south = record["vehicles"][2]
     assert all(v["ended_s"] < south["ended_s"] for v in record["vehicles"][:2])
+
+
+@pytest.mark.long
+def test_two_that_come_too_near_land_and_say_how_near(tmp_path: Path) -> None:
+    """Under a parent that calls 2.6 m too near."""
+    pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
+    path = two(tmp_path)
+    capture = "profile: sim, positioning: {by: mocap}"
+    path.write_text(path.read_text().replace("profile: sim", capture), encoding="utf-8")
+    done = run_apart(
+        *("fleet", "fly", str(path), "--json", "--log-dir", str(tmp_path)),
+        before="from perchctl.fleet import dispatch; dispatch.NEAR_MARGIN_M = -3.0",
+        timeout_s=120.0,
+    )
+    record = json.loads(done.stdout)
+    assert done.code == 52, done.stderr
+    for vehicle, other in zip(record["vehicles"], ("east", "north"), strict=True):
+        assert (vehicle["outcome"], vehicle["exit_code"]) == ("landed", 52), done.stderr
+        assert re.match(rf"2\.\d\d m from {other} in the air: ", vehicle["reason"])
+    assert re.fullmatch(
+        r"north and east were 2\.\d\d m apart in the air: both land", record["problems"][0]
+    )
 
 
 HUB = """

@@ -59,6 +59,10 @@ class FakeHub:
         self.reports: dict[str, HubReport] = {}
         self.problem: str | None = None
         self.is_open = True
+        self.limits: list[tuple[str, int | None]] = []
+
+    def limit(self, uri: str, packets_per_s: int | None) -> None:
+        self.limits.append((uri, packets_per_s))
 
     def update(self) -> str | None:
         return self.problem
@@ -88,6 +92,9 @@ def test_those_who_share_a_dongle_fly_through_its_hub(made: list[FakeHub], tmp_p
         assert [each.link_uri for each in routed.values()] == [*hub.uris.values(), None]
         assert [each.uri for each in routed.values()] == [each.uri for each in options.values()]
         assert hub.is_open
+        radios.slow_down(NORTH)
+        radios.slow_down(EAST)
+        assert hub.limits == [(NORTH, prepare.IDLE_PER_S)]
     assert not hub.is_open
 
 
