@@ -75,18 +75,20 @@ def decide(checkout: Path, log: Path) -> list[Any]:
 
 def print_decisions(log: Path) -> None:
     """The child's part of `decide`: a line of JSON for each decision."""
-    from perchctl.mission import load_table, step_mission
+    from perchctl import mission
     from perchctl.record import read_log, to_exact_json
 
     found = read_log(log)
     profile, state = found.flown_profile, None
     if not found.has_position_variance:  # as a replay does
         profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
+    # An older checkout has it under its former name.
+    load_table = getattr(mission, "load_table", None) or mission.table_of
     table = load_table(profile.planner.rows)
     for turn in found.turns:
         if turn.observation is None or turn.role == "waiting":
             continue
-        new, command = step_mission(state, turn.observation, profile, table)
+        new, command = mission.step_mission(state, turn.observation, profile, table)
         decided = {
             "kind": "decision",
             "phase": new.phase.value,

@@ -59,19 +59,21 @@ def largest_state() -> tuple[str, int]:
 
 def press() -> tuple[int, int, int, int]:
     """Functions, files, calls and contexts of the tick in the middle of the recorded press."""
-    from perchctl.mission import load_table, step_mission
+    from perchctl import mission
     from perchctl.record import read_log
 
     log = read_log(LOG)
     profile, state, ticks = log.flown_profile, None, []
     profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
+    # An older checkout has it under its former name.
+    load_table = getattr(mission, "load_table", None) or mission.table_of
     table = load_table(profile.planner.rows)
     for turn in log.turns:
         if turn.observation is None or turn.role != "flown":
             continue
         if state is not None and state.phase.value == "PERCH":
             ticks.append((state, turn.observation))
-        state, _ = step_mission(state, turn.observation, profile, table)
+        state, _ = mission.step_mission(state, turn.observation, profile, table)
     state, obs = ticks[len(ticks) // 2]
     functions, files, calls, contexts = set(), set(), 0, 0
 
@@ -86,7 +88,7 @@ def press() -> tuple[int, int, int, int]:
         contexts += frame.f_code.co_qualname == "Context.__init__"
 
     sys.setprofile(seen)
-    step_mission(state, obs, profile, table)
+    mission.step_mission(state, obs, profile, table)
     sys.setprofile(None)
     return len(functions), len(files), calls, contexts
 

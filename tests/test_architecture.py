@@ -313,3 +313,25 @@ def test_a_cycle_is_seen() -> None:
     ]
     assert set(cycle(there_and_back)) == set(pair)
     assert cycle(there_and_back[:1]) == []
+
+
+def numbers_of(source: str) -> dict[str, str]:
+    """The module's constants whose value is a number, with the number as it is written."""
+    found = {}
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            value = node.value.operand if isinstance(node.value, ast.UnaryOp) else node.value
+            is_number = isinstance(value, ast.Constant) and isinstance(value.value, (int, float))
+            if is_number and node.targets[0].id.isupper():
+                found[node.targets[0].id] = ast.unparse(node.value)
+    return found
+
+
+def test_a_constants_name_has_one_value() -> None:
+    """Whoever searches for a name finds one number, and need not ask which of them is meant."""
+    values: dict[str, dict[str, str]] = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        for name, value in numbers_of(path.read_text(encoding="utf-8")).items():
+            values.setdefault(name, {})[value] = module_name(path)
+    assert len(values) > 500
+    assert [f"{name}: {at}" for name, at in values.items() if len(at) > 1] == []

@@ -35,7 +35,7 @@ from perchctl.flight import (
     operator_signals,
 )
 
-LOOK_S = 0.1
+DISPLAY_PERIOD_S = 0.1
 """Between two looks at the vehicles, for display and record. The orders do not wait for it."""
 ENDING_TIMEOUT_S = 90.0
 """For vehicles to land and their processes to end by themselves after the fleet's own failure.
@@ -166,7 +166,7 @@ class FleetSession:
         while not coordinator.are_ready:
             self._look(coordinator)
             self._refuse_failed(coordinator)
-            time.sleep(LOOK_S)
+            time.sleep(DISPLAY_PERIOD_S)
         self._look(coordinator)
 
     def _refuse_failed(self, coordinator: fleets.Coordinator) -> None:
@@ -203,7 +203,7 @@ class FleetSession:
                 self._look(coordinator)
                 if not coordinator.started:
                     self._refuse_failed(coordinator)
-                time.sleep(LOOK_S)
+                time.sleep(DISPLAY_PERIOD_S)
         self._look(coordinator)
         if not coordinator.started:
             self._refuse_failed(coordinator)
@@ -290,7 +290,7 @@ class FleetSession:
         hung = isinstance(error, Interrupted) and self._switch.listening
         end_s = time.monotonic() + (0.0 if hung else ENDING_TIMEOUT_S)
         while time.monotonic() < end_s and not all(map(_has_ended, self._children.values())):
-            time.sleep(LOOK_S)
+            time.sleep(DISPLAY_PERIOD_S)
 
     def _close_panel(self) -> None:
         if self._panel is not None:

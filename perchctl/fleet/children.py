@@ -13,7 +13,7 @@ from perchctl.errors import InvalidValue
 from perchctl.fleet.messages import Order, Result, Status
 from perchctl.flight import FlyOptions
 
-END_TIMEOUT_S = 5.0
+PROCESS_END_TIMEOUT_S = 5.0
 """For a process to end after its result. Longer, and the fleet ends later; shorter, and one that is
 only slow is killed."""
 # The parent hears that it is up before the libraries are loaded.
@@ -85,8 +85,8 @@ class VehicleProcess:
         if self._closed:
             return
         self._closed = True
-        wait_or_kill(self._process, END_TIMEOUT_S if self._result is not None else 0.0)
-        self._reader.join(END_TIMEOUT_S)
+        wait_or_kill(self._process, PROCESS_END_TIMEOUT_S if self._result is not None else 0.0)
+        self._reader.join(PROCESS_END_TIMEOUT_S)
         self._channel.close()
         with contextlib.suppress(OSError):
             is_empty = self._output.seek(0, 2) == 0

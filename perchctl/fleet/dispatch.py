@@ -29,7 +29,7 @@ from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M
 from perchctl.mission import Operator
 
-FRESH_S = 1.0
+FRESH_STATUS_S = 1.0
 """A vehicle whose process has sent nothing for so long is not ready. Longer, and one that hangs
 counts as ready; shorter, and a busy computer puts off the start."""
 
@@ -79,7 +79,7 @@ class VehicleView:
     @property
     def is_ready(self) -> bool:
         """True if nothing but permission keeps it on the floor."""
-        return self.result is None and self.stage is Stage.READY and self.silent_s < FRESH_S
+        return self.result is None and self.stage is Stage.READY and self.silent_s < FRESH_STATUS_S
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,8 @@ from perchctl.corridor import Corridor, Point
 from perchctl.fleet.fleet import Fleet
 from perchctl.fleet.schedule import vehicle_corridor
 
-COLUMNS = 80
-MOST_ROWS = 34
+DRAWING_COLUMNS = 80
+DRAWING_ROWS = 34
 """Of the map; with more of them it does not fit on a screen together with its legend."""
 CELL_ASPECT = 2.0
 """Height of a character over its width, in usual terminals."""
@@ -40,9 +40,9 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     corridors = _corridors(fleet)
     low, high = _bounds(corridors)
     width_m, height_m = high[0] - low[0], high[1] - low[1]
-    cell_m = max(width_m / COLUMNS, height_m / (MOST_ROWS * CELL_ASPECT))
-    columns = min(COLUMNS, math.ceil(width_m / cell_m))
-    rows = min(MOST_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
+    cell_m = max(width_m / DRAWING_COLUMNS, height_m / (DRAWING_ROWS * CELL_ASPECT))
+    columns = min(DRAWING_COLUMNS, math.ceil(width_m / cell_m))
+    rows = min(DRAWING_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
     cells = [
         [
             _cell(
@@ -65,7 +65,7 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     lines = ["".join(row).rstrip() for row in cells]
     lines += [f"{width_m:.1f} by {height_m:.1f} m; x to the right, y up", ""]
     for line in _legend(fleet, corridors, groups):
-        lines += textwrap.wrap(line, COLUMNS, subsequent_indent="   ", drop_whitespace=True)
+        lines += textwrap.wrap(line, DRAWING_COLUMNS, subsequent_indent="   ", drop_whitespace=True)
     return "\n".join(lines)
 
 

@@ -17,7 +17,7 @@ from perchctl.mission import Operator
 PARENT_SILENCE_S = 1.0
 """Without a message for so long, the parent hangs and the vehicle lands. Longer, and nobody can
 stop it for longer; shorter, and a busy computer ends flights."""
-LONGEST_STEP_S = 0.25
+LONGEST_WATCH_STEP_S = 0.25
 """What one reading of the word may add to the parent's silence. A process that was itself suspended
 finds messages waiting once it runs again, but has not taken them in yet. Longer, and its own pause
 passes for the parent's; shorter, and a parent's silence is noticed late on a busy computer."""
@@ -61,7 +61,7 @@ class ParentSwitch(OperatorSwitch):
             if self._heard or before_s is None:
                 self._heard, self._silent_s = False, 0.0
             else:
-                self._silent_s += min(now_s - before_s, LONGEST_STEP_S)
+                self._silent_s += min(now_s - before_s, LONGEST_WATCH_STEP_S)
             self._read_s = now_s
             is_silent = self._silent_s > PARENT_SILENCE_S
         if is_silent:

@@ -18,11 +18,11 @@ from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
 from perchctl.link.hub_driver import HubReport
 from perchctl.link.protocol import check_uri, vehicle_uri
 
-START_TIMEOUT_S = 20.0
+HUB_START_TIMEOUT_S = 20.0
 """Longest wait for a hub to start and open its dongle, s: loading takes 1 s on an idle computer,
 and each of a dongle's settings at most 1 s. Longer: a hub that hangs is noticed later. Shorter: a
 busy computer fails to start."""
-END_TIMEOUT_S = 5.0
+HUB_END_TIMEOUT_S = 5.0
 """Longest wait for a hub to end, s, after which it is killed. Longer: a hub that hangs delays the
 end. Shorter: its dongle may stay claimed until the system has cleaned up."""
 SILENT_S = 1.0
@@ -52,9 +52,9 @@ class RadioHub:
         self._heard_s = time.monotonic()
         self.reports: dict[str, HubReport] = {}
         try:
-            self._channel.receive(START_TIMEOUT_S)
+            self._channel.receive(HUB_START_TIMEOUT_S)
             self._channel.send(list(uris))
-            answer = self._channel.receive(START_TIMEOUT_S)
+            answer = self._channel.receive(HUB_START_TIMEOUT_S)
             if isinstance(answer, PerchError):
                 raise answer
             self.uris: dict[str, str] = answer
@@ -99,7 +99,7 @@ class RadioHub:
         if self._child.poll() is None:
             with contextlib.suppress(OSError):
                 self._child.terminate()
-            wait_or_kill(self._child, END_TIMEOUT_S)
+            wait_or_kill(self._child, HUB_END_TIMEOUT_S)
         self._output.close()
 
     def __enter__(self) -> RadioHub:

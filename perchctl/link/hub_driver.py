@@ -58,7 +58,7 @@ SIGN_OF_LIFE_S = 1.0
 """Time between two requests of an open link, s, by which the hub knows that the flight is there. If
 the hub's process is gone, the system refuses them: that is noticed even if nothing is sent. Longer:
 noticed later. Shorter: more packets."""
-STOP_PERIOD_S = 0.2
+HUB_STOP_PERIOD_S = 0.2
 """Longest time until the driver's thread notices that it is closed, or that a sign of life is due,
 s. Longer: its socket is freed later. Shorter: it wakes up more often in vain."""
 HUB_ENDED = "the radio hub of this vehicle has ended"
@@ -224,7 +224,7 @@ class HubDriver:
         assert self._socket is not None
         asked_s = time.monotonic()
         with self._socket as wire:
-            wire.settimeout(STOP_PERIOD_S)
+            wire.settimeout(HUB_STOP_PERIOD_S)
             while not self._closed.is_set():
                 try:
                     if time.monotonic() - asked_s > SIGN_OF_LIFE_S:

@@ -74,7 +74,7 @@ LINGER_S = 5.0
 """Time without a word of a flight after which a hub without parent ends, s; an open link speaks at
 least once a second. Longer: the dongle stays claimed after a crash. Shorter: a flight on a busy
 computer loses its radio while it lands."""
-MOST_WAITING = 64
+MOST_QUEUED_PACKETS = 64
 """Largest number of a flight's packets that wait for the radio; then the oldest is dropped. A
 flight waits after each, but cflib's own requests do not. Larger: more packets are out of date.
 Smaller: such requests get lost."""
@@ -105,7 +105,7 @@ class Carrier:
         self._offered = 0  # packets of the present driver
         self._quality: float | None = None
         self._limit: int | None = None
-        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[bytes] = deque(maxlen=MOST_QUEUED_PACKETS)
         self._flight: tuple[str, int] | None = None
         self._closed = threading.Event()
 

@@ -35,7 +35,7 @@ WIDTH = 0.0767
 """Half-width for each distance. Larger: a wider jet."""
 SHAPE = 0.414
 """With it the speed falls to half at the half-width."""
-NEAREST_M = 0.25
+JET_BEGINS_M = 0.25
 """The jet is measured from here on; nearer, the speed of here counts. Smaller: faster air than
 anyone measured."""
 AXIS_FACTOR = 1.5
@@ -55,7 +55,7 @@ def jet_mps(thrust_n: float, below_m: float, aside_m: float) -> float:
     if below_m <= 0.0 or thrust_n <= 0.0:
         return 0.0
     rotors_m2 = 8.0 * AIR_DENSITY_KGPM3 * math.pi * ROTOR_RADIUS_M**2
-    distance = max(below_m, NEAREST_M) / MOTOR_DISTANCE_M + ORIGIN
+    distance = max(below_m, JET_BEGINS_M) / MOTOR_DISTANCE_M + ORIGIN
     half_width_m = WIDTH * MOTOR_DISTANCE_M * distance
     profile = (1.0 + SHAPE * (aside_m / half_width_m) ** 2) ** -2
     return math.sqrt(thrust_n / rotors_m2) * DECAY / distance * profile

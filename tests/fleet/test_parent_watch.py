@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from perchctl.fleet.messages import BEAT_S, Order
-from perchctl.fleet.parent_watch import LONGEST_STEP_S, PARENT_SILENCE_S, ParentSwitch
+from perchctl.fleet.parent_watch import LONGEST_WATCH_STEP_S, PARENT_SILENCE_S, ParentSwitch
 from perchctl.mission import Operator
 
 READ_S = 0.02
@@ -81,10 +81,10 @@ def test_its_own_pause_is_not_the_parents_silence() -> None:
 def test_a_slow_loop_notices_a_silent_parent_too() -> None:
     """The link's watchdog reads 20 times a second while the loop hangs."""
     switch, clock = listening()
-    assert readings(switch, clock, 2 * PARENT_SILENCE_S, every_s=2 * LONGEST_STEP_S) is (
+    assert readings(switch, clock, 2 * PARENT_SILENCE_S, every_s=2 * LONGEST_WATCH_STEP_S) is (
         Operator.NONE
     )
-    assert readings(switch, clock, 2 * LONGEST_STEP_S, every_s=0.05) is Operator.LAND
+    assert readings(switch, clock, 2 * LONGEST_WATCH_STEP_S, every_s=0.05) is Operator.LAND
 
 
 @pytest.mark.parametrize("word", [Operator.LAND, Operator.STOP])

@@ -31,7 +31,7 @@ SPIN_UP_S = 2.0
 LANDED_S = 3.0
 TILT_ACC_G, TILT_S = 0.5, 1.0
 UPSIDE_DOWN_ACC_G, UPSIDE_DOWN_S = -0.2, 0.1
-FREE_FALL_G = 0.1
+SUPERVISOR_FREE_FALL_G = 0.1
 _TICK_S = 1e-6  # ages are compared on a 2 ms grid
 
 
@@ -187,7 +187,7 @@ class Supervisor:
             self.armed = self._arms_itself and self.state is State.CHECKS_PASSED
 
     def _check_tumbled(self, t_s: float, acc_g: tuple[float, float, float]) -> bool:
-        if max(abs(a) for a in acc_g) < FREE_FALL_G:
+        if max(abs(a) for a in acc_g) < SUPERVISOR_FREE_FALL_G:
             self._tumble_s = None
         if acc_g[2] >= TILT_ACC_G:
             self._tumble_s = None

@@ -57,7 +57,7 @@ _GOOD_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
 _SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_CUT_GAIN = 0.9, 20.0
 _MIN_SHOWN_FRACTION = 0.75  # share of the edge points in view
-_MAX_RESIDUAL_PX = 1.2
+_MAX_CUT_RESIDUAL_PX = 1.2
 _MAX_CENTRE_SIGMA = 0.04  # of the centre, in half sides
 _MIN_CORNER_SIGMA_PX = 0.02
 _MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
@@ -193,7 +193,7 @@ def _is_reliable(found: PoseFit) -> bool:
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.points_shown >= _MIN_SHOWN_FRACTION * found.points_in_view
-        and found.residual_px < _MAX_RESIDUAL_PX
+        and found.residual_px < _MAX_CUT_RESIDUAL_PX
         and spread < _MAX_CENTRE_SIGMA
     )
 
