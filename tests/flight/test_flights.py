@@ -150,7 +150,7 @@ long = pytest.mark.long
     pytest.param({}, {"camera_burst": (FAULT_S, 9999)}, Outcome.SAFETY, 52, "no picture",
                  ["ALIGN", ..., "LANDING", "LANDED"], id="camera gone"),
     # The same bytes again and again are no measurement, though they show the target.
-    pytest.param({}, {"camera_freeze_at_s": FAULT_S}, Outcome.SAFETY, 52, "stands still",
+    pytest.param({}, {"camera_freeze_at_s": FAULT_S}, Outcome.SAFETY, 52, "the picture is frozen",
                  ["ALIGN", ..., "LANDING", "LANDED"], marks=long, id="camera frozen"),
     pytest.param(LOW, {"battery_rest_v": 3.3}, Outcome.SAFETY, 52, "battery",
                  ["LANDING", "LANDED"], marks=long, id="battery nearly empty"),

@@ -197,7 +197,7 @@ IN_TIME_LIKEWISE: list[tuple[dict[str, Any], str]] = [
     ({"velocity_variance_m2ps2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
     ({"velocity_variance_m2ps2": None}, r"settle .the vehicle reports no variance of its velocity"),
     ({"height_variance_m2": None}, r"no variance of its height: .*link\.unreported: \[variance\]"),
-    ({"variance_behind_s": math.nan}, "its variances are nan s old"),
+    ({"variance_behind_s": math.nan}, "the variances are nan s old"),
     ({"battery_v": 0.0}, "no battery voltage"),
     ({"battery_behind_s": 3.0}, r"the battery voltage is 3\.0 s old"),
     ({"battery_behind_s": math.inf}, r"the battery voltage is inf s old"),
