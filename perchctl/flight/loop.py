@@ -202,7 +202,8 @@ def _wait_until_ready(
         _end_on_word(parts.operator(), arming)  # given in this turn, it counts before the request
         if not waiting and newest is not None:
             _refuse_lost_view(parts, inputs, newest)
-        if not parts.may_take_off(waiting) and not waiting:
+        is_held = not parts.may_take_off(waiting) and not waiting
+        if is_held:
             # Whoever may wait for minutes is later given the usual time again for each check.
             waiting, started_s = PERMISSION, now_s
         arming.note_waiting(waiting, now_s, parts.clock.now())
@@ -214,7 +215,7 @@ def _wait_until_ready(
                 parts.link.send(request)
                 watchers.sent(SentCommand(now_s, "preflight", request))
         # A target that is the positioning system must go on being sent as the position.
-        slow = waiting is PERMISSION and inputs.target_positioning is None
+        slow = is_held and inputs.target_positioning is None
         period_s = PERMISSION_PERIOD_S if slow else 1.0 / parts.profile.link.loop_hz
         parts.clock.wait_until(now_s + period_s)
 
