@@ -103,7 +103,7 @@ def check(
 def fly(
     file: FleetArgument = None,
     seed: Annotated[
-        int, typer.Option("--seed", help="Seed of the simulated fleet.")
+        int, typer.Option("--seed", min=0, help="Seed of the simulated fleet.")
     ] = FlyOptions.seed,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight's own folder.")

@@ -61,6 +61,14 @@ def test_one_bad_uri_of_many_is_one_sentence(clash: Path) -> None:
     assert done.complaint.startswith(f"{clash}: vehicle east: 'radio://x' is not the URI of a")
 
 
+@pytest.mark.parametrize("subcommand", ["fly", "simulate"])
+def test_a_negative_seed_is_the_users_and_no_vehicles(subcommand: str) -> None:
+    done = run("fleet", subcommand, "--seed", "-1")
+    assert done.code == 2
+    assert "--seed" in done.stderr
+    assert "-32" not in done.stderr
+
+
 def test_convert_writes_a_file_that_says_what_it_lacks(tmp_path: Path) -> None:
     listed, written = tmp_path / "lab.yaml", tmp_path / "fleet.yaml"
     listed.write_text("units: [{name: CF-01, uri: 'radio:///80/2M/E7E7E7E701'}]\n")
