@@ -68,7 +68,7 @@ def half_size_search(file: Path) -> None:
     """The window in the picture, and the same at half size."""
     view = _view("Half-size search")
     figure, whole, half = _panels(view, width_ratios=(2.0, 1.0))
-    rows, columns = search_window(view.prior.both, SETUP.ratio, view.image.shape) or _WHOLE
+    rows, columns = search_window(view.prior.expected_both, SETUP.ratio, view.image.shape) or _WHOLE
     half.clear()
     reduced = cv2.resize(
         view.image[rows, columns], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
@@ -77,7 +77,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_half_size(view.picture, view.prior.both)
+    searched = search_half_size(view.picture, view.prior.expected_both)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25
@@ -113,7 +113,7 @@ def cut_view_fit(file: Path) -> None:
     start = RigidPose(np.asarray(R) @ np.diag([1.0, -1.0, -1.0]), t)
     fit = fit_pose(view.image, start, outline, CAMERA)
     assert fit is not None
-    X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ fit.pose.R.T + fit.pose.t
+    X = np.column_stack([outline.points, np.zeros(len(outline.points))]) @ fit.pose.R.T + fit.pose.t
     x = X[:, :2] / X[:, 2:]
     at = distort(x[np.hypot(*x.T) < make_lattice(CAMERA).reach], CAMERA)
     _dots(whole, near, at[((at > 0.0) & (at < (639.0, 479.0))).all(axis=1)], "edge of the drawing")
@@ -144,7 +144,7 @@ def _view(method: str) -> View:
 
 
 def _expected(view: View) -> Array:
-    return view.prior.both[view.marker]
+    return view.prior.expected_both[view.marker]
 
 
 def _found(view: View) -> Array:
