@@ -162,8 +162,8 @@ def _estimate_period_s(periods_s: tuple[float, ...]) -> float:
 
 
 def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    if state.last_woven_s is not None:
-        gap_s = frame.t_s - state.last_woven_s
+    if state.last_frame_s is not None:
+        gap_s = frame.t_s - state.last_frame_s
         if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
             return (*state.periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
     return state.periods_s
@@ -171,7 +171,7 @@ def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
     before, order_votes, is_top_first = state.previous, state.order_votes, state.is_top_first
-    near = state.last_woven_s is not None and 0.0 < frame.t_s - state.last_woven_s < _MAX_GAP_S
+    near = state.last_frame_s is not None and 0.0 < frame.t_s - state.last_frame_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
         rows = (len(before) - 2) // 2 * 2
         tops = [image[0:rows:2] for image in (before, frame.image)]
@@ -191,7 +191,7 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         is_top_first = not is_top_first
     return replace(
         state,
-        last_woven_s=frame.t_s,
+        last_frame_s=frame.t_s,
         order_votes=order_votes,
         is_top_first=is_top_first,
         previous=frame.image,

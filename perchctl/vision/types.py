@@ -385,15 +385,15 @@ class MeasuredMarkers:
 class FieldState:
     """State of the detection of interlacing in a stream: `kind` of the last examined frame,
     `skipped` frames ago; whether the top field is first, None until the `order_votes` decide; the
-    last periods of the frames; the time `last_woven_s` and the picture of the `previous` woven
-    frame."""
+    last periods of the frames; the time of the last frame; and the picture of the `previous` frame,
+    unless that was whole."""
 
     kind: PictureKind | None = None
     skipped: int = 0
     order_votes: float = 0.0
     is_top_first: bool | None = None
     periods_s: tuple[float, ...] = ()
-    last_woven_s: float | None = None
+    last_frame_s: float | None = None
     previous: NDArray[np.uint8] | None = None
 
 
