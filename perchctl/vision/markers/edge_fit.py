@@ -559,7 +559,9 @@ def find_neighbour_edges(
 _SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
-_MAX_VARIANCE_FRACTION, _MIN_SECOND_MOMENT, _MAX_FIRST_MOMENT = 0.9, 0.01, 0.8
+_MAX_NEIGHBOUR_FRACTION = 0.9  # share of the gradient that neighbouring edges may cause
+# second moment of an edge: px^2, and in units of the window's variance
+_MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
 _WINDOW_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_SCALE = 3.5 * 1.4826
@@ -673,7 +675,7 @@ class _Profiles:
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
-        share = np.minimum(self.both * lost[:, None], _MAX_VARIANCE_FRACTION)
+        share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_FRACTION)
         total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
@@ -681,7 +683,9 @@ class _Profiles:
         second = mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
         moment = (second * usable).dot(_ONES32)
         moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
-        moment = np.minimum(np.maximum(moment, _MIN_SECOND_MOMENT), _MAX_FIRST_MOMENT * w2)
+        moment = np.minimum(
+            np.maximum(moment, _MIN_SECOND_MOMENT_PX2), _MAX_SECOND_MOMENT_RATIO * w2
+        )
         found2 = moment * w2 / (w2 - moment)
         # Undo the pull of the window on the centroid.
         centroid = first / total * (1.0 + found2 / w2)[:, None]
