@@ -330,10 +330,10 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     common = gain.dot(points.shift)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
-    is_curled, twisted = gain.dot(curl).T
+    curled, twisted = gain.dot(curl).T
     if weight is not None:
         cov += np.multiply.outer(twisted, twisted)
-    return cov, chi2 / freedom, is_curled
+    return cov, chi2 / freedom, curled
 
 
 def _whiten_curl(points: WeightedCorners, scored: ScoredPose) -> Array:

@@ -122,13 +122,13 @@ def track_measurement(
     setup: PoseSetup,
 ) -> Measurement:
     """Return a pose as a measurement for the filter, in the world or the level frame."""
-    z, body_to_target_m = np.empty(4), pose.e_m
+    z, lever_m = np.empty(4), pose.e_m  # an error of the tilt turns the lever
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
         assert attitude is not None
-        body_to_target_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
+        lever_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
-        z[1:] = attitude.R_world_level.dot(body_to_target_m) + attitude.position_m
+        z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
     if constants.process is None or pose.cov is None:
         return Measurement(z)
     noise = pose.cov.copy()
@@ -136,7 +136,7 @@ def track_measurement(
     bias = np.zeros((4, 4))
     bias[1:, PRINT] = pose.print_shift_m
     if attitude is not None:
-        bias[1:, TILTS] = tilt_jacobian(body_to_target_m) * constants.tilt_sigma_rad
+        bias[1:, TILTS] = tilt_jacobian(lever_m) * constants.tilt_sigma_rad
     if in_world and attitude is not None:
         turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level

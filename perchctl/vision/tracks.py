@@ -112,8 +112,8 @@ def update_tracks(
         return TrackedFrame(measured, tracks, verdict)
     lock, rival = drop_expired(state.lock, verdict.rival, t_s)
     if sight is not None and verdict.accepted and tracks:
-        most_certain_pose = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
-        lock = update_lock(lock, most_certain_pose, sight, verdict)
+        most_certain = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
+        lock = update_lock(lock, most_certain, sight, verdict)
     return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 

@@ -105,14 +105,8 @@ def _rank_quads(
     for name in MARKERS:
         like = np.array([correlate_pattern(image, quad, patterns[name]) for quad in quads])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_START_CORRELATION):
-            blur_guess_index = int(like[i].argmax())
-            found.append(
-                (
-                    float(like[i, blur_guess_index]),
-                    name,
-                    np.roll(quads[i], blur_guess_index, axis=0),
-                )
-            )
+            roll = int(like[i].argmax())
+            found.append((float(like[i, roll]), name, np.roll(quads[i], roll, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
         middle, room_px = (
@@ -246,7 +240,7 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool
 
 def is_distinctive(found: Alignment) -> bool:
     """True if any other codeword would look different. All of 36 other markers that `is_verified`
-    accepted had a flip above 0.5."""
+    accepted had a `wrong_bit_degree` above 0.5."""
     return (
         found.wrong_bit_degree < _MAX_WRONG_BIT_DEGREE
         and found.wrong_bit_sigma < _MAX_WRONG_BIT_SIGMA

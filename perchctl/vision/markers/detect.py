@@ -210,8 +210,8 @@ def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFind
 
 
 def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    has_turn = prior.search_mode not in ("sharp", "window")
-    return not found.corners and has_turn and picture.setup.fits_lines
+    allowed = prior.search_mode not in ("sharp", "window")
+    return not found.corners and allowed and picture.setup.fits_lines
 
 
 def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
@@ -675,7 +675,7 @@ _MAX_FIELD_MOTION_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 def average_fields(first: Detections, second: Detections) -> Detections:
     """Return the mean of both fields' corners, valid for either order of the fields. If one marker
     is in both fields, a marker in only one field is omitted."""
-    expected_both: dict[MarkerName, Detection] = {}
+    averaged: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)
         if one is None or other is None:
@@ -684,13 +684,11 @@ def average_fields(first: Detections, second: Detections) -> Detections:
         if float(np.linalg.norm(offset_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(
             one.corners_px
         ):
-            expected_both[name] = _average_detections(one, other)
-    if not expected_both:
+            averaged[name] = _average_detections(one, other)
+    if not averaged:
         alone = first if first.markers else second
         return replace(alone, mirrored=alone.mirrored or second.mirrored)
-    return replace(
-        first, large=expected_both.get("large"), small=expected_both.get("small"), mirrored=False
-    )
+    return replace(first, large=averaged.get("large"), small=averaged.get("small"), mirrored=False)
 
 
 def _average_detections(a: Detection, b: Detection) -> Detection:

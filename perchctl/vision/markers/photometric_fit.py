@@ -53,8 +53,8 @@ _MAX_GRID_NODES, _MIN_GRID_NODES = 44, 18
 _NODE_SPACING_PX = 0.8  # picture pixels between nodes
 _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
-"""Number of rounds after which the fit fails unless its likeness reaches `_MIN_EARLY_CORRELATION`.
-The likeness of a marker is above 0.9 after two rounds."""
+"""Number of rounds after which the fit fails unless its correlation reaches
+`_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two rounds."""
 _CONVERGED_STEP_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
 _MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
 _MAX_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
@@ -162,10 +162,10 @@ def align_drawing(
     def drawn(blur_px: float) -> RenderedDrawing:
         return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_STEP))
 
-    def max_motion_px(blur_px: float) -> float:
+    def limit_blur_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
 
-    seen = drawn(max_motion_px(blur_px))
+    seen = drawn(limit_blur_px(blur_px))
     offset_px, since_lens_px, total = lens_px - first, 0.0, np.zeros(8)
     for k in range(_MAX_ITERATIONS):
         if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
@@ -189,7 +189,7 @@ def align_drawing(
         sigma2 = seen.sigma**2
         most = max(1.0, _MAX_BLUR_STEP * sigma2)
         squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
-        wanted_px = max_motion_px(math.sqrt(max(squared, 1e-3)) * node_px)
+        wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = seen.sigma * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
             seen = drawn(wanted_px)
