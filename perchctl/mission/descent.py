@@ -341,11 +341,11 @@ def make_onboard_landing(
     above the vehicle: the motors stop at the end of the trajectory.
     """
     drifted_m = min(MAX_HEIGHT_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
-    axis_intersection_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
+    goal_z_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(
-        axis_intersection_m,
+        goal_z_m,
         ONBOARD_LANDING_MARGIN_S
-        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - axis_intersection_m) / ONBOARD_LANDING_MEAN_MPS,
+        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - goal_z_m) / ONBOARD_LANDING_MEAN_MPS,
     )
 
 

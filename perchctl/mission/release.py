@@ -127,10 +127,9 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
         b = replace(b, contact_z_m=z_m if b.contact_z_m is None else b.contact_z_m)
         state = replace(state, released_s=released_s, belief=b)
     hung_s = c.held_s(FULL_WEIGHT_HANGS)
-    last_thrust_mismatch_s = (
-        UNCONFIRMED_THRUST_EXTRA_S if b.last_thrust_mismatch_s >= c.t_s - hung_s else 0.0
-    )
-    if hung_s >= complete.hang_s + last_thrust_mismatch_s:
+    unconfirmed = b.last_thrust_mismatch_s >= c.t_s - hung_s
+    extra_s = UNCONFIRMED_THRUST_EXTRA_S if unconfirmed else 0.0
+    if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
     part = min(1.0, (c.t_s - released_s) / complete.ramp_s)
     start = c.planner.perch.thrust if state.setpoint is None else MIN_POSITION_MODE_THRUST
@@ -193,9 +192,9 @@ def catch_slip(c: Context) -> Action | None:
 def _braking_setpoint_m(c: Context) -> tuple[float, float]:
     """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
     tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
-    imu_only_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
+    missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
-        max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps)) for mps in imu_only_mps
+        max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps)) for mps in missing_mps
     )
     x_m, y_m, _ = tel.position_m
     return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S

@@ -35,7 +35,7 @@ def is_aligned(c: Context) -> bool:
     return c.held_s(ALIGNED) >= c.planner.align.dwell_s
 
 
-def should_wait_for_charge(c: Context) -> bool:
+def is_charge_too_low_to_begin(c: Context) -> bool:
     """True if an attempt or a retry is about to begin and the battery has too little charge for
     it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
@@ -67,7 +67,7 @@ ALIGN = PhaseDefinition(
         land_row(
             "too-little-left",
             {Phase.ALIGN, Phase.RECOVER},
-            should_wait_for_charge,
+            is_charge_too_low_to_begin,
             battery_shortfall_text,
         ),
         Transition(
