@@ -5,15 +5,16 @@ The firmware flies to a setpoint p with a cascade of PID controllers. On top of 
 reference r, the vehicle's position x (height z), its velocity v, and the acceleration a that it
 leans into:
 
-    p = r + integral + near * limit(LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
-                                    - LEAN_DAMPING_S2 a)                                   lateral
-    p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                         vertical
+    p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
+                                     - LEAN_DAMPING_S2 a))                                 lateral
+    p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                        vertical
 
-The integral removes the offset that a steady wind leaves; `near` grows from 0 to 1 as the target
-comes closer. The lateral correction is state feedback on the whole chain from setpoint to position:
-a setpoint acts through the attitude, so the lean of now is the velocity of a tenth of a second
-later. With it, the gains can be higher without oscillation. They hold for prompt telemetry; the
-feedback fades out as it ages, and the onboard controllers, which know no delay, are left alone.
+The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
+on the whole chain from setpoint to position: a setpoint acts through the attitude, so the present
+lean becomes velocity a tenth of a second later. Feedback of the lean permits higher gains without
+oscillation, but only while the telemetry is prompt. So `gain` is the smaller of two factors: one
+grows from 0 to 1 as the target comes closer, and one falls from 1 to 0 as the telemetry ages. At 0,
+the vehicle is left to its onboard controllers, which act without that delay.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ LEAN_DAMPING_S2 = 0.08
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
 MAX_FULL_FEEDBACK_AGE_S = 0.06
-"""Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: the vehicle
-oscillates by late telemetry. Smaller: telemetry at 25 Hz weakens the feedback."""
+"""Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: late
+telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
 MAX_FEEDBACK_AGE_S = 0.16
 """Age of the telemetry from which the onboard controllers are left alone, s."""
 LATERAL_FEEDBACK_START_M = 0.8
@@ -136,10 +137,10 @@ def fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Act
 
 
 def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
-    """Move under the target at height `z_m`, and learn the trim that keeps the gear there."""
+    """Move under the target at height `z_m`, and learn the integral that keeps the gear there."""
     goal = setpoint_under_target(c, z_m)
-    trim = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
-    c = Context(replace(c.state, integral_m=trim))
+    integral_m = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
+    c = Context(replace(c.state, integral_m=integral_m))
     old = c.state.setpoint or hold_here(c)
     return fly_to(c, step_towards(c, old, goal, up_mps=up_mps, is_cautious=True))
 
@@ -148,7 +149,7 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
     """Return the integral (x, y) of the position error to `goal_xy`, m, world axes, which removes
     the offset that a steady wind leaves.
 
-    The integral is limit_vector, and frozen while the vehicle is still on its way: a large error
+    The integral is limited, and frozen while the vehicle is still on its way: a large error
     accumulates, and the integral may become large, only while the vehicle hovers in place.
     """
     planner = c.planner
@@ -208,8 +209,8 @@ def correct_setpoint(
 
 
 def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Return the lateral feedback on top of the onboard controllers, near the target only and by
-    prompt telemetry only."""
+    """Return the lateral feedback on top of the onboard controllers; zero far from the target or
+    with old telemetry."""
     near = (LATERAL_FEEDBACK_START_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_RANGE_M
     prompt = (MAX_FEEDBACK_AGE_S - c.belief.attitude_age_s) / (
         MAX_FEEDBACK_AGE_S - MAX_FULL_FEEDBACK_AGE_S

@@ -97,7 +97,7 @@ class Belief:
     #: vehicle's velocity from pictures alone
     target_motion: TargetMotion = field(default_factory=TargetMotion)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
-    #: level part of the thrust's direction, world axes: mean over `LEAN_TIME_CONSTANT_S`
+    #: low-passed `lean`, with the time constant `LEAN_TIME_CONSTANT_S`
     mean_lean: tuple[float, float] = (0.0, 0.0)
     contact_z_m: float | None = None  #: height of the body where the magnet may hold it
     contact: ContactOffset | None = None  #: offset at the last contact
@@ -341,9 +341,9 @@ class Belief:
     @cached_property
     def lean_acceleration_mps2(self) -> tuple[float, float]:
         """Lateral acceleration (x, y) in world axes, m/s^2, of a hovering vehicle that leans away
-        from its mean lean. The mean balances wind, an unbalanced vehicle and an error of the
-        estimated attitude, and accelerates nothing; a change of the wind is wrong by as much until
-        the mean has followed."""
+        from its mean lean. The mean lean causes no acceleration: it balances the wind, an
+        unbalanced vehicle, or an error of the estimated attitude. After a change of the wind, the
+        result is wrong until the mean has followed."""
         (x, y), (mean_x, mean_y) = self.lean, self.mean_lean
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 

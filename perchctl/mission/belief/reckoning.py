@@ -3,9 +3,9 @@
 While positions correct the state estimate, the reckoned velocity v is drawn to the estimated
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
-    v += (dv_imu - b dt)                          each sample
-    v += (e - v) dt / VELOCITY_TIME_CONSTANT_S              while e is believed
-    b += (dv_imu - de - b dt) / BIAS_TIME_CONSTANT_S     while e is believed
+    v += (dv_imu - b dt)                                each sample
+    v += (e - v) dt / VELOCITY_TIME_CONSTANT_S          while e is believed
+    b += (dv_imu - de - b dt) / BIAS_TIME_CONSTANT_S    while e is believed
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
@@ -128,7 +128,7 @@ class DeadReckoning:
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
     mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
-    position_control_s: float = 0.0  # total time in the open under position control
+    position_control_s: float = 0.0  # total time in free air under position control
 
 
 def advance_reckoning(
@@ -283,7 +283,7 @@ def _integrate_sample(
 
 def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> DeadReckoning:
     """Return the reckoning with the bias of the estimated velocity learned from two samples, during
-    a flight in the open under position control.
+    a flight in free air under position control.
 
     In a steady wind, the firmware takes the drag of the air for a tilt, and its estimate reads up
     to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the

@@ -62,8 +62,8 @@ MAX_TARGET_SUPPORT_DISTANCE_M = 0.3
 REST_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
 MAX_SAMPLE_WEIGHT_S = 0.1
-"""Largest weight of one sample in the hover-thrust filter, s. Larger: after a gap, a single sample
-has the weight of many."""
+"""Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
+single sample has the weight of many."""
 MAX_THRUST_MISMATCH_FRACTION = 0.12
 """Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
 KEEPALIVE_THRUST = 1000
@@ -116,7 +116,7 @@ def start_dead_reckoning(b: Belief) -> Belief:
 
 def reset_evidence(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: all conditions restart, except for those that
-    last."""
+    are independent of the phase."""
     return replace(b, since=keep_independent(b.since))
 
 
@@ -233,7 +233,7 @@ def _update_dead_reckoning(b: Belief) -> Belief:
 
 
 def _integrate_reckoning(b: Belief) -> DeadReckoning:
-    """Integrate accelerometer and estimate, and learn biases from positions in the open."""
+    """Integrate accelerometer and estimate, and learn biases from positions in free air."""
     obs, source = b.obs, b.profile.positioning.source
     believed = (
         b.is_position_valid

@@ -23,9 +23,9 @@ far ahead of a weak vehicle."""
 MIN_CLIMB_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
 MAX_TARGET_LOST_S = 1.5
-"""Time since the last sighting of the target after which an ascent is given up, s, while a
-positioning system keeps the vehicle in its place meanwhile. Larger: a target that has moved, or is
-covered, is waited for. Smaller: a burst of lost pictures ends an attempt that would succeed."""
+"""Time since the last sighting of the target after which an ascent is given up, s, if a positioning
+system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that has moved
+or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
 
 
 def cone_radius_m(c: Context) -> float:

@@ -39,8 +39,8 @@ radius. Smaller: a covered marker ends attempts that would succeed."""
 def act(c: Context) -> Action:
     """Raise the setpoint through the target while x, y and heading keep following it.
 
-    The learned trim is frozen and the height correction is off (`lift=False`) because both would
-    wind up against the ceiling. In raw mode, order the thrust instead.
+    The learned integral is frozen and the height correction is off (`lift=False`) because both
+    would wind up against the ceiling. In raw mode, order the thrust instead.
     """
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":
