@@ -54,13 +54,16 @@ class _Given:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = delay_s
         self._pictures = _readable(pictures)
+        self._name: str | None = None  # of the flown source, once it has ended
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = TurnInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
 
     def turn(self, turn: Turn) -> None:
-        taken = turn.taken
+        taken, obs = turn.taken, turn.observation
         self._taken, self._samples = taken, [taken.samples, taken.late]
+        if self._name is None and obs is not None and taken.ended:
+            self._name = _ended_name(taken, obs)
 
     # As a link.
 
@@ -89,7 +92,7 @@ class _Given:
         return self._taken.problem
 
     def describe(self) -> str:
-        return "the recording"
+        return self._name or "the recording"
 
     def close(self) -> None:
         return None
@@ -124,16 +127,6 @@ class _Given:
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 
-class _ReplayedSenses(FlightInputs):
-    """The inputs of a replay. Once the recording is over, the camera's problem names the flown
-    source, whose name no other record has: it is taken from the `recorded` observation."""
-
-    recorded: str | None = None
-
-    def ended_problem(self) -> str:
-        return self.recorded or super().ended_problem()
-
-
 def replay_inputs(
     turns: Iterable[Turn],
     profile: Profile,
@@ -148,12 +141,11 @@ def replay_inputs(
     there the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
-    inputs = _ReplayedSenses(given, given, pipeline, profile, is_logged=True)
+    inputs = FlightInputs(given, given, pipeline, profile, is_logged=True)
     with one_thread():
         for turn in turns:
             given.turn(turn)
-            taken, obs = turn.taken, turn.observation
-            inputs.recorded = None if obs is None else obs.camera_problem
+            taken = turn.taken
             inputs.poll_inputs(
                 turn.began_s,
                 search=taken.look,
@@ -163,6 +155,16 @@ def replay_inputs(
             if turn.t_s != turn.began_s:
                 inputs.catch_up(turn.began_s, turn.t_s)
             yield ReplayedInputs(turn, inputs.poses, _observed(turn, inputs))
+
+
+def _ended_name(taken: TurnInputs, obs: Observation) -> str | None:
+    """Return the flown source's name from the camera's problem after its end, which alone has it.
+    None if the problem is another one, so that the replay's differs from it."""
+    told = obs.camera_problem
+    if told is None or taken.frame is not None or taken.problem is not None:
+        return None
+    name = told.removesuffix(FlightInputs.ended_text(""))
+    return name if told == FlightInputs.ended_text(name) else None
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:

@@ -150,7 +150,7 @@ class FlightInputs:
         )
         if frame is None:
             if problem is None and self.source.finished:
-                problem = self.ended_problem()
+                problem = self.ended_text(self.source.describe())
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
@@ -180,9 +180,10 @@ class FlightInputs:
             self.camera_problem = mirrored_problem(self.profile.camera).sentence
             self.problem_kind = "mirrored"
 
-    def ended_problem(self) -> str:
-        """Return the camera's problem once a recording is over."""
-        return f"{self.source.describe()} has ended"
+    @staticmethod
+    def ended_text(name: str) -> str:
+        """Return the camera's problem once the recording `name` is over."""
+        return f"{name} has ended"
 
     @property
     def _positioning(self) -> TargetPositioning | None:

@@ -119,6 +119,24 @@ def test_a_source_that_ends_does_so_again(ended: tuple[FlightLog, list[Picture]]
     assert seen_again(log, pictures).is_identical
 
 
+@pytest.mark.parametrize("told", ["the picture is dark", "another camera has ended"])
+def test_another_problem_of_a_source_that_has_ended_is_a_difference(
+    ended: tuple[FlightLog, list[Picture]], told: str
+) -> None:
+    """Its name is taken from the log, and nothing else of its problem."""
+    log, pictures = ended
+    turns = list(log.turns)
+    obs = turns[-1].observation
+    assert obs is not None
+    turns[-1] = replace(turns[-1], observation=replace(obs, camera_problem=told))
+    other = replace(log)
+    other.__dict__["turns"] = turns
+    found = seen_again(other, pictures)
+    assert found.seen is not None
+    (differs,) = found.seen.differences
+    assert differs.field == "camera_problem"
+
+
 def test_with_another_latency_the_pictures_are_of_another_time(
     flight: tuple[FlightLog, list[Picture]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
