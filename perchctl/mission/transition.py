@@ -53,16 +53,7 @@ def motor_cut_row(
     name: str, when: Predicate, reason: str, outcome: Outcome = Outcome.SAFETY
 ) -> Transition:
     """Return a row that cuts and locks the motors at once, in any airborne phase."""
-    return Transition(
-        name,
-        AIRBORNE_PHASES,
-        when,
-        Phase.ABORTED,
-        reason,
-        Severity.STOP,
-        outcome,
-        stop=EmergencyStop(),
-    )
+    return _abort_row(name, when, reason, outcome, EmergencyStop())
 
 
 def supervisor_row(name: str, bit: int, reason: str) -> Transition:
@@ -71,6 +62,12 @@ def supervisor_row(name: str, bit: int, reason: str) -> Transition:
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(bit)
 
+    return _abort_row(name, when, reason, Outcome.SAFETY, StopMotors())
+
+
+def _abort_row(
+    name: str, when: Predicate, reason: str, outcome: Outcome, stop: EmergencyStop | StopMotors
+) -> Transition:
     return Transition(
         name,
         AIRBORNE_PHASES,
@@ -78,8 +75,8 @@ def supervisor_row(name: str, bit: int, reason: str) -> Transition:
         Phase.ABORTED,
         reason,
         Severity.STOP,
-        Outcome.SAFETY,
-        stop=StopMotors(),
+        outcome,
+        stop=stop,
     )
 
 
