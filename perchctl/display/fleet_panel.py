@@ -86,7 +86,7 @@ class FleetPanel:
                     self._draw_once()
                 self._draw_once()
         except Exception as error:
-            self.failure = f"the display fell silent: {error.__class__.__name__}: {error}"
+            self.failure = f"the display failed: {error.__class__.__name__}: {error}"
 
     def _draw_once(self) -> None:
         while self._lines:
