@@ -77,7 +77,7 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     for name, text in end.rows():
         yield from _named(name, text)
     if log.summary is None:
-        cause = "its end: the program may have been killed, or the disk have failed"
+        cause = "its end: the program may have been killed, or the disk may have failed"
         if not log.phases:
             cause = "nothing: it never took off, or the program was killed before"
         yield from _named("log lost", cause)

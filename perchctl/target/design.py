@@ -93,10 +93,10 @@ class TargetDesign:
             )
         nearest_m = self.small_nearest_m
         if nearest_m is None or nearest_m > self.standoff_m:
+            beyond = "" if nearest_m is None else f", but only beyond {_cm(nearest_m)}"
             found.append(
                 f"gap before contact: with the gear {_cm(self.standoff_m)} below the target the "
-                f"small marker is not wholly in view, which takes {_cm(nearest_m)}; mount the "
-                "camera closer to the gear"
+                f"small marker is not wholly in view{beyond}; mount the camera closer to the gear"
             )
         return tuple(found)
 

@@ -97,7 +97,7 @@ class Calibration:
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
-            text += f", but off axis {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
+            text += f", but within {aside.mm95:.2g} mm off the axis at {aside.z_m * 100:.0f} cm"
         return text
 
     def lines(self) -> list[str]:
