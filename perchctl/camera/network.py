@@ -36,6 +36,7 @@ READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _NOT_MENDED = (401, 403, 404, 410)
 """What the server answers to another attempt, too."""
+_NAME_AND_PASSWORD = "add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
 _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 
 
@@ -63,12 +64,9 @@ class MjpegSource(LiveSource):
         except HTTPError as refused:
             refused.close()
             reason = f"the server answered {refused.code} {refused.reason}"
-            if refused.code == 401:
-                reason += (
-                    ", so add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
-                )
             if refused.code in _NOT_MENDED:
-                raise NotFound(f"{self._name}: {reason}") from None
+                advice = _NAME_AND_PASSWORD if refused.code == 401 else ""
+                raise NotFound(f"{self._name}: {reason}", advice) from None
             self._connected()
             self._note(reason)
             return reason
