@@ -143,7 +143,7 @@ def _setpoint_deviation_m(c: Context) -> float:
 
 
 def divergence_reason(c: Context) -> str:
-    """Return how far positions have led the vehicle away, and the possible causes."""
+    """Return what shows that the positions are wrong, and the possible causes."""
     b = c.belief
     if _is_oscillating(c):
         return (

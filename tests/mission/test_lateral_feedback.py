@@ -143,7 +143,7 @@ def test_old_telemetry_makes_no_oscillation(age_s: float) -> None:
 
 
 def test_fluctuating_thrust_moves_the_vehicle_less_than_its_own_controller_lets_it() -> None:
-    """By half: the same disturbance on the same vehicle, with a setpoint that stands still."""
+    """By at least 40 %: the same disturbance on the same vehicle, with a constant setpoint."""
     fed, left = Hovering(0.1, 0.02), Hovering(0.1, 0.02)
     fly(ascending(), fed, 20.0, one_phase=True)
     for i in range(len(fed.path_m)):
@@ -155,7 +155,7 @@ def test_fluctuating_thrust_moves_the_vehicle_less_than_its_own_controller_lets_
 
 
 def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:
-    """It waits below the target without climbing, and backs off once 1.5 s have passed."""
+    """The vehicle waits below the target without climbing, and backs off after 1.5 s."""
 
     def look(t_s: float) -> Observation:
         sample = telemetry(t_s, Z_M)
