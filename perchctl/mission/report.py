@@ -95,8 +95,8 @@ class Findings:
         turns = zip(found.rotation_deg, found.rotation_sigma_deg, strict=True)
         if any(_is_significant(turn, ROTATION_GATE_DEG, sigma) for turn, sigma in turns):
             advice.append(
-                f"the camera is rotated by {found.turn_text} relative to the profile: measure the "
-                f"mounting with `perchctl calibrate mount`"
+                f"the camera is rotated by {found.rotation_text} relative to the profile: measure "
+                f"the mounting with `perchctl calibrate mount`"
             )
         return replace(found, advice=tuple(advice))
 
@@ -107,7 +107,7 @@ class Findings:
         return f"{self.latency_s * 1e3:.0f} +- {margin_s * 1e3:.0f} ms"
 
     @property
-    def turn_text(self) -> str:
+    def rotation_text(self) -> str:
         """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
         0.4 +- 1.8 deg``."""
         each = zip(self.rotation_deg, self.rotation_sigma_deg, strict=True)

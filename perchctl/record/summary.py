@@ -176,7 +176,7 @@ class FlightSummary:
             lines.append(("battery", f"{self.battery_min_v:.2f} V at the lowest"))
         if self.findings is not None:  # with 95 % intervals
             lines.append(("latency", self.findings.latency_text))
-            lines.append(("mounting", f"rotated by {self.findings.turn_text} (x, y, z)"))
+            lines.append(("mounting", f"rotated by {self.findings.rotation_text} (x, y, z)"))
             lines += [("advice", sentence) for sentence in self.findings.advice]
         if self.locked:
             lines.append(("vehicle", "locked by its supervisor: inspect and restart it"))
