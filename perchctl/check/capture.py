@@ -151,7 +151,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     span_s = times[-1] - times[0]
     rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
     gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
-    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
+    # `MotionCapture.poll` prefers frames with the body, so the others are frames without it.
     share = 1.0 - len(places) / len(samples.frames)
     found = (
         f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, "
