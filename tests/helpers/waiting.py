@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from typing import Any
 
 
-def until(condition: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """What `condition` returns once that is true; fails when it stays away so long."""
+def until(condition: Callable[[], Any], limit_s: float = 60.0) -> Any:
+    """What `condition` returns once that is true; fails when it stays away so long, which a busy
+    computer does not."""
     end_s, pause = time.monotonic() + limit_s, threading.Event()
     while not (value := condition()):
         assert time.monotonic() < end_s, "waited in vain"
