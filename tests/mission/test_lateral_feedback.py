@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import Observation, Phase, PlannerState
+from perchctl.mission import Observation, Operator, Phase, PlannerState
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import HANG_Z_M, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, fly
@@ -66,6 +66,37 @@ def test_a_lean_is_met_by_a_setpoint_on_its_other_side(
     later = fly(ascending(), leaning(lean_rad, towards_rad, heading_rad, math.inf), 4.0).command
     assert isinstance(later, PositionSetpoint)
     assert math.hypot(later.x_m, later.y_m) < 0.05 * math.hypot(at_once.x_m, at_once.y_m)
+
+
+@AGAIN
+@given(
+    lean_rad=st.floats(0.01, 0.03),
+    speed_mps=st.floats(0.03, 0.08),
+    towards_rad=st.floats(-3.1, 3.1),
+)
+def test_a_landing_begins_without_a_step_of_the_setpoint(
+    lean_rad: float, speed_mps: float, towards_rad: float
+) -> None:
+    """A landing feeds nothing back; what the ascent gave last stays in the integral."""
+    stands = leaning(lean_rad, towards_rad, 0.0, math.inf)
+    velocity_mps = (speed_mps * math.cos(towards_rad), speed_mps * math.sin(towards_rad), 0.0)
+
+    def lands(t_s: float) -> Observation:
+        obs = stands(t_s)
+        operator = Operator.LAND if t_s > BEGIN_S + 1.5 * TICK_S else Operator.NONE
+        moves = replace(obs.telemetry, velocity_mps=velocity_mps)
+        return replace(obs, telemetry=moves, operator=operator)
+
+    before, after = fly(ascending(), lands, 2 * TICK_S).ticks
+    assert (before.state.phase, after.state.phase) == (Phase.ASCEND, Phase.LANDING)
+    assert isinstance(before.command, PositionSetpoint)
+    assert isinstance(after.command, PositionSetpoint)
+    damped_m = math.hypot(before.command.x_m, before.command.y_m)
+    step_m = math.dist(
+        (before.command.x_m, before.command.y_m), (after.command.x_m, after.command.y_m)
+    )
+    assert damped_m > 0.03
+    assert step_m < 0.1 * damped_m
 
 
 class Hovering(Motors):
