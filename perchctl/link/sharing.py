@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import select
 import signal
@@ -24,6 +25,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -71,9 +73,14 @@ CLOSE_TIMEOUT_S = 3.0
 """Longest wait for a driver to close, s: a call of USB may take 2. Longer: a dongle that hangs is
 opened anew later. Shorter: it is opened while the old driver still uses it."""
 LINGER_S = 5.0
-"""Time without a word of a flight after which a hub without parent ends, s; an open link speaks at
-least once a second. Longer: the dongle stays claimed after a crash. Shorter: a flight on a busy
-computer loses its radio while it lands."""
+"""Time without a word of a flight after which it is dead, s; an open link speaks at least once a
+second. Its packets are dropped then, and a hub without parent and flights ends. Longer: a vehicle
+that was out of reach obeys an older order, and the dongle stays claimed after a crash. Shorter: a
+flight on a busy computer loses its radio while it lands."""
+FAREWELL_S = 0.5
+"""Time for which a flight's last packets still go out after it has closed its link, s. Longer: a
+vehicle that was out of reach obeys an older order. Shorter: a landing that is sent just before the
+end may get lost."""
 MOST_QUEUED_PACKETS = 64
 """Largest number of a flight's packets that wait for the radio; then the oldest is dropped. A
 flight waits after each, but cflib's own requests do not. Larger: more packets are out of date.
@@ -101,8 +108,11 @@ class Carrier:
         self.heard_s = time.monotonic()  # when the flight's last datagram came
         self.problem: str | None = None
         self.answered = self.lost = 0
-        self.refused = 0  # in a row
+        self.refused = self.missed = 0  # in a row: by the dongle, by the vehicle
+        self.has_stale_packet = False
+        """True if the driver is to be closed because a packet in it is out of date."""
         self._offered = 0  # packets of the present driver
+        self._has_carried = False  # anything of the present flight in the present driver
         self._quality: float | None = None
         self._limit: int | None = None
         self._waiting: deque[bytes] = deque(maxlen=MOST_QUEUED_PACKETS)
@@ -111,8 +121,8 @@ class Carrier:
 
     @property
     def has_flight(self) -> bool:
-        """True while a flight's link is open, as far as the hub knows."""
-        return self._flight is not None
+        """True while a flight's link is open that was heard lately."""
+        return self._flight is not None and time.monotonic() - self.heard_s < LINGER_S
 
     @property
     def lacks_safelink(self) -> bool:
@@ -127,7 +137,8 @@ class Carrier:
         from cflib.crtp.radiodriver import RadioDriver
 
         driver = RadioDriver()
-        self._offered = self.refused = 0
+        self._offered = self.refused = self.missed = 0
+        self.has_stale_packet = self._has_carried = False
         # cflib reports errors and goes on; the hub counts what the dongle answers instead.
         driver.connect(self.uri, self._take_statistics, lambda message: None)
         internals.count_answers(driver, self._count)
@@ -171,8 +182,10 @@ class Carrier:
         self.refused = 0
         self._offered += 1
         if answer:
+            self.missed = 0
             self.answered += 1
         else:
+            self.missed += 1
             self.lost += 1
 
     def _take_statistics(self, statistics: dict[str, float]) -> None:
@@ -184,13 +197,29 @@ class Carrier:
             while select.select([self.socket], [], [], wait_s)[0]:
                 self._take_datagram()
                 wait_s = 0.0
-            driver = self.driver
+            silent_s = time.monotonic() - self.heard_s
+            if silent_s > (FAREWELL_S if self._flight is None else LINGER_S):
+                self._drop_packets()
+            driver = None if self.has_stale_packet else self.driver
             if driver is None:
                 self._closed.wait(ROOM_WAIT_S if self._waiting else 0.0)
             elif self._waiting and self._put(driver, self._waiting[0]):
                 self._waiting.popleft()
                 self._send(ROOM + bytes((min(len(self._waiting), 255),)))
         self.socket.close()
+
+    def _drop_packets(self) -> None:
+        """Let no packet that the flight has sent so far reach the vehicle any more.
+
+        cflib's driver holds up to two: one that it repeats until the vehicle acknowledges it, and
+        one in its queue. They cannot be taken from it, but end with it; the next driver begins with
+        an offer of safelink.
+        """
+        self._waiting.clear()
+        driver, has_carried = self.driver, self._has_carried
+        self._has_carried = False
+        if driver is not None and has_carried and (self.missed or driver.out_queue.full()):
+            self.has_stale_packet = True
 
     def _take_datagram(self) -> None:
         try:
@@ -202,7 +231,7 @@ class Carrier:
             if datagram[1:].decode("ascii", "replace") != self.vehicle:
                 return
             if sender != self._flight:
-                self._waiting.clear()  # what an earlier link wanted to send is out of date
+                self._drop_packets()  # what an earlier link wanted to send is out of date
             self._flight = sender
             self.send_report()
         elif sender != self._flight:
@@ -217,6 +246,7 @@ class Carrier:
         from cflib.crtp.crtpstack import CRTPPacket
 
         packet = CRTPPacket(datagram[0], datagram[1:])
+        self._has_carried = True
         return internals.put_packet(driver, packet, ROOM_WAIT_S)
 
     def _carry_down(self) -> None:
@@ -298,8 +328,7 @@ class Hub:
 
     def has_flights(self) -> bool:
         """True while a flight's link is open that was heard lately."""
-        heard_s = time.monotonic() - LINGER_S
-        return any(carrier.has_flight and carrier.heard_s > heard_s for carrier in self.carriers)
+        return any(carrier.has_flight for carrier in self.carriers)
 
     def close(self) -> None:
         """End the flights' links and close all drivers, without a packet; bounded."""
@@ -330,14 +359,15 @@ class Hub:
             carrier.problem = problem
 
     def _keep_open(self) -> None:
-        """Open a dead dongle again, and drivers whose vehicle was out of reach."""
+        """Open a dead dongle again, drivers whose vehicle was out of reach, and those that hold a
+        packet of a flight that is over."""
         while not self._closed.is_set():
             self._wake.wait(REOPEN_PERIOD_S)
             self._wake.clear()
             if self._closed.is_set():
                 return
             if self.problem is None:
-                self._offer_safelink()
+                self._renew_drivers()
                 continue
             self._close_dongle()
             if self._closed.is_set():  # meanwhile
@@ -350,11 +380,14 @@ class Hub:
             self._stuck_ticks = 0
             self._set_problem(None)
 
-    def _offer_safelink(self) -> None:
+    def _renew_drivers(self) -> None:
         for carrier in self.carriers:
             if carrier.lacks_safelink:
                 self._close_driver(carrier)
                 carrier.opened_s = time.monotonic()
+            elif carrier.has_stale_packet and carrier.driver is not None:
+                self._close_driver(carrier)
+                carrier.opened_s = -math.inf  # to be opened again at once
             elif carrier.driver is None and time.monotonic() - carrier.opened_s > SAFELINK_PERIOD_S:
                 try:
                     carrier.open()
@@ -402,25 +435,34 @@ def serve_parent() -> None:
     except PerchError as error:
         channel.send(error)
         return
+    status = 1
     try:
         with contextlib.closing(hub):
             channel.send(hub.uris)
             run(hub, channel)
+        status = 0
+    except SystemExit:  # by SIGTERM
+        status = 0
+    except Exception:
+        traceback.print_exc()  # the parent shows the last line
+        sys.stderr.flush()
     finally:
-        os._exit(0)  # a driver that hangs in USB must not keep the process
+        os._exit(status)  # a driver that hangs in USB must not keep the process
 
 
 def run(hub: Hub, channel: Channel) -> None:
     """Serve a hub and its parent; return once both the parent and the flights are gone."""
     parent = True
     while parent or hub.has_flights():
-        try:
-            if parent and channel.poll(TICK_S):
-                hub.limit(*channel.recv())
-        except (EOFError, OSError):
-            parent = False
-        if not parent:
-            time.sleep(TICK_S)
+        due_s = time.monotonic() + TICK_S
+        while (wait_s := due_s - time.monotonic()) > 0.0:
+            try:
+                if not parent:
+                    time.sleep(wait_s)
+                elif channel.poll(wait_s):
+                    hub.limit(*channel.recv())
+            except (EOFError, OSError):
+                parent = False
         # A parent that hangs reads nothing, and must not stop the hub.
         if hub.tick() and parent and select.select([], [channel], [], 0.0)[1]:
             with contextlib.suppress(OSError):
