@@ -199,6 +199,7 @@ class FleetFlight:
         self._results: dict[str, FaultResult] = {}
         self._known_m: dict[str, Point] = {}  # where who has ended is, in the room, as known
         self._landed_all = ""  # who has failed, and all land for it
+        self._cause_has_begun = False
 
     def fly(self, seed: int) -> FleetResult:
         """Fly group by group, and return what became of all."""
@@ -247,6 +248,7 @@ class FleetFlight:
             yield seats
 
     def _begin_cause(self, seats: Sequence[_Seat]) -> None:
+        self._cause_has_begun = True
         for seat in seats:
             flight = seat.flight
             if seat.name in self._trouble.cases and flight is not None and flight.end is None:
@@ -314,12 +316,10 @@ class FleetFlight:
         return ""
 
     def _is_lasting(self, name: str) -> bool:
-        """True if a common cause that befell an earlier group lasts for good."""
-        trouble = self._trouble
-        if trouble.at_s is None or name not in trouble.cases or not self._results:
-            return False
-        flown = self._plan.group_number(name) - 1 > trouble.group
-        return flown and trouble.cases[name].lasts_s > FOR_GOOD_S
+        """True if a common cause has begun that concerns this vehicle and lasts for good. One whose
+        group ended before its moment never begins."""
+        case = self._trouble.cases.get(name)
+        return self._cause_has_begun and case is not None and case.lasts_s > FOR_GOOD_S
 
 
 def _finite(value: float) -> float | None:

@@ -209,6 +209,18 @@ def test_a_common_cause_befalls_all_that_fly_and_outlasts_them(stage: Stage) -> 
     assert outcomes(fly(plan.fleet, replace(stall, group=0, at_s=0.1)))[2] == "perched"
 
 
+@pytest.mark.parametrize(("group", "at_s"), [(0, 20.0), (2, 0.1)])
+def test_a_cause_that_has_not_begun_keeps_no_vehicle_on_the_floor(
+    stage: Stage, group: int, at_s: float
+) -> None:
+    """Neither one whose group has ended before its moment, nor one that befalls a later group."""
+    plan = make_plan(row(3))
+    drawn = draw_trouble(plan, place_fleet(plan.fleet, 1), ["dongle-dies"], 3)
+    result = fly(plan.fleet, replace(drawn, group=group, at_s=at_s))
+    assert outcomes(result) == ["perched"] * 3
+    assert [line for line in stage.log if "meets" in line] == []
+
+
 def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
     plan = make_plan(row(4, order="together"))
     placed = place_fleet(plan.fleet, 1)
