@@ -79,12 +79,19 @@ def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: flo
 
 
 def external_positions(
-    rig: FaultRig, t_s: float, how: str, for_s: float, late_s: float = 0.0
+    rig: FaultRig,
+    t_s: float,
+    how: str,
+    for_s: float,
+    late_s: float = 0.0,
+    swapped_with: str | None = None,
 ) -> None:
     """Make the motion capture of a vehicle without a deck fail for `for_s` as
-    `CAPTURE_FAULTS[how]`, or be late by `late_s`."""
+    `CAPTURE_FAULTS[how]`, or be late by `late_s`. `swapped_with`: the other body of a swap of
+    names; None: the first one."""
     assert rig.vehicle.capture is not None
-    rig.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
+    fault = replace(CAPTURE_FAULTS[how], late_s=late_s, swapped_with=swapped_with)
+    rig.vehicle.capture.begin_fault(fault, for_s)
 
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:

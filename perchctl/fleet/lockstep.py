@@ -22,6 +22,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -41,7 +42,7 @@ from perchctl.fleet.coroutine import ThreadCoroutine
 from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.results import FleetResult, fleet_outcome, refused_vehicle
-from perchctl.fleet.room import PlacedVehicle, Room, place_fleet
+from perchctl.fleet.room import PlacedVehicle, Room, body_name, place_fleet
 from perchctl.fleet.schedule import OBSTACLE_M
 
 TICK_S = 0.02
@@ -117,9 +118,22 @@ def draw_trouble(
     cause = _CAUSES[name]
     case = cause.draw(rng, placed[number].scenario)
     whom = _whom(cause.whom, plan, [each.name for each in placed], number, rng)
+    cases = dict.fromkeys(whom, case)
+    if cause.whom == "pair" and len(whom) == 2:
+        cases = swapped_cases(case, *whom)
     group = int(rng.integers(len(plan.schedule.groups)))
     at_s = round(float(rng.uniform(*CAUSE_S)), 3)
-    return Trouble(name=name, cases=dict.fromkeys(whom, case), group=group, at_s=at_s)
+    return Trouble(name=name, cases=cases, group=group, at_s=at_s)
+
+
+def swapped_cases(case: Case, first: str, second: str) -> dict[str, Case]:
+    """The cases of two vehicles that each get the other one's body, from the case of one."""
+    return {
+        name: replace(
+            case, effects=tuple(partial(e, swapped_with=body_name(other)) for e in case.effects)
+        )
+        for name, other in ((first, second), (second, first))
+    }
 
 
 def _whom(

@@ -124,6 +124,12 @@ def _neighbours(
 # --- All of them, as time passes ---
 
 
+def body_name(name: str) -> str:
+    """The name of the rigid body of the vehicle called `name` in the motion capture of another
+    one. In its own, its body has the name from its profile."""
+    return f"body of {name}"
+
+
 class Body:
     """One vehicle in the room: simulated, or where it stands, hangs or lies."""
 
@@ -188,7 +194,7 @@ class Room:
         vehicle called `name`."""
         own = self.bodies[name]
         return tuple(
-            (f"body of {other}", own.in_own_axes(body.place_m))
+            (body_name(other), own.in_own_axes(body.place_m))
             for other, body in self.bodies.items()
             if body is not own
         )

@@ -42,7 +42,8 @@ class CaptureFault:
         occluded: the vehicle's body is hidden from the cameras.
         frozen: all bodies stay where they were seen last, to the last digit.
         gone: no frame is sent.
-        swapped: the vehicle's body and the first other one have changed names.
+        swapped: the vehicle's body and another one have changed names: the one called
+            `swapped_with`, or the first other one if that is None.
         scale: factor on all positions; 1000 is millimetres.
         mirrored: positions with y's sign turned, as a left-handed program sends them.
         axes: rows (3, 3) of the rotation from the world's axes to the capture's.
@@ -53,6 +54,7 @@ class CaptureFault:
     frozen: bool = False
     gone: bool = False
     swapped: bool = False
+    swapped_with: str | None = None
     scale: float = 1.0
     mirrored: bool = False
     axes: tuple[tuple[float, ...], ...] = TRUE_AXES
@@ -198,8 +200,10 @@ class SimCapture:
             for (place, R), white in zip(poses, noise, strict=True)
         ]
         names = list(settings.names)
-        if any(fault.swapped for fault in faults):
-            names[:2] = reversed(names[:2])
+        swap = next((fault for fault in reversed(faults) if fault.swapped), None)
+        if swap is not None:
+            other = 1 if swap.swapped_with is None else names.index(swap.swapped_with)
+            names[0], names[other] = names[other], names[0]
         return dict(zip(names, seen, strict=True))
 
     def _pose(self, place: Array, R: Array, noise: Array, faults: list[CaptureFault]) -> BodyPose:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,10 +31,17 @@ from perchctl.fleet import (
     select_fleet_faults,
 )
 from perchctl.fleet.fleet import Fleet, FleetVehicle
-from perchctl.fleet.lockstep import TICK_S, FleetFlight, Trouble, draw_trouble
+from perchctl.fleet.lockstep import (
+    TICK_S,
+    FleetFlight,
+    Trouble,
+    draw_trouble,
+    swapped_cases,
+)
 from perchctl.fleet.results import refused_vehicle
-from perchctl.fleet.room import place_fleet
+from perchctl.fleet.room import Room, body_name, place_fleet
 from perchctl.record import from_exact_json, to_exact_json
+from perchctl.sim.capture import CaptureSettings, SimCapture
 from tests.fleet.rig import fleet
 from tests.fleet.test_room import flying
 from tests.helpers.commands import run
@@ -221,11 +229,21 @@ def test_a_cause_that_has_not_begun_keeps_no_vehicle_on_the_floor(
     assert [line for line in stage.log if "meets" in line] == []
 
 
+def swapped_with(trouble: Trouble, name: str) -> str:
+    (effect,) = trouble.cases[name].effects
+    other: str = effect.keywords["swapped_with"]
+    return other
+
+
 def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
     plan = make_plan(row(4, order="together"))
     placed = place_fleet(plan.fleet, 1)
     for seed in range(8):
-        assert len(draw_trouble(plan, placed, ["bodies-swap"], seed).cases) == 2
+        swap = draw_trouble(plan, placed, ["bodies-swap"], seed)
+        first, second = swap.cases
+        assert [swapped_with(swap, name) for name in (first, second)] == [
+            f"body of {second}", f"body of {first}",
+        ]  # fmt: skip
         one = draw_trouble(plan, placed, ["kick", "gust"], seed)
         assert len(one.cases) == 1
         assert one.at_s is None
@@ -234,6 +252,39 @@ def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
     met = {next(iter(draw_trouble(plan, placed, ["kick"], seed).cases)) for seed in range(30)}
     assert met == {"v0", "v1", "v2", "v3"}
     assert draw_trouble(plan, placed, (), 1).cases == {}
+
+
+def test_two_vehicles_whose_bodies_swap_get_each_other_s_position() -> None:
+    """Also if the fleet has others, and not only one of the two is deceived."""
+    plan = make_plan(row(4, order="together"))
+    placed = place_fleet(plan.fleet, 1)
+    case = next(iter(draw_trouble(plan, placed, ["bodies-swap"], 0).cases.values()))
+    room = Room(placed)
+    pair = swapped_cases(case, "v1", "v3")
+    exact = CaptureSettings(position_noise_m=0.0)
+    for name, own_case in pair.items():
+        vehicle = flying(0.1, 0.2, 1.0)
+        vehicle.world.t_s, vehicle.world.quaternion = 1.0, (1.0, 0.0, 0.0, 0.0)
+        vehicle.capture = SimCapture(replace(exact, others=room.others_of(name)))
+        room.bodies[name].follow(vehicle)
+        (effect,) = own_case.effects
+        effect(SimpleNamespace(vehicle=vehicle), 0.0)
+    room.update()
+    for name, other in (("v1", "v3"), ("v3", "v1")):
+        body = room.bodies[name]
+        assert body.vehicle is not None
+        capture = body.vehicle.capture
+        assert capture is not None
+        capture.advance(body.vehicle.world)
+        body.vehicle.world.t_s = 1.1
+        capture.advance(body.vehicle.world)
+        seen = capture.take()[0].bodies
+        theirs_m = body.in_own_axes(room.bodies[other].place_m)
+        assert seen["crazyflie"].position_m == pytest.approx(theirs_m)
+        assert seen[body_name(other)].position_m == pytest.approx((0.1, 0.2, 1.0))
+        for third in {"v0", "v1", "v2", "v3"} - {name, other}:
+            where_m = body.in_own_axes(room.bodies[third].place_m)
+            assert seen[body_name(third)].position_m == pytest.approx(where_m)
 
 
 def test_whom_nothing_measures_is_refused(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -356,8 +407,10 @@ def lasting(trouble: Trouble) -> Trouble:
     (effect,) = case.effects
     if effect.func is external_positions:
         case = replace(case, effects=(partial(effect, for_s=FOR_EVER),))
-    whom = ("v0", "v1") if trouble.name == "bodies-swap" else ("v0", "v1", "v2")
-    return replace(trouble, cases=dict.fromkeys(whom, case), group=0, at_s=CAUSE_S)
+    cases = dict.fromkeys(("v0", "v1", "v2"), case)
+    if trouble.name == "bodies-swap":
+        cases = swapped_cases(case, "v0", "v1")
+    return replace(trouble, cases=cases, group=0, at_s=CAUSE_S)
 
 
 @cache
