@@ -47,6 +47,7 @@ class FleetPlan:
                     "frame": vehicle.frame,
                     "home_m": list(vehicle.home_m),
                     "target_m": list(vehicle.target_m),
+                    "heading_deg": vehicle.heading_deg,
                     "radius_m": round(corridor.radius_m, 3),
                     "way_top_m": corridor.way_top_m,
                     "target_top_m": corridor.target_top_m,

@@ -28,6 +28,7 @@ from perchctl.fleet import (
     fly_fleet,
     lockstep,
     make_plan,
+    plan_sha256,
     select_fleet_faults,
 )
 from perchctl.fleet.fleet import Fleet, FleetVehicle
@@ -356,6 +357,16 @@ def test_figures_count_fleets_and_vehicles() -> None:
 def test_a_result_is_written_and_read_back() -> None:
     data = json.loads(json.dumps(to_exact_json(made())))
     assert from_exact_json(FleetResult, data) == made()
+
+
+def test_a_vehicle_that_is_turned_is_another_plan() -> None:
+    """Also below its target, where its profile is the same; a campaign is not resumed with it."""
+    planned = row(2)
+    first, second = planned.vehicles
+    turned = replace(planned, vehicles=(first, replace(second, heading_deg=90.0)))
+    assert turned.vehicles[1].profile == second.profile
+    assert plan_sha256(make_plan(turned)) != plan_sha256(make_plan(planned))
+    assert plan_sha256(make_plan(row(2))) == plan_sha256(make_plan(planned))
 
 
 def test_faults_are_chosen_by_name() -> None:
