@@ -218,6 +218,7 @@ class FleetFlight:
     def fly(self, seed: int) -> FleetResult:
         """Fly group by group, and return what became of all."""
         for number, group in enumerate(self._plan.schedule.groups):
+            self._land_after_failure([])  # also after a group of which nobody has started
             starters = [name for name in group if not self._refuse(name)]
             self._fly_group(starters, number)
         room, results = self._room, [self._results[name] for name in self._placed]

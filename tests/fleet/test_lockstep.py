@@ -202,6 +202,16 @@ def test_land_all_lands_who_flies_and_starts_nobody_else(stage: Stage) -> None:
     assert outcomes(result) == ["aborted", "perched", "perched"]
 
 
+def test_land_all_starts_nobody_after_a_group_that_was_refused_as_a_whole(stage: Stage) -> None:
+    plan = make_plan(row(3, on_failure="land-all"))
+    drawn = draw_trouble(plan, place_fleet(plan.fleet, 1), ["dongle-dies"], 3)
+    only = {"v1": drawn.cases["v1"]}
+    result = fly(plan.fleet, replace(drawn, cases=only, group=0, at_s=0.05))
+    assert outcomes(result) == ["perched", "refused", "refused"]
+    assert result.vehicles[2].reason == "v1 has failed, and on_failure is land-all"
+    assert stage.log == ["v0 starts", "v0 perched"]
+
+
 def test_a_common_cause_befalls_all_that_fly_and_outlasts_them(stage: Stage) -> None:
     plan = make_plan(row(3, order="2 at a time"))
     drawn = draw_trouble(plan, place_fleet(plan.fleet, 1), ["dongle-dies"], 3)
