@@ -178,7 +178,7 @@ class Room:
 
     Attributes:
         collided: the pairs whose centres came nearer than two ellipsoids of `COLLISION_RADIUS_M`
-            and `COLLISION_HALF_HEIGHT_M` while the motors of one turned.
+            and `COLLISION_HALF_HEIGHT_M`, also if one fell onto the other with its motors off.
         least_m: least level distance between the centres of two vehicles of which one's motors
             turn, as heights do not count between corridors; infinite before.
         least_both_m: the same of two whose motors turn.
@@ -224,14 +224,13 @@ class Room:
     def _measure(
         self, pair: tuple[str, str], places: dict[str, _Place], turning: dict[str, bool]
     ) -> None:
-        motors = [turning[name] for name in pair]
-        if not any(motors):
-            return
         (x, y, z), (u, v, w) = (places[name] for name in pair)
         level_m = math.hypot(x - u, y - v)
-        self.least_m = min(self.least_m, level_m)
-        if all(motors):
-            self.least_both_m = min(self.least_both_m, level_m)
         aside, above = level_m / COLLISION_RADIUS_M, (z - w) / COLLISION_HALF_HEIGHT_M
         if math.hypot(aside, above) < 2.0:
             self.collided.add(pair)
+        motors = [turning[name] for name in pair]
+        if any(motors):
+            self.least_m = min(self.least_m, level_m)
+        if all(motors):
+            self.least_both_m = min(self.least_both_m, level_m)

@@ -116,6 +116,18 @@ def test_two_ellipsoids_that_touch_are_a_collision(x_m: float, z_m: float, colli
     assert room.collided == ({("v0", "v1")} if collide else set())
 
 
+def test_one_that_falls_with_its_motors_off_collides_with_one_that_stands() -> None:
+    """The least distances are of vehicles that fly, so they do not count it."""
+    room = two()
+    room.bodies["v0"].follow(flying(0.9, 0.0, 0.7, turns=False))
+    room.update()
+    assert room.collided == set()
+    room.bodies["v0"].follow(flying(0.95, 0.0, 0.3, turns=False))
+    room.update()
+    assert room.collided == {("v0", "v1")}
+    assert math.isinf(room.least_m)
+
+
 def test_the_upper_one_blows_down_on_the_lower_one_alone() -> None:
     room = two()
     low, high = flying(0.0, 0.0, 0.5), flying(-0.9, 0.0, 1.5)
