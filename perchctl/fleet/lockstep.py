@@ -277,9 +277,11 @@ class FleetFlight:
         self._results[seat.name] = result
         body.rest()
         vehicle = self._plan.fleet.vehicle(seat.name)
-        frame = replace(vehicle, frame="home")
+        # An estimate in the room's axes knows where they are; the simulated one begins at the true
+        # start. Of any other one, the parent takes the start from the file.
+        axes = self._placed[seat.name].true if vehicle.frame == "room" else vehicle
         hangs = result.outcome == "perched"
-        self._known_m[seat.name] = vehicle.target_m if hangs else frame.to_room(seat.known_m)
+        self._known_m[seat.name] = vehicle.target_m if hangs else axes.to_room(seat.known_m)
 
     def _land_after_failure(self, seats: Sequence[_Seat]) -> None:
         """By ``on_failure: land-all``, land all others once one has ended without perching."""

@@ -116,11 +116,16 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     return made
 
 
-def fly(planned: Fleet, trouble: Trouble | None = None) -> FleetResult:
+def fly(planned: Fleet, trouble: Trouble | None = None, *, are_exact: bool = True) -> FleetResult:
+    """The fleet's flight; `are_exact`: each vehicle starts exactly where the file says."""
     plan = make_plan(planned)
     placed = [
-        replace(each, profile=each.profile.model_copy(update={"name": each.name}))
-        for each in place_fleet(plan.fleet, 1)
+        replace(
+            each,
+            true=replace(vehicle, frame="home") if are_exact else each.true,
+            profile=each.profile.model_copy(update={"name": each.name}),
+        )
+        for each, vehicle in zip(place_fleet(plan.fleet, 1), plan.fleet.vehicles, strict=True)
     ]
     return FleetFlight(plan, placed, trouble or Trouble(cases={})).fly(1)
 
@@ -189,6 +194,17 @@ def test_who_lies_away_from_its_home_may_block_others(
     assert outcomes(result)[1:] == [second, third], "whose corridor is far away"
     assert words in result.vehicles[1].reason
     assert ("v1 starts" in stage.log) is (second == "perched")
+
+
+def test_who_measures_in_the_room_s_axes_is_known_to_lie_where_it_does(stage: Stage) -> None:
+    """Though it did not start exactly where the file says."""
+    stage.scripts = {"v0": Script(outcome="landed", lies_m=(0.0, 0.6))}
+    planned = fleet(CROSSING)
+    placed = place_fleet(planned, 1)[0]
+    away_m = math.dist(placed.true.to_room((0.0, 0.6)), planned.vehicles[0].home_m)
+    assert f"{away_m:.2f}" != "0.60"
+    result = fly(planned, are_exact=False)
+    assert f"v0 lies {away_m:.2f} m from its home" in result.vehicles[1].reason
 
 
 def test_land_all_lands_who_flies_and_starts_nobody_else(stage: Stage) -> None:
