@@ -170,7 +170,7 @@ class _Seat:
                 self._case,
                 placed.scenario,
                 on_sample=self._wait,
-                others=self._room.others_of(self.name),
+                others=self._room.others_of(self.name) or None,
             )
         except ConnectionFailed as error:  # such as no motion capture that sees it
             return refused_vehicle(str(error))

@@ -191,7 +191,7 @@ class Room:
 
     def others_of(self, name: str) -> tuple[tuple[str, _Place], ...]:
         """The other vehicles with their places, as a motion capture sees them in the axes of the
-        vehicle called `name`."""
+        vehicle called `name`. With none, a capture keeps the bodies that it has by itself."""
         own = self.bodies[name]
         return tuple(
             (body_name(other), own.in_own_axes(body.place_m))
@@ -216,7 +216,7 @@ class Room:
                 for x, y, z in [places[above]]
                 if above != name and turning[above]
             )
-            if body.vehicle.capture is not None:
+            if body.vehicle.capture is not None and len(self.bodies) > 1:
                 order = [other for other, _ in body.vehicle.capture.settings.others]
                 seen = dict(self.others_of(name))
                 body.vehicle.capture.others_m = [seen[other] for other in order]

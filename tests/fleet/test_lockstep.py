@@ -67,6 +67,7 @@ class Stage:
 
     scripts: dict[str, Script] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)
+    others: dict[str, Any] = field(default_factory=dict)
 
 
 class FakeFlight:
@@ -110,6 +111,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     made = Stage()
 
     def flight(profile: Any, case: Case, _scenario: Any, *, on_sample: Any, others: Any) -> Any:
+        made.others[profile.name] = others
         return FakeFlight(made, profile.name, case, on_sample)
 
     monkeypatch.setattr(lockstep, "FaultyFlight", flight)
@@ -279,6 +281,21 @@ def test_two_bodies_swap_and_a_fault_befalls_one_vehicle() -> None:
     met = {next(iter(draw_trouble(plan, placed, ["kick"], seed).cases)) for seed in range(30)}
     assert met == {"v0", "v1", "v2", "v3"}
     assert draw_trouble(plan, placed, (), 1).cases == {}
+
+
+def test_a_vehicle_alone_keeps_the_other_body_of_its_capture(stage: Stage) -> None:
+    """Its name can be taken by no vehicle, but by the wand, as in a single flight."""
+    fly(row(1))
+    assert stage.others == {"v0": None}
+    fly(row(2))
+    assert [name for name, _ in stage.others["v0"]] == ["body of v1"]
+    room = Room(place_fleet(row(1), 1))
+    vehicle = flying(0.0, 0.0, 1.0)
+    vehicle.capture = SimCapture(CaptureSettings())
+    before_m = list(vehicle.capture.others_m)
+    room.bodies["v0"].follow(vehicle)
+    room.update()
+    assert vehicle.capture.others_m == before_m != []
 
 
 def test_two_vehicles_whose_bodies_swap_get_each_other_s_position() -> None:
