@@ -109,7 +109,9 @@ def _from_crazyswarm2(path: Path, robots: Mapping[Any, Any], types: Any) -> Conv
         if entry.get("enabled") is not True:
             skipped.append(str(name))
             continue
-        kind = types.get(entry.get("type")) if isinstance(types, dict) else None
+        type_name = entry.get("type")
+        is_named = isinstance(types, dict) and isinstance(type_name, str | int)
+        kind = types.get(type_name) if is_named else None
         capture = kind.get("motion_capture") if isinstance(kind, dict) else None
         # `enabled` up to version 2 of the file, `tracking` from version 3 on.
         tracked = isinstance(capture, dict) and (
@@ -133,11 +135,12 @@ def _from_cfcli(path: Path, units: Sequence[Any], values: Mapping[str, Any]) -> 
         entry = _mapping(where, unit)
         vehicles.append(
             ConvertedVehicle(
-                name=_file_name(str(entry.get("name", f"CF-{number:02d}"))), uri=_uri(where, entry)
+                name=_file_name(_text(entry.get("name"), f"CF-{number:02d}")),
+                uri=_uri(where, entry),
             )
         )
     return ConvertedFleet(
-        name=str(values.get("name", path.stem)),
+        name=_text(values.get("name"), path.stem),
         vehicles=tuple(vehicles),
         in_room_axes=values.get("lighthouse") is not None,
     )
@@ -167,7 +170,16 @@ def _place(where: str, value: Any) -> tuple[float, float] | None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # of an integer that is no float
+        return False
+
+
+def _text(value: Any, default: str) -> str:
+    return default if value is None else str(value)
 
 
 def _file_name(name: str) -> str:

@@ -86,6 +86,14 @@ def test_cfcli_gives_names_and_uris_and_a_lighthouse_s_frame(tmp_path: Path) -> 
     assert "frame: room" in found.text()
 
 
+def test_a_type_that_is_no_name_and_names_that_are_empty_do_no_harm(tmp_path: Path) -> None:
+    listed = CRAZYSWARM2.replace("type: cf21", "type: [cf21]")
+    first, _ = convert_fleet(written(tmp_path, listed)).vehicles
+    assert (first.name, first.body) == ("cf231", None)
+    unnamed = convert_fleet(written(tmp_path, "name:\nunits: [{uri: 'usb://0', name: }]\n"))
+    assert (unnamed.name, unnamed.vehicles[0].name) == ("crazyflies", "CF-01")
+
+
 @pytest.mark.parametrize("text", [CRAZYSWARM2.replace("CAPTURE", "{enabled: true}"), CFCLI])
 def test_what_is_missing_is_refused_until_it_is_there(tmp_path: Path, text: str) -> None:
     found = convert_fleet(written(tmp_path, text))
@@ -116,9 +124,13 @@ def test_what_is_missing_is_refused_until_it_is_there(tmp_path: Path, text: str)
             "robots: {a: {enabled: true, uri: 'usb://0', initial_position: [1, x]}}\n",
             "robots.a.initial_position: must be x, y and z in metres, found [1, 'x']",
         ),
+        (
+            f"robots: {{a: {{enabled: true, uri: 'usb://0', initial_position: [{'9' * 400}, 0]}}}}",
+            "robots.a.initial_position: must be x, y and z in metres, found [999",
+        ),
         ("units: [{uri: 'usb://0', name: a}, {uri: 'usb://1', name: A}]\n", "two vehicles would"),
     ],
-    ids=["profile", "off", "no-uri", "no-keys", "place", "twice"],
+    ids=["profile", "off", "no-uri", "no-keys", "place", "no-float", "twice"],
 )
 def test_what_is_no_such_list_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     assert refusal(tmp_path, text).startswith(sentence)
