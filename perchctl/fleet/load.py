@@ -40,6 +40,9 @@ _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
 _PROFILE_KEYS = tuple(name for name in Profile.model_fields if name not in ("name", "description"))
+_SECTIONS = tuple(name for name in _PROFILE_KEYS if name != "date")
+_ALSO_TEXT = ("target", "positioning")
+"""Sections whose value may be text instead: a file's name, what measures positions."""
 
 
 class _Common(Section):
@@ -279,6 +282,14 @@ def _split(
             raise InvalidValue(
                 f"{where}: {clip_text(str(name))}: this key is unknown; "
                 f"{nearest_names(str(name), allowed)}"
+            )
+    for name, value in sections.items():
+        # The same section of another layer would replace it unnoticed.
+        is_text = name in _ALSO_TEXT and isinstance(value, str)
+        if name in _SECTIONS and not is_text and not isinstance(value, dict):
+            raise InvalidValue(
+                f"{where}: {name}: must have keys and values, found {clip_text(repr(value))}; "
+                f"add some, or remove it"
             )
     return own, sections
 

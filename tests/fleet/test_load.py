@@ -152,6 +152,11 @@ REFUSED = [
     (two(first=", hme_m: [0, 0]"), "vehicle north: hme_m: this key is unknown; did you mean home"),
     (two(first=", safety: {fence_m: 1}"), "vehicle north: safety.fence_m: this key is unknown"),
     (two(defaults=", home_m: [0, 0]"), "defaults: home_m: this key is unknown"),
+    (two(first=", target: [1]"), "vehicle north: target: must have keys and values, found [1]; "),
+    (
+        two(", safety: {fence_radius_m: 1}", defaults=", safety: 3"),
+        "defaults: safety: must have keys and values, found 3; add some, or remove it",
+    ),
     (two(second=", profile: smi"), "vehicle east: profile: profile 'smi' not found"),
     (two(second=", uri: radio://0/80/3M/E7"), f"vehicle east: {BAD_URI}"),
     (two(second=", source: 'camra:0'"), "vehicle east: "),
@@ -191,6 +196,12 @@ def test_a_fault_is_one_sentence_that_names_the_vehicle(
     tmp_path: Path, text: str, sentence: str
 ) -> None:
     assert refusal(tmp_path, text).startswith(sentence)
+
+
+def test_a_section_may_be_text_and_the_date_is_no_section(tmp_path: Path) -> None:
+    fleet = load(tmp_path, two(first=", date: 2026-01-02", defaults=", positioning: target"))
+    assert str(fleet.vehicles[0].profile.date) == "2026-01-02"
+    assert all(vehicle.profile.positioning.source.is_target for vehicle in fleet.vehicles)
 
 
 def test_a_fleet_that_is_missing_names_the_choices() -> None:
