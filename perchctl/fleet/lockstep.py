@@ -319,7 +319,8 @@ class FleetFlight:
         """Why a vehicle that has ended is in the way of `name`; empty if it is not. A place that
         nobody knows (NaN) is."""
         place_m, result = self._known_m[other], self._results[other]
-        does = "hangs" if result.outcome == "perched" else "lies"
+        hangs = result.outcome == "perched"
+        does = "hangs" if hangs else "lies"
         if not all(map(math.isfinite, place_m)):
             return f"nobody knows where {other} {does}"
         gap_m = self._plan.corridors[name].distance_to_m(place_m)
@@ -328,7 +329,7 @@ class FleetFlight:
             return f"{other} {does} {inside} its corridor"
         away_m = math.dist(place_m, self._plan.fleet.vehicle(other).home_m)
         together = self._plan.schedule.may_fly_together(other, name)
-        if does == "lies" and not (together or away_m <= AT_HOME_M):
+        if not (hangs or together or away_m <= AT_HOME_M):
             return f"{other} lies {away_m:.2f} m from its home, in a corridor that is too near"
         return ""
 
