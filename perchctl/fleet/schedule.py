@@ -20,7 +20,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from graphlib import CycleError, TopologicalSorter
 
 from perchctl.corridor import Corridor
@@ -98,20 +98,19 @@ def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
     )
 
 
-def estimate_corridor(vehicle: FleetVehicle) -> Corridor:
-    """The same corridor in the axes of the vehicle's own state estimate: its fence.
+def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Corridor:
+    """The same corridor in the axes of the vehicle's own state estimate: its fence. `estimate`: the
+    same vehicle with other axes of its state estimate, which are taken.
 
     Its radius is the same. A vehicle that flies by its setpoints keeps its estimate on the way
     while its true place drifts; one under its target keeps its true place, while its estimate
     drifts.
     """
-    corridor = vehicle_corridor(vehicle)
-    return Corridor(
-        home_m=vehicle.to_estimate(corridor.home_m),
-        target_m=vehicle.to_estimate(corridor.target_m),
-        radius_m=corridor.radius_m,
-        way_top_m=corridor.way_top_m,
-        target_top_m=corridor.target_top_m,
+    corridor, axes = vehicle_corridor(vehicle), estimate or vehicle
+    return replace(
+        corridor,
+        home_m=axes.to_estimate(corridor.home_m),
+        target_m=axes.to_estimate(corridor.target_m),
     )
 
 
@@ -121,16 +120,10 @@ def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -
 
     `estimate`: the same vehicle with other axes of its state estimate, whose profile is taken.
     """
-    at, corridor = estimate or vehicle, vehicle_corridor(vehicle)
-    section = CorridorConfig(
-        home_m=at.to_estimate(corridor.home_m),
-        target_m=at.to_estimate(corridor.target_m),
-        radius_m=corridor.radius_m,
-        way_top_m=corridor.way_top_m,
-        target_top_m=corridor.target_top_m,
-    )
-    safety = at.profile.safety.model_copy(update={"corridor": section})
-    return at.profile.model_copy(update={"safety": safety})
+    section = CorridorConfig(**asdict(estimate_corridor(vehicle, estimate)))
+    profile = (estimate or vehicle).profile
+    safety = profile.safety.model_copy(update={"corridor": section})
+    return profile.model_copy(update={"safety": safety})
 
 
 # --- Who may fly with whom ---
