@@ -236,7 +236,7 @@ AIR = (
     P.LANDING,
 )
 BEFORE_LANDING = AIR[:-1]
-CAMERA_GUIDED_PHASES = (P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER)
+CAMERA_GUIDED = (P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER)
 TARGET_SEEN = (P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER)
 STOPPING = (P.COMPLETE, P.LANDING)
 FROM_THE_START = (P.APPROACH,)
@@ -498,17 +498,13 @@ FAULTS: tuple[Fault, ...] = (
         effect(e.operator, presses_s=key_press_times(uniform(0.1, 0.33), uniform(1.0, 4.0))),
     ),
     # Two at once.
-    Fault(
-        "covered-and-kick", "a blow; the target is hidden", (COVERED, KICK), CAMERA_GUIDED_PHASES
-    ),
-    Fault(
-        "covered-and-gust", "a gust; the target is hidden", (COVERED, GUST), CAMERA_GUIDED_PHASES
-    ),
+    Fault("covered-and-kick", "a blow; the target is hidden", (COVERED, KICK), CAMERA_GUIDED),
+    Fault("covered-and-gust", "a gust; the target is hidden", (COVERED, GUST), CAMERA_GUIDED),
     Fault(
         "covered-and-operator",
         "Ctrl-C; the target is hidden",
         (COVERED, ONCE),
-        CAMERA_GUIDED_PHASES,
+        CAMERA_GUIDED,
     ),
     Fault(
         "weak-magnet-uplink",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.faults import effects as e
+from perchctl.faults.catalogue import CAMERA_GUIDED
 from perchctl.faults.oracle import Sample
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.link import MockLink
@@ -225,10 +226,7 @@ Place = tuple[float, float]
 UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE})
 STEERED_BY_TARGET = UNDER_TARGET | {Phase.ESTIMATE, Phase.ALIGN}
 TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
-CAMERA_GUIDED_PHASES = frozenset(
-    {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER}
-)
-FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
+FREE_AIR = frozenset(CAMERA_GUIDED) | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
 """The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
 NO_SIGHT = (*NO_PICTURE, "covered")  # in the dark a target that is near is found
@@ -419,11 +417,11 @@ def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
         if silent and values.get("delay_s", math.inf) > safety.telemetry_land_s:
             limit_s = safety.telemetry_land_s
     elif effect.func is e.camera_fault:
-        if values["kind"] in NO_PICTURE and phase in CAMERA_GUIDED_PHASES:
+        if values["kind"] in NO_PICTURE and phase in CAMERA_GUIDED:
             limit_s = safety.camera_land_s
         if values["kind"] in NO_SIGHT and profile.positioning.source.is_target:
             limit_s = min(limit_s, profile.positioning.land_s)
     elif effect.func is e.deck_silent or values.get("how") in NO_POSITION:
         limit_s = profile.positioning.land_s
-    flown = phase in FREE_AIR_PHASES and _for_s(effect) > limit_s + LASTS_S
+    flown = phase in FREE_AIR and _for_s(effect) > limit_s + LASTS_S
     return limit_s if flown else math.inf
