@@ -473,7 +473,7 @@ _PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
 _CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
 _MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35  # grey levels; share of the median
 _MIN_EDGE_POINTS = 24
-_TUKEY_SCALE, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
+_TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 _ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
 _LINE_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
@@ -483,7 +483,7 @@ _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     1.0,
 )
 _EDGE_SHIFT_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
-_PRIOR_INFORMATION: Array = (
+_PREDICTION_INFORMATION: Array = (
     np.array(
         [
             _TILT_SIGMA_RAD,
@@ -674,14 +674,14 @@ def _solve_step(
         error = offset_px - J @ step
         size = np.abs(error)
         scale = max(1.4826 * float(np.median(size[shows])), _MIN_TUKEY_SCALE_PX)
-        weight = np.maximum(1.0 - (size / (_TUKEY_SCALE * scale)) ** 2, 0.0) ** 2 * shows
+        weight = np.maximum(1.0 - (size / (_TUKEY_CUTOFF_SIGMAS * scale)) ** 2, 0.0) ** 2 * shows
         mass = float(weight.sum())
         if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
         variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(_PRIOR_INFORMATION)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
-        step = inverse @ (J.T @ (weight * offset_px) / variance - _PRIOR_INFORMATION * total)
+        step = inverse @ (J.T @ (weight * offset_px) / variance - _PREDICTION_INFORMATION * total)
     return step, inverse, weight, variance
 
 
@@ -696,7 +696,7 @@ def _make_pose_fit(
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    cov = inverse @ (middle / variance**2 + np.diag(_PRIOR_INFORMATION)) @ inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_PREDICTION_INFORMATION)) @ inverse
     shown = w > 0.0
     return PoseFit(
         pose=pose,

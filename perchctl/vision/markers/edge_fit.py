@@ -564,11 +564,11 @@ _MAX_NEIGHBOUR_FRACTION = 0.9  # share of the gradient that neighbouring edges m
 _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
 _WINDOW_LENGTH_SIGMAS = 1.0 / 0.6
-_TUKEY_SCALE = 3.5 * 1.4826
+_TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
 _SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
 _MIN_GRADIENT_FRACTION = 0.3  # share of the row's mean gradient that a profile requires to count
-_MIN_TUKEY_SCALE_PX = 3.5 * 0.05  # scatter that counts as noise
+_MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # for a scatter that counts as noise
 _MAX_ONE_ROUND_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _CONVERGED_LINE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
@@ -712,9 +712,9 @@ def _fit_robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tu
     line = median_per_row(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
-        size /= np.maximum(_TUKEY_SCALE * median_per_row(size, usable), _MIN_TUKEY_SCALE_PX)[
-            :, None
-        ]
+        size /= np.maximum(
+            _TUKEY_CUTOFF_MEDIANS * median_per_row(size, usable), _MIN_TUKEY_CUTOFF_PX
+        )[:, None]
         size *= size
         weight = np.maximum(1.0 - size, 0.0)
         weight *= weight

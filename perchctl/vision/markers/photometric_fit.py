@@ -71,7 +71,7 @@ _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 # indices of the unknowns: increment, blur, light
 _SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
-_PRIOR_INFORMATION: Array = (
+_SHAPE_INFORMATION: Array = (
     np.array(
         [
             _SHAPE_SIGMA,
@@ -239,8 +239,8 @@ def _linearize_greys(grey: Array, seen: RenderedDrawing, total: Array) -> _Equat
     N[bend, bend] += (_TONE_CURVE_SIGMA * gain) ** -2.0
     g[bend] -= light[BEND] * (_TONE_CURVE_SIGMA * gain) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
-    N[range(8), range(8)] += _PRIOR_INFORMATION
-    g[_SHAPE_SLICE] -= _PRIOR_INFORMATION * total
+    N[range(8), range(8)] += _SHAPE_INFORMATION
+    g[_SHAPE_SLICE] -= _SHAPE_INFORMATION * total
     return _Equations(gain, error, J, noise, N, g)
 
 
