@@ -315,16 +315,39 @@ def test_a_cycle_is_seen() -> None:
     assert cycle(there_and_back[:1]) == []
 
 
+def is_arithmetic(node: ast.expr) -> bool:
+    """True for a number, a computation with numbers alone, and a tuple of such."""
+    match node:
+        case ast.Constant():
+            return isinstance(node.value, (int, float))
+        case ast.UnaryOp():
+            return is_arithmetic(node.operand)
+        case ast.BinOp():
+            return is_arithmetic(node.left) and is_arithmetic(node.right)
+        case ast.Tuple():
+            return all(map(is_arithmetic, node.elts))
+    return False
+
+
 def numbers_of(source: str) -> dict[str, str]:
-    """The module's constants whose value is a number, with the number as it is written."""
+    """The module's constants whose value is arithmetic, with the value as it is written."""
     found = {}
     for node in ast.parse(source).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            value = node.value.operand if isinstance(node.value, ast.UnaryOp) else node.value
-            is_number = isinstance(value, ast.Constant) and isinstance(value.value, (int, float))
-            if is_number and node.targets[0].id.isupper():
-                found[node.targets[0].id] = ast.unparse(node.value)
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        pairs = [(target, node.value)]
+        if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+            pairs = list(zip(target.elts, node.value.elts, strict=True))
+        for name, value in pairs:
+            if isinstance(name, ast.Name) and name.id.isupper() and is_arithmetic(value):
+                found[name.id] = ast.unparse(value)
     return found
+
+
+def test_constants_are_found_however_they_are_written() -> None:
+    source = "A = -1\n_B_M: float = 3.5 * 1.4\nC, _D = 2.0**3, (1, 2)\nE = A\nf = 1\nG = 'g'\n"
+    assert numbers_of(source) == {"A": "-1", "_B_M": "3.5 * 1.4", "C": "2.0 ** 3", "_D": "(1, 2)"}
 
 
 def test_a_constants_name_has_one_value() -> None:

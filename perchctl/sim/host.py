@@ -32,7 +32,7 @@ from perchctl.sim.vehicle import SimulatedVehicle
 
 Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
-_RECEIVE_BYTES = 1 << 20
+_RECEIVED_PACKETS_BYTES = 1 << 20
 _NULL_HEADER = 0xFF
 _EPS_S = 1e-9
 
@@ -65,7 +65,7 @@ class VehicleHost:
         self.server = CrtpServer(self.vehicle.firmware, **(link or {}))
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED_PACKETS_BYTES)
         self.socket.bind(("127.0.0.1", 0))
         self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
         self.stream = None if self.vehicle.camera is None else MjpegServer()
