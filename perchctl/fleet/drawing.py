@@ -41,7 +41,8 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     low, high = _bounds(corridors)
     width_m, height_m = high[0] - low[0], high[1] - low[1]
     cell_m = max(width_m / DRAWING_COLUMNS, height_m / (DRAWING_ROWS * CELL_ASPECT))
-    columns = min(DRAWING_COLUMNS, math.ceil(width_m / cell_m))
+    label = len(f"{len(fleet.vehicles)}*")  # fits also into a room that is long and narrow
+    columns = min(DRAWING_COLUMNS, max(label, math.ceil(width_m / cell_m)))
     rows = min(DRAWING_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
     cells = [
         [

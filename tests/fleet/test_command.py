@@ -96,6 +96,12 @@ def test_many_vehicles_on_one_spot_can_be_drawn() -> None:
     assert "12" in draw_text(crowd)
 
 
+def test_a_long_and_narrow_room_has_each_label_once() -> None:
+    column = fleet([((0.0, 8.0 * n), (0.0, 8.0 * n)) for n in range(12)])
+    rows = [row for row in draw_text(column).splitlines() if row.endswith("*")]
+    assert rows == [f"{n}*" for n in range(12, 0, -1)]
+
+
 def test_the_picture_is_an_svg_of_all_vehicles() -> None:
     planned = load_fleet()
     root = ElementTree.fromstring(draw_svg(planned, (("north",), ("east",))))
