@@ -156,7 +156,7 @@ def _a_step_aside(source: DrawInputs) -> tuple[float, float]:
 def _beside(source: DrawInputs) -> tuple[Neighbour, ...]:
     x, y = draw_direction(source)
     away_m = uniform(0.35, 1.2)(source)
-    return (Neighbour((x * away_m, y * away_m)),)
+    return (*source.scenario.neighbours, Neighbour((x * away_m, y * away_m)))
 
 
 def _turned_camera(source: DrawInputs) -> tuple[tuple[float, ...], ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, d
 from perchctl.faults.oracle import emergency_stop_s
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator, Phase
-from perchctl.sim import Scenario
+from perchctl.sim import Neighbour, Scenario
 
 SCENARIO = Scenario(seed=5)
 
@@ -54,6 +55,15 @@ def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
         then = (case.landed_from, case.landed_after_s, case.first_hold_ratio)
         drawn.update(repr((rounded(told), rounded(then))).encode())
     assert drawn.hexdigest()[:16] == "f8208484787cc1ce"
+
+
+def test_a_second_target_leaves_those_of_the_neighbours_where_they_hang() -> None:
+    """In a fleet, a camera may see both."""
+    fleet = replace(SCENARIO, neighbours=(Neighbour((1.5, 0.0), 0.3, 145, 254),))
+    (effect,) = draw_case(3, fleet, [BY_NAME["second-target"]]).effects
+    theirs, second = effect(fleet).neighbours
+    assert theirs == fleet.neighbours[0]
+    assert second.large_id is None, "the same markers as its own"
 
 
 @pytest.mark.parametrize(("name", "stops"), [("operator-held", False), ("operator-hammers", True)])
