@@ -26,7 +26,7 @@ from perchctl.corridor import Point
 from perchctl.fleet.fleet import FleetVehicle
 from perchctl.fleet.messages import Order, Result, Stage, Status
 from perchctl.fleet.plan import FleetPlan
-from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M
+from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, gap_text
 from perchctl.mission import Operator
 
 FRESH_STATUS_S = 1.0
@@ -201,8 +201,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
             continue
         away_m = corridor.distance_to_m(place)
         if away_m < OBSTACLE_M:
-            text = f"{-away_m:.2f} m inside" if away_m < 0.0 else f"{away_m:.2f} m from"
-            return f"{other} {where} {text} its corridor"
+            return f"{other} {where} {gap_text(away_m)} its corridor"
     return None
 
 

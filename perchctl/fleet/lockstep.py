@@ -43,7 +43,7 @@ from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.results import FleetResult, fleet_outcome, refused_vehicle
 from perchctl.fleet.room import PlacedVehicle, Room, body_name, place_fleet
-from perchctl.fleet.schedule import OBSTACLE_M
+from perchctl.fleet.schedule import OBSTACLE_M, gap_text
 
 TICK_S = 0.02
 """Of the room's clock: two vehicles that fly 0.4 m/s are 8 mm nearer by then. Larger: a collision
@@ -325,8 +325,7 @@ class FleetFlight:
             return f"nobody knows where {other} {does}"
         gap_m = self._plan.corridors[name].distance_to_m(place_m)
         if gap_m < OBSTACLE_M:
-            inside = f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
-            return f"{other} {does} {inside} its corridor"
+            return f"{other} {does} {gap_text(gap_m)} its corridor"
         away_m = math.dist(place_m, self._plan.fleet.vehicle(other).home_m)
         together = self._plan.schedule.may_fly_together(other, name)
         if not (hangs or together or away_m <= AT_HOME_M):

@@ -223,9 +223,12 @@ def _apart(gap_m: float) -> str:
 
 
 def _from(gap_m: float, other: str) -> str:
-    if gap_m < 0.0:
-        return f"{-gap_m:.2f} m inside the corridor of {other}"
-    return f"{gap_m:.2f} m from the corridor of {other}"
+    return f"{gap_text(gap_m)} the corridor of {other}"
+
+
+def gap_text(gap_m: float) -> str:
+    """The distance of a place from a corridor's edge, negative inside, before the words for it."""
+    return f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
 
 
 def _groups(
