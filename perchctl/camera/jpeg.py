@@ -22,7 +22,7 @@ _SCAN_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 """The first marker behind entropy-coded bytes, in which FF is followed by 00 or a restart."""
 _START, _END = b"\xff\xd8\xff", b"\xff\xd9"
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
-_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_FRAME_HEADER_CODES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Start of frame: behind its length and precision stand height and width."""
 
 
@@ -52,7 +52,7 @@ def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | 
             return at + 2, size_px
         if at + 9 > len(data):
             return None
-        if code in _SIZES:
+        if code in _FRAME_HEADER_CODES:
             height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
             size_px = width, height
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

@@ -227,7 +227,7 @@ class SimCapture:
 # Of a frame only the rigid bodies are filled in; a client steps over the empty lists.
 
 
-CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
+CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME_OF_DATA = 0, 1, 4, 5, 7
 _HOST = "127.0.0.1"
 _VERSION = bytes((3, 1, 0, 0))
 _NAME_BYTES = 256
@@ -306,4 +306,4 @@ def frame_message(number: int, names: Sequence[str], frame: CaptureFrame) -> byt
     parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
     ticks = round(frame.t_s * _TICKS_HZ)
     parts.append(struct.pack("<IId3Qh", 0, 0, frame.t_s, ticks, ticks, ticks, 0) + _EMPTY)
-    return _message(FRAME, *parts)
+    return _message(FRAME_OF_DATA, *parts)

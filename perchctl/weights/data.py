@@ -24,7 +24,7 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 
 AXES = ("x", "y", "z", "yaw")
-YAW = 3
+YAW_COLUMN = 3
 SOURCES = ("large", "small", "actual")
 NEEDED = (
     "position",
@@ -134,7 +134,7 @@ def _check_cells(
     for source, pose in poses.items():
         refuse(np.isinf(pose).any(axis=1), f"the {source} pose has an infinite number")
         refuse(
-            np.abs(pose[:, YAW]) > 2.0 * np.pi + 1e-6,
+            np.abs(pose[:, YAW_COLUMN]) > 2.0 * np.pi + 1e-6,
             f"{source}_yaw_rad looks like degrees: radians are needed",
         )
         empty = np.isnan(pose)
@@ -160,7 +160,7 @@ def _check_positions(data: Measurements) -> None:
         rows = data.has_both_markers & (data.position == place)
         for source in ("large", "small"):
             apart = getattr(data, source)[rows] - data.actual[rows]
-            apart[:, YAW] = wrap_angles(apart[:, YAW])
+            apart[:, YAW_COLUMN] = wrap_angles(apart[:, YAW_COLUMN])
             far = np.abs(np.median(apart, axis=0)) > MOST_APART
             if far.any():
                 raise InvalidValue(

@@ -25,7 +25,7 @@ from scipy.special import stdtrit
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.weights.data import AXES, YAW, Measurements, wrap_angles
+from perchctl.weights.data import AXES, YAW_COLUMN, Measurements, wrap_angles
 
 OUTLIER_SIGMAS = 6.0
 """A row does not count on an axis where a marker's error is farther from the median of its
@@ -84,10 +84,10 @@ def marker_errors(data: Measurements) -> MarkerErrors:
     positions, starts = np.unique(data.position[rows], return_index=True)
     actual = data.actual[rows]
     large, small = data.large[rows] - actual, data.small[rows] - actual
-    yaw = np.concatenate([large[:, YAW], small[:, YAW]])
+    yaw = np.concatenate([large[:, YAW_COLUMN], small[:, YAW_COLUMN]])
     reference = float(np.arctan2(np.sin(yaw).sum(), np.cos(yaw).sum()))
     for each in (large, small):
-        each[:, YAW] = reference + wrap_angles(each[:, YAW] - reference)
+        each[:, YAW_COLUMN] = reference + wrap_angles(each[:, YAW_COLUMN] - reference)
     return MarkerErrors(
         name=data.name,
         positions=positions,

@@ -107,7 +107,7 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
 # --- How alike two views are ---
 
 
-AXES = ("x", "y", "size", "tilt")
+COVERAGE_AXES = ("x", "y", "size", "tilt")
 GOALS = {"x": 0.5, "y": 0.5, "size": 0.3, "tilt": 0.4}
 """Spread of each over the views, after which it counts as covered."""
 NEW_BEYOND = 0.18
@@ -147,7 +147,7 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
     """For x, y, size and tilt, the spread of the view signatures over its goal, at most 1."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
-    return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
+    return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in COVERAGE_AXES}
 
 
 # --- Guided capture ---
@@ -294,10 +294,10 @@ def next_advice(signatures: Sequence[Array]) -> str:
     """Return how to move or tilt the board next, in directions of the picture: towards what the
     view `signatures` cover least."""
     done = covered_shares(signatures)
-    least = min(AXES, key=lambda axis: done[axis])
+    least = min(COVERAGE_AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
         return "show the board somewhere new"
-    k = AXES.index(least)
+    k = COVERAGE_AXES.index(least)
     if least == "tilt":
         across, down = np.ptp(signatures, axis=0)[3:]
         k = 3 if across <= down else 4

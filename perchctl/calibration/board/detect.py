@@ -279,7 +279,7 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 REACH = 0.42
 """Half of the window, in squares; the next corner's edges begin at 1."""
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
-GRID = 21  # samples across the largest window
+WINDOW_SAMPLES = 21  # samples across the largest window
 _CORNER_ITERATIONS = 6
 _LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # step: px, rad, logarithms
 _MIN_SLOPE_PX = 5.0
@@ -313,7 +313,7 @@ def fit_saddles(
     # The narrower height of the parallelogram that a square makes.
     size_px = np.maximum(area / np.linalg.norm(axes_px, axis=1).max(axis=1), 1e-6)
     reach = np.clip(REACH, MIN_REACH_PX / size_px, MAX_REACH_PX / size_px)
-    t = np.linspace(-1.0, 1.0, GRID)
+    t = np.linspace(-1.0, 1.0, WINDOW_SAMPLES)
     uv = np.stack(np.meshgrid(t, t), axis=-1).reshape(1, -1, 2) * reach[:, None, None]
     offsets = np.einsum("nij,nmj->nmi", axes_px, uv)
     grey, inside = _sample(image, start[:, None] + offsets)
@@ -335,7 +335,7 @@ def fit_saddles(
     samples = weight.sum(axis=1)
     noise = np.sqrt((residual**2).sum(axis=1) / np.maximum(samples - 12.0, 1.0))
     ok = (
-        (samples > 0.2 * GRID * GRID)
+        (samples > 0.2 * WINDOW_SAMPLES * WINDOW_SAMPLES)
         & (np.abs(contrast) > 4.0)
         & (noise < 0.45 * np.abs(contrast))
         & (np.linalg.norm(state[:, :2], axis=1) < np.maximum(1.5, 0.6 * span_px))

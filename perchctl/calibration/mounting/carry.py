@@ -313,7 +313,7 @@ def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
 
 
 FREEDOM = 5.0
-BLOCKS = 15
+JACKKNIFE_BLOCKS = 15
 MOST_LEFT_OUT = 0.4
 _COUNTS_LITTLE = 0.2
 _JITTERS_S = 1e-3 * np.concatenate([np.arange(0.0, 12.0), np.geomspace(13.0, 30.0, 4)])
@@ -369,7 +369,8 @@ class PoseResiduals:
         """The parameters' covariance (p, p), by a block jackknife, as errors of consecutive
         pictures may correlate."""
         blocks = [
-            self.normal_equations(k) for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
+            self.normal_equations(k)
+            for k in np.array_split(np.arange(len(self.misfit)), JACKKNIFE_BLOCKS)
         ]
         return jackknife_covariance(blocks, self.prior, *_robust_shares(self.chi2))
 
