@@ -308,10 +308,10 @@ def _has_ended(child: fleets.VehicleProcess) -> bool:
 def _stage_and_reason(view: fleets.VehicleView) -> tuple[str, str]:
     result, status = view.result, view.status
     if result is not None:
-        return ("hangs" if result.hangs else result.outcome), result.reason
+        return ("hangs" if result.hangs else result.outcome.value), result.reason
     if status is None:
         return fleets.Stage.STARTING.value, ""
-    return status.phase or status.stage.value, status.reason
+    return (status.phase or status.stage).value, status.reason
 
 
 def _row(number: int, view: fleets.VehicleView) -> FleetRow:

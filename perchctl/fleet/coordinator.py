@@ -23,7 +23,7 @@ from perchctl.fleet.dispatch import (
     find_near_pairs,
     find_unwatched,
 )
-from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status
+from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator
@@ -183,10 +183,12 @@ class Coordinator:
             return None
         child.kill()
         if name not in self._flying:
-            return Result(exit_code=PerchError.exit_code, outcome="failed", reason=problem)
+            return Result(
+                exit_code=PerchError.exit_code, outcome=VehicleOutcome.FAILED, reason=problem
+            )
         return Result(
             exit_code=SafetyAbort.exit_code,
-            outcome="failed",
+            outcome=VehicleOutcome.FAILED,
             reason=f"{problem}: look where the vehicle is before you reach for it",
             has_flown=True,
             log=None if status is None else status.log,

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 from perchctl.corridor import Point
 from perchctl.fleet.fleet import FleetVehicle
-from perchctl.fleet.messages import Order, Result, Stage, Status
+from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, gap_text
 from perchctl.mission import Operator
@@ -123,7 +123,7 @@ def decide(
                 own, reasons[name] = Operator.LAND, f"{failed} is not ready"
             elif plan.fleet.on_failure == "land-all":
                 own, reasons[name] = Operator.LAND, f"{failed} has failed"
-        if own is Operator.NONE and view.stage not in (Stage.FLYING, Stage.ENDING):
+        if own is Operator.NONE and view.stage.is_before_takeoff:
             obstacle = find_obstacle(plan, name, ended)
             if obstacle is not None:
                 own, reasons[name] = Operator.LAND, obstacle
@@ -191,7 +191,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
         vehicle = plan.fleet.vehicle(other)
         if other == name:
             continue
-        if result.hangs and result.outcome == "perched":
+        if result.hangs:
             place, where = vehicle.target_m, "hangs"
         elif is_at_home(vehicle, result):
             place, where = vehicle.home_m, "stands"
@@ -213,4 +213,4 @@ def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
     if result.hangs or vehicle.frame != "room" or result.place_m is None:
         return False
     away_m = math.dist(vehicle.flown_to_room(result.place_m), vehicle.home_m)
-    return result.outcome == "landed" and away_m <= OBSTACLE_M
+    return result.outcome is VehicleOutcome.LANDED and away_m <= OBSTACLE_M

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from perchctl.corridor import Point
-from perchctl.mission import Operator
+from perchctl.mission import Operator, Phase
 
 BEAT_S = 0.1
 """Between two messages in each direction. Longer, and few of them are left within the second after
@@ -31,6 +31,29 @@ class Stage(Enum):
     READY = "ready"  # on the floor, disarmed; only permission is missing
     FLYING = "flying"  # from its first setpoint to the end of its mission
     ENDING = "ending"  # landed or hanging; link and log are being closed
+
+    @property
+    def is_before_takeoff(self) -> bool:
+        """True on the floor, before the first setpoint."""
+        return self in (Stage.STARTING, Stage.CHECKING, Stage.READY)
+
+
+class VehicleOutcome(Enum):
+    """How one vehicle ended."""
+
+    PERCHED = "perched"  # it hangs with its motors off
+    LANDED = "landed"
+    ABORTED = "aborted"
+    FAILED = "failed"  # its flight raised, or its process was lost
+
+    @classmethod
+    def from_phase(cls, phase: Phase) -> VehicleOutcome:
+        """The outcome of a mission that ended in this phase. Raises KeyError unless it is over."""
+        return {
+            Phase.PERCHED: cls.PERCHED,
+            Phase.LANDED: cls.LANDED,
+            Phase.ABORTED: cls.ABORTED,
+        }[phase]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +75,7 @@ class Status:
     are None.
 
     Attributes:
+        phase: of its mission; None on the floor before it.
         reason: what it waits for on the floor, or why it is in its phase.
         height_m: above the ground.
         error_m: the target's level distance from the gear.
@@ -63,7 +87,7 @@ class Status:
     """
 
     stage: Stage = Stage.STARTING
-    phase: str = ""
+    phase: Phase | None = None
     reason: str = ""
     height_m: float | None = None
     error_m: float | None = None
@@ -103,18 +127,15 @@ class Result:
     """How one vehicle ended; its process sends nothing after it.
 
     Attributes:
-        outcome: ``perched``, ``landed``, ``aborted``, or ``failed`` for a flight that raised.
         has_flown: False if it has never left the floor by its own doing.
-        hangs: it is known to hang with its motors off.
         ended_s: `time.monotonic` at its last tick, None without one; one clock for all processes.
         place_m: its last place, in the axes of its estimate.
     """
 
     exit_code: int
-    outcome: str
+    outcome: VehicleOutcome
     reason: str
     has_flown: bool = False
-    hangs: bool = False
     ended_s: float | None = None
     place_m: Point | None = None
     attempts: int = 0
@@ -122,3 +143,8 @@ class Result:
     battery_min_v: float | None = None
     log: str | None = None
     pace: Pace | None = None
+
+    @property
+    def hangs(self) -> bool:
+        """True if it is known to hang with its motors off."""
+        return self.outcome is VehicleOutcome.PERCHED

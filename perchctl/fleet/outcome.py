@@ -131,7 +131,7 @@ class FleetOutcome:
             "name": name,
             "uri": vehicle.uri,
             "seed": options.seed if options.simulated else None,
-            "outcome": result.outcome,
+            "outcome": result.outcome.value,
             "exit_code": result.exit_code,
             "hangs": result.hangs,
             "reason": result.reason,
@@ -153,9 +153,8 @@ class FleetOutcome:
         """The outcome for people, a line for each vehicle."""
         lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
-            lines.append(
-                vehicle_line(name, result.hangs, result.outcome, result.miss_m, result.reason)
-            )
+            outcome = result.outcome.value
+            lines.append(vehicle_line(name, result.hangs, outcome, result.miss_m, result.reason))
         ratio = self.ratio
         if ratio is not None and any(each.simulated for each in self.options.values()):
             lines.append(f"{'pace':<12}{ratio:.2f} s of simulated time per second")

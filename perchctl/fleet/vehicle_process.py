@@ -19,10 +19,10 @@ from dataclasses import replace
 
 from perchctl.children import Channel
 from perchctl.errors import Interrupted, PerchError
-from perchctl.fleet.messages import BEAT_S, Pace, Result, Stage, Status
+from perchctl.fleet.messages import BEAT_S, Pace, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
 from perchctl.flight import FlyOptions, fly_session, operator_signals
-from perchctl.mission import Event, Phase, Tick, Watcher
+from perchctl.mission import Event, Tick, Watcher
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
 
@@ -71,12 +71,12 @@ def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> 
             remarks=log.remarks,
             may_take_off=reporter.may_take_off,
         )
-        hangs = report.phase is Phase.PERCHED
-        summary = log.close(report, miss_m if hangs else None)
+        outcome = VehicleOutcome.from_phase(report.phase)
+        summary = log.close(report, miss_m if outcome is VehicleOutcome.PERCHED else None)
         assert summary is not None, "it was closed with a report"
         for sentence in report.detached:
             _say(sentence)
-        return reporter.result_of(summary, str(log.path), hangs=hangs, lost=switch.lost)
+        return reporter.result_of(outcome, summary, str(log.path), lost=switch.lost)
     except BaseException as error:
         line.may_interrupt = False
         if log is not None:
@@ -212,13 +212,12 @@ class StatusReporter(Watcher):
             self._rest = event.reason
 
     def result_of(
-        self, summary: FlightSummary, log: str, *, hangs: bool, lost: str | None
+        self, outcome: VehicleOutcome, summary: FlightSummary, log: str, *, lost: str | None
     ) -> Result:
         """The result of a flight that has ended by itself."""
         reason = summary.reason if lost is None else f"{lost}: {summary.reason}"
         return replace(
-            self._result(summary.exit_code, summary.outcome, reason),
-            hangs=hangs,
+            self._result(summary.exit_code, outcome, reason),
             attempts=summary.attempts,
             miss_m=summary.miss_m,
             battery_min_v=summary.battery_min_v,
@@ -241,10 +240,10 @@ class StatusReporter(Watcher):
             reason = f"{reason}; {self._rest}"
         if lost is not None:
             reason = f"{lost}: {reason}"
-        result = self._result(code, "failed", reason)
+        result = self._result(code, VehicleOutcome.FAILED, reason)
         return replace(result, log=str(log.path) if log is not None and log.has_begun else None)
 
-    def _result(self, code: int, outcome: str, reason: str) -> Result:
+    def _result(self, code: int, outcome: VehicleOutcome, reason: str) -> Result:
         tick = self._tick
         return Result(
             exit_code=code,
@@ -279,7 +278,7 @@ def flight_status(tick: Tick) -> Status:
     x_m, y_m, z_m = telemetry.position_m
     return Status(
         stage=Stage.ENDING if state.phase.is_over else Stage.FLYING,
-        phase=state.phase.value,
+        phase=state.phase,
         reason=state.pause_reason or state.reason,
         height_m=z_m - state.belief.ground_z_m,
         error_m=None if target is None else math.hypot(*target.e_m[:2]),

@@ -9,14 +9,16 @@ from typing import Any
 from perchctl.corridor import Point
 from perchctl.fleet import make_plan
 from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, Coordinator
-from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status
+from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
 from perchctl.flight import OperatorSwitch
-from perchctl.mission import Operator
+from perchctl.mission import Operator, Phase
 from tests.fleet.rig import fleet
 
 FAR: tuple[tuple[Point, Point], ...] = tuple(((4.0 * n, 0.0), (4.0 * n, 0.5)) for n in range(4))
-PERCHED = Result(exit_code=0, outcome="perched", reason="hangs", has_flown=True, hangs=True)
-ABORTED = Result(exit_code=52, outcome="aborted", reason="the link was lost", has_flown=True)
+PERCHED = Result(exit_code=0, outcome=VehicleOutcome.PERCHED, reason="hangs", has_flown=True)
+ABORTED = Result(
+    exit_code=52, outcome=VehicleOutcome.ABORTED, reason="the link was lost", has_flown=True
+)
 
 
 @dataclass
@@ -92,7 +94,7 @@ class Rig:
 
     def fly(self, *names: str) -> None:
         for name in names:
-            self[name].tell(Stage.FLYING, phase="ALIGN")
+            self[name].tell(Stage.FLYING, phase=Phase.ALIGN)
         self.pass_s()
 
     def end(self, name: str, result: Result = PERCHED) -> None:
@@ -156,7 +158,9 @@ def test_one_that_is_not_ready_keeps_all_on_the_floor() -> None:
     rig = Rig()
     rig.fleet.confirm()
     rig.ready("v0", "v1", "v2")
-    rig.end("v3", Result(exit_code=10, outcome="failed", reason="no Crazyflie answers"))
+    rig.end(
+        "v3", Result(exit_code=10, outcome=VehicleOutcome.FAILED, reason="no Crazyflie answers")
+    )
     assert rig.permitted == []
     assert rig.words[:3] == [Operator.LAND] * 3
     assert not rig.fleet.started
@@ -193,9 +197,17 @@ def test_one_that_ended_somewhere_keeps_its_neighbour_on_the_floor() -> None:
 
 def test_one_that_hangs_or_stands_at_its_home_keeps_nobody() -> None:
     at_home = Result(
-        exit_code=50, outcome="landed", reason="target not found", has_flown=True, place_m=(0.1, 0)
+        exit_code=50,
+        outcome=VehicleOutcome.LANDED,
+        reason="target not found",
+        has_flown=True,
+        place_m=(0.1, 0),
     )
-    for result in (PERCHED, at_home, Result(exit_code=52, outcome="failed", reason="battery")):
+    for result in (
+        PERCHED,
+        at_home,
+        Result(exit_code=52, outcome=VehicleOutcome.FAILED, reason="battery"),
+    ):
         rig = Rig(NEAR).started()
         rig.end("v0", result)
         assert rig["v1"].order == Order(may_take_off=True)
@@ -220,19 +232,22 @@ def test_two_that_come_too_near_land_and_the_others_fly_on() -> None:
     rig = Rig(order="together").started()
     for name, x_m in (("v0", 2.0), ("v1", -1.8), ("v2", 0.0), ("v3", 0.0)):  # from its home
         rig[name].tell(
-            Stage.FLYING, phase="ALIGN", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(x_m, 0.0)
+            Stage.FLYING, phase=Phase.ALIGN, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(x_m, 0.0)
         )
     rig.pass_s()
     assert rig.words == [Operator.LAND, Operator.LAND, Operator.NONE, Operator.NONE]
     rig["v0"].tell(
-        Stage.FLYING, phase="LANDING", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
+        Stage.FLYING, phase=Phase.LANDING, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
     )
     rig.pass_s()
     assert rig.words[:2] == [Operator.LAND] * 2, "also once they are apart again"
     assert [str(pair) for pair in rig.fleet.near_pairs] == [
         "v0 and v1 were 0.20 m apart in the air"
     ]
-    rig.end("v0", Result(exit_code=130, outcome="landed", reason="operator", has_flown=True))
+    rig.end(
+        "v0",
+        Result(exit_code=130, outcome=VehicleOutcome.LANDED, reason="operator", has_flown=True),
+    )
     result = rig.fleet.views[0].result
     assert result is not None
     assert (result.exit_code, result.reason) == (52, "0.20 m from v1 in the air: operator")
@@ -242,7 +257,7 @@ def test_a_position_that_grows_old_lands_nobody_and_is_named() -> None:
     rig = Rig(order="together").started()
     for name in ("v0", "v1"):
         rig[name].tell(
-            Stage.FLYING, phase="ALIGN", telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
+            Stage.FLYING, phase=Phase.ALIGN, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
         )
     rig.pass_s()
     assert rig.fleet.unwatched == ()
@@ -274,7 +289,10 @@ def test_a_key_lands_one_and_the_next_group_still_flies() -> None:
     rig.fleet.land("v0")
     rig.fleet.step()
     assert rig.words == [Operator.LAND, *[Operator.NONE] * 3]
-    rig.end("v0", Result(exit_code=130, outcome="landed", reason="operator", has_flown=True))
+    rig.end(
+        "v0",
+        Result(exit_code=130, outcome=VehicleOutcome.LANDED, reason="operator", has_flown=True),
+    )
     rig.end("v1")
     assert {"v2", "v3"} <= set(rig.permitted)
 
@@ -296,17 +314,17 @@ def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:
 
 def test_a_loop_that_hangs_for_longer_than_any_landing_is_ended() -> None:
     rig = Rig().started()
-    rig["v0"].tell(Stage.FLYING, phase="ALIGN", loop_age_s=LOOP_HUNG_S - 1.0)
+    rig["v0"].tell(Stage.FLYING, phase=Phase.ALIGN, loop_age_s=LOOP_HUNG_S - 1.0)
     rig.pass_s()
     assert not rig["v0"].killed
-    rig["v0"].tell(Stage.FLYING, phase="ALIGN", loop_age_s=LOOP_HUNG_S + 1.0)
+    rig["v0"].tell(Stage.FLYING, phase=Phase.ALIGN, loop_age_s=LOOP_HUNG_S + 1.0)
     rig.pass_s()
     assert rig["v0"].killed
 
 
 def test_a_process_that_was_killed_in_the_air_counts_as_somewhere() -> None:
     rig = Rig(NEAR).started()
-    rig["v0"].tell(Stage.FLYING, phase="ALIGN", log="logs/flight.jsonl")
+    rig["v0"].tell(Stage.FLYING, phase=Phase.ALIGN, log="logs/flight.jsonl")
     rig.pass_s()
     rig["v0"].gone = "its process has ended unexpectedly (signal 9)"
     rig.pass_s()

@@ -19,7 +19,7 @@ from perchctl.fleet.dispatch import (
     find_near_pairs,
     find_unwatched,
 )
-from perchctl.fleet.messages import BEAT_S, Result, Stage, Status
+from perchctl.fleet.messages import BEAT_S, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.radio import SLOWEST_PERIOD_S
 from tests.fleet.rig import fleet, on_air
 
@@ -130,7 +130,7 @@ def test_the_reason_names_the_other_and_the_distance() -> None:
 def test_one_that_has_ended_is_not_in_the_air() -> None:
     hangs = replace(
         flying("v0", (0.0, 0.0)),
-        result=Result(exit_code=0, outcome="perched", reason="", hangs=True),
+        result=Result(exit_code=0, outcome=VehicleOutcome.PERCHED, reason=""),
     )
     assert find_near_pairs(PLAN, [hangs, flying("v1", (0.0, 0.2))]) == ()
 

@@ -12,16 +12,16 @@ import pytest
 from perchctl.errors import EXIT_CODES, ConnectionFailed
 from perchctl.fleet import FleetOutcome, as_error, flight_options, load_fleet, make_plan, worst_of
 from perchctl.fleet.fleet import vehicle_seed
-from perchctl.fleet.messages import Pace, Result
+from perchctl.fleet.messages import Pace, Result, VehicleOutcome
 from perchctl.fleet.outcome import fleet_exit_code
+from perchctl.mission import Phase
 
 PACE = Pace(flown_s=20.0, wall_s=40.0, gap_p50_s=0.02, gap_p99_s=0.05, gap_max_s=0.1, cores=0.4)
 PERCHED = Result(
     exit_code=0,
-    outcome="perched",
+    outcome=VehicleOutcome.PERCHED,
     reason="hanging still",
     has_flown=True,
-    hangs=True,
     ended_s=130.0,
     place_m=(0.3, 0.1),
     miss_m=0.002,
@@ -31,7 +31,15 @@ PERCHED = Result(
 
 
 def ended(code: int) -> Result:
-    return Result(exit_code=code, outcome="failed", reason="so it was")
+    return Result(exit_code=code, outcome=VehicleOutcome.FAILED, reason="so it was")
+
+
+def test_each_end_of_a_mission_is_an_outcome_and_only_one_of_them_hangs() -> None:
+    ends = {phase: VehicleOutcome.from_phase(phase) for phase in Phase if phase.is_over}
+    assert len(set(ends.values())) == len(ends)
+    assert VehicleOutcome.FAILED not in ends.values(), "which no mission ends in"
+    hanging = [p for p, outcome in ends.items() if replace(PERCHED, outcome=outcome).hangs]
+    assert hanging == [Phase.PERCHED]
 
 
 def test_the_exit_code_is_0_only_if_all_hang() -> None:
