@@ -106,7 +106,7 @@ class Coordinator:
     @property
     def has_ended(self) -> bool:
         """True once every vehicle has ended."""
-        return len(self._results) == len(self._children)
+        return all(view.result is not None for view in self._views)
 
     def confirm(self) -> None:
         """The operator's yes: flights begin as soon as all are ready at once."""

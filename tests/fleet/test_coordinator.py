@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
+
 from perchctl.corridor import Point
 from perchctl.fleet import make_plan
 from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, Coordinator
@@ -143,6 +145,25 @@ def test_groups_fly_in_their_order_each_after_the_one_before() -> None:
     rig.end("v3")
     assert rig.fleet.has_ended
     assert rig.words == [Operator.NONE] * 4
+
+
+def test_a_fleet_has_not_ended_before_each_view_has_its_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The display reads the views in another thread, also in the middle of a round."""
+    rig = Rig(FAR[:2]).started()
+    rig.fly("v0", "v1")
+    rig.end("v1")
+    seen: list[bool] = []
+
+    def newest() -> tuple[Status | None, float]:
+        seen.append(rig.fleet.has_ended or rig.fleet.views[0].result is not None)
+        return rig["v1"].status, rig.now_s
+
+    monkeypatch.setattr(rig["v1"], "newest", newest)
+    rig.end("v0")
+    assert seen == [False]
+    assert rig.fleet.has_ended
 
 
 def test_a_vehicle_that_is_not_ready_any_more_does_not_hold_up_those_in_the_air() -> None:
