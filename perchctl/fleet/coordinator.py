@@ -124,13 +124,12 @@ class Coordinator:
         self._views = tuple(
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
-        if self._confirmed and are_all_ready(self._views) and self._word() is Operator.NONE:
+        word = self._switch.read()  # once: what lands all must not come after the permission
+        if self._confirmed and are_all_ready(self._views) and word is Operator.NONE:
             self.started = True
         self._watch_distances()
         landed = self._landed | self._were_near
-        decision = decide(
-            self._plan, self._views, started=self.started, word=self._word(), landed=landed
-        )
+        decision = decide(self._plan, self._views, started=self.started, word=word, landed=landed)
         for name, why in decision.reasons.items():
             self.reasons.setdefault(name, why)
         self._send(decision, now_s)
@@ -150,9 +149,6 @@ class Coordinator:
             for name in both - self._were_near:
                 self.reasons.setdefault(name, pair.why(name))
             self._were_near |= both
-
-    def _word(self) -> Operator:
-        return self._switch.read()
 
     def _heard(self, name: str, child: Child, now_s: float) -> VehicleView:
         status, heard_s = child.newest()

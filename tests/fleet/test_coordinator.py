@@ -304,6 +304,22 @@ def test_ctrl_c_lands_all_and_again_cuts_all() -> None:
     assert rig.words == [Operator.STOP] * 4
 
 
+def test_a_stop_in_the_round_of_the_start_keeps_the_fleet_on_the_floor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fleet that has never taken off must not be reported as one that has."""
+    rig = Rig()
+    rig.fleet.confirm()
+    words = [Operator.NONE, Operator.LAND]
+    monkeypatch.setattr(rig.switch, "read", lambda: words.pop(0) if len(words) > 1 else words[0])
+    for child in rig.children.values():
+        child.tell(Stage.READY)
+    rig.fleet.step()
+    assert rig.fleet.started == (rig.permitted != [])
+    rig.fleet.step()
+    assert rig.words == [Operator.LAND] * 4
+
+
 def test_a_key_lands_one_and_the_next_group_still_flies() -> None:
     rig = Rig().started()
     rig.fly("v0", "v1")
