@@ -89,7 +89,7 @@ class Coordinator:
         self._sent: dict[str, Order] = {}
         self._sent_s: dict[str, float] = {}
         self._begun_s = clock()
-        self._flying: set[str] = set()
+        self._may_have_flown: set[str] = set()
 
     # --- what others ask and order ---
 
@@ -154,7 +154,7 @@ class Coordinator:
         status, heard_s = child.newest()
         silent_s = now_s - max(heard_s, self._begun_s)
         if status is not None and status.stage is Stage.FLYING:
-            self._flying.add(name)
+            self._may_have_flown.add(name)
         if name not in self._results:
             result = child.result() or self._lost(name, child, status, silent_s)
             if result is not None:
@@ -178,7 +178,7 @@ class Coordinator:
         if problem is None:
             return None
         child.kill()
-        if name not in self._flying:
+        if name not in self._may_have_flown:
             return Result(
                 exit_code=PerchError.exit_code, outcome=VehicleOutcome.FAILED, reason=problem
             )
@@ -195,6 +195,8 @@ class Coordinator:
             due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
             if name not in self._results and (due or order != self._sent.get(name)):
                 self._sent[name], self._sent_s[name] = order, now_s
+                if order.may_take_off:  # it need not have told of its take-off before it is lost
+                    self._may_have_flown.add(name)
                 self._children[name].send(order)
 
 

@@ -371,6 +371,28 @@ def test_a_process_that_was_killed_in_the_air_counts_as_somewhere() -> None:
     assert (result.has_flown, result.log) == (True, "logs/flight.jsonl")
 
 
+def test_a_process_that_was_lost_after_its_permission_may_have_flown() -> None:
+    """Its last message is older than its permission, so nobody knows whether it took off."""
+    rig = Rig(NEAR).started()
+    assert rig["v0"].order.may_take_off
+    rig["v0"].gone = "its process has ended unexpectedly (signal 9)"
+    rig.pass_s()
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert (result.exit_code, result.has_flown) == (52, True)
+    assert "look where the vehicle is" in result.reason
+    assert rig["v1"].order == Order(may_take_off=False, word=Operator.LAND)
+
+
+def test_a_process_that_was_lost_without_permission_has_not_flown() -> None:
+    rig = Rig(NEAR).started()
+    rig["v1"].gone = "its process has ended unexpectedly (signal 9)"
+    rig.pass_s()
+    result = rig.fleet.views[1].result
+    assert result is not None
+    assert (result.exit_code, result.has_flown) == (1, False)
+
+
 def test_orders_are_repeated_as_signs_of_life() -> None:
     rig = Rig().started()
     before = len(rig["v0"].orders)
