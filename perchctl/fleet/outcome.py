@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -47,17 +47,25 @@ _WORST_FIRST: tuple[type[PerchError], ...] = (
 )
 
 
+_CODES_WORST_FIRST = (*(cls.exit_code for cls in _WORST_FIRST), 0)
+
+
+def worst_code(codes: Iterable[int]) -> int:
+    """The most severe of these exit codes; 0 of none. A code that perchctl does not know counts as
+    `PerchError`."""
+    known = (code if code in EXIT_CODES else PerchError.exit_code for code in codes)
+    return min(known, key=_CODES_WORST_FIRST.index, default=0)
+
+
 def fleet_exit_code(results: Sequence[Result]) -> int:
     """0 if all hang and their logs are complete; else the code of whoever fared worst."""
-    codes = {result.exit_code for result in results}
-    worst = next((cls.exit_code for cls in _WORST_FIRST if cls.exit_code in codes), 0)
-    return worst if codes <= EXIT_CODES.keys() else PerchError.exit_code
+    return worst_code(result.exit_code for result in results)
 
 
 def worst_of(results: Mapping[str, Result]) -> str:
     """The name of the vehicle whose exit code is the fleet's."""
     code = fleet_exit_code([*results.values()])
-    return next(name for name, result in results.items() if result.exit_code == code)
+    return next(name for name, result in results.items() if worst_code([result.exit_code]) == code)
 
 
 def as_error(name: str, result: Result) -> PerchError:

@@ -13,7 +13,7 @@ from perchctl.errors import EXIT_CODES, ConnectionFailed
 from perchctl.fleet import FleetOutcome, as_error, flight_options, load_fleet, make_plan, worst_of
 from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.messages import Pace, Result, VehicleOutcome
-from perchctl.fleet.outcome import fleet_exit_code
+from perchctl.fleet.outcome import fleet_exit_code, worst_code
 from perchctl.mission import Phase
 
 PACE = Pace(flown_s=20.0, wall_s=40.0, gap_p50_s=0.02, gap_p99_s=0.05, gap_max_s=0.1, cores=0.4)
@@ -50,10 +50,12 @@ def test_the_exit_code_is_0_only_if_all_hang() -> None:
 
 @pytest.mark.parametrize(
     ("codes", "worst"),
-    [((130, 10, 130, 130), 10), ((53, 52, 130), 53), ((0, 50, 52), 52), ((0, 99), 1)],
+    [((130, 10, 130, 130), 10), ((53, 52, 130), 53), ((0, 50, 52), 52), ((0, 99), 1), ((99, 52), 52), ((99, 130), 1)],
 )
 def test_it_is_the_code_of_whoever_fared_worst(codes: tuple[int, ...], worst: int) -> None:
     assert fleet_exit_code([ended(code) for code in codes]) == worst
+    results = {str(code): ended(code) for code in codes}
+    assert worst_code([results[worst_of(results)].exit_code]) == worst
 
 
 def test_a_failure_on_the_ground_is_an_error_of_its_own_kind() -> None:
