@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from perchctl.errors import Interrupted, PerchError, SafetyAbort
+from perchctl.errors import PerchError, SafetyAbort
 from perchctl.fleet.dispatch import (
     Decision,
     NearPair,
@@ -24,6 +24,7 @@ from perchctl.fleet.dispatch import (
     find_unwatched,
 )
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
+from perchctl.fleet.outcome import worst_code
 from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator
@@ -158,8 +159,9 @@ class Coordinator:
         if name not in self._results:
             result = child.result() or self._lost(name, child, status, silent_s)
             if result is not None:
-                if name in self._were_near and result.exit_code == Interrupted.exit_code:
-                    result = replace(result, exit_code=SafetyAbort.exit_code)
+                if name in self._were_near and result.exit_code != 0:
+                    code = worst_code((result.exit_code, SafetyAbort.exit_code))
+                    result = replace(result, exit_code=code)
                 self._results[name] = _explained(result, self.reasons.get(name))
         return VehicleView(
             name=name, status=status, silent_s=silent_s, result=self._results.get(name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -272,6 +272,21 @@ def test_two_that_come_too_near_land_and_the_others_fly_on() -> None:
     result = rig.fleet.views[0].result
     assert result is not None
     assert (result.exit_code, result.reason) == (52, "0.20 m from v1 in the air: operator")
+
+
+@pytest.mark.parametrize(("own", "reported"), [(130, 52), (50, 52), (1, 52), (53, 53), (0, 0)])
+def test_a_vehicle_that_came_too_near_reports_at_least_a_safety_abort(
+    own: int, reported: int
+) -> None:
+    """Unless it hangs in spite of the order to land."""
+    rig = Rig(order="together").started()
+    for name, x_m in (("v0", 2.0), ("v1", -1.8)):
+        rig[name].tell(Stage.FLYING, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(x_m, 0.0))
+    rig.pass_s()
+    rig.end("v0", replace(ABORTED, exit_code=own))
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert result.exit_code == reported
 
 
 def test_a_position_that_grows_old_lands_nobody_and_is_named() -> None:

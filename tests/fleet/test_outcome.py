@@ -50,7 +50,14 @@ def test_the_exit_code_is_0_only_if_all_hang() -> None:
 
 @pytest.mark.parametrize(
     ("codes", "worst"),
-    [((130, 10, 130, 130), 10), ((53, 52, 130), 53), ((0, 50, 52), 52), ((0, 99), 1), ((99, 52), 52), ((99, 130), 1)],
+    [
+        ((130, 10, 130, 130), 10),
+        ((53, 52, 130), 53),
+        ((0, 50, 52), 52),
+        ((0, 99), 1),
+        ((99, 52), 52),
+        ((99, 130), 1),
+    ],
 )
 def test_it_is_the_code_of_whoever_fared_worst(codes: tuple[int, ...], worst: int) -> None:
     assert fleet_exit_code([ended(code) for code in codes]) == worst
