@@ -98,8 +98,16 @@ class FleetOutcome:
     problems: tuple[str, ...] = ()
 
     @property
+    def unfinished(self) -> tuple[str, ...]:
+        """The vehicles without a result: they still fly, or nobody knows how they ended."""
+        names = (vehicle.name for vehicle in self.plan.fleet.vehicles)
+        return tuple(name for name in names if name not in self.results)
+
+    @property
     def exit_code(self) -> int:
-        return fleet_exit_code([*self.results.values()])
+        """That of whoever fared worst; a vehicle without a result counts as a failure."""
+        codes = [result.exit_code for result in self.results.values()]
+        return worst_code(codes + [PerchError.exit_code] * len(self.unfinished))
 
     @property
     def hanging(self) -> int:
@@ -123,6 +131,7 @@ class FleetOutcome:
             "exit_code": code,
             "error": None if code == 0 else EXIT_CODES[code],
             "hanging": self.hanging,
+            "unfinished": list(self.unfinished),
             "problems": list(self.problems),
             "ratio": None if ratio is None else round(ratio, 3),
             "vehicles": vehicles,
@@ -158,7 +167,7 @@ class FleetOutcome:
         }
 
     def text(self) -> str:
-        """The outcome for people, a line for each vehicle."""
+        """The outcome for people, a line for each vehicle that has ended."""
         lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
             outcome = result.outcome.value

@@ -92,6 +92,25 @@ def test_the_record_says_who_hangs_where_and_when(tmp_path: Path) -> None:
     assert "0.50 s of simulated time per second" in outcome.text()
 
 
+def test_a_record_of_a_fleet_that_still_flies_claims_no_success(tmp_path: Path) -> None:
+    """It is written again each time a vehicle ends, and stays if the command is killed."""
+    plan = make_plan(load_fleet())
+    names = [vehicle.name for vehicle in plan.fleet.vehicles]
+    flying = FleetOutcome(
+        plan=plan,
+        options=flight_options(plan, tmp_path, 3, None),
+        started=datetime(2026, 11, 30, tzinfo=UTC),
+        started_s=100.0,
+        results={names[0]: PERCHED},
+    )
+    record = flying.record()
+    assert (record["exit_code"], record["error"]) == (1, EXIT_CODES[1])
+    assert record["unfinished"] == names[1:]
+    ended_record = replace(flying, results=dict.fromkeys(names, PERCHED)).record()
+    assert (ended_record["exit_code"], ended_record["error"]) == (0, None)
+    assert ended_record["unfinished"] == []
+
+
 def test_each_simulated_vehicle_has_a_seed_and_a_target_of_its_own(tmp_path: Path) -> None:
     plan = make_plan(load_fleet())
     options = flight_options(plan, tmp_path, 0, None)
