@@ -24,7 +24,6 @@ from perchctl.commands.output import (
 )
 from perchctl.display import FleetPanel, FleetRow
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
-from perchctl.extensions import error_at
 from perchctl.files import write_files
 from perchctl.flight import (
     KEY_HELP,
@@ -38,7 +37,7 @@ from perchctl.flight import (
 DISPLAY_PERIOD_S = 0.1
 """Between two looks at the vehicles, for display and record. The orders do not wait for it."""
 ENDING_TIMEOUT_S = 90.0
-"""For vehicles to land and their processes to end by themselves after the fleet's own failure.
+"""For vehicles to land and their processes to end by themselves after a failure of the parent.
 Longer than a landing and the closing of link and log take. Shorter, and a process is ended whose
 vehicle may still fly; longer, and a command that has failed ends later."""
 NUMBER_KEYS = 9
@@ -117,7 +116,7 @@ class FleetSession:
         self._problems: list[str] = []
         self._slowed: set[str] = set()
         self._recorded = 0
-        self._failure: str | None = None
+        self._failed_s: float | None = None
         self._unwritten: str | None = None
 
     def fly(self, asks: bool) -> fleets.FleetOutcome:
@@ -131,7 +130,8 @@ class FleetSession:
                 self._wait_until_ready(coordinator)
                 if asks:
                     self._ask(coordinator)
-                self._fly(coordinator)
+                # The keys stop the vehicles until all have ended, also after an error.
+                self._fly(coordinator, stack)
             except BaseException as error:
                 self._end(error)
                 raise
@@ -149,18 +149,12 @@ class FleetSession:
             say(f"connecting to {len(self._options)} vehicles: {names}")
             coordinator = fleets.Coordinator(self._plan, self._children, self._switch)
             thread = threading.Thread(
-                target=self._coordinate, args=(coordinator, over), name="fleet", daemon=True
+                target=coordinator.run, args=(over,), name="fleet", daemon=True
             )
             thread.start()
             stack.callback(thread.join, 1.0)
             stack.callback(over.set)
             yield coordinator
-
-    def _coordinate(self, coordinator: fleets.Coordinator, over: threading.Event) -> None:
-        try:
-            coordinator.run(over)
-        except BaseException as error:  # no more orders: every vehicle lands by itself
-            self._failure = error_at(error)
 
     def _wait_until_ready(self, coordinator: fleets.Coordinator) -> None:
         while not coordinator.are_ready:
@@ -168,10 +162,17 @@ class FleetSession:
             self._refuse_failed(coordinator)
             time.sleep(DISPLAY_PERIOD_S)
         self._look(coordinator)
+        self._refuse_failed(coordinator)
 
     def _refuse_failed(self, coordinator: fleets.Coordinator) -> None:
-        """Once all have ended: raises the failure that has kept the fleet on the ground."""
+        """Raises the failure that has kept the fleet on the ground: the coordinator's, or that of a
+        vehicle once all have ended."""
         results = {v.name: v.result for v in coordinator.views if v.result is not None}
+        failure = coordinator.failure
+        if coordinator.started:  # asked last: it stays so
+            return
+        if failure is not None:
+            raise PerchError(f"{_failure_text(failure)}; no vehicle was armed")
         if len(results) == len(self._options):
             name = fleets.worst_of(results)
             error = fleets.as_error(name, results[name])
@@ -183,7 +184,7 @@ class FleetSession:
         if not ask_to_confirm(f"{question}Is the space under the targets clear?"):
             raise UsageError("not confirmed: nothing was started")
 
-    def _fly(self, coordinator: fleets.Coordinator) -> None:
+    def _fly(self, coordinator: fleets.Coordinator, stack: contextlib.ExitStack) -> None:
         names = list(self._options)
 
         def on_keys(keys: bytes) -> None:
@@ -193,27 +194,32 @@ class FleetSession:
                     coordinator.land(names[number - 1])
 
         self._switch.listening = True
-        with cut_key(self._switch, stdin_number(), on_keys) as has_keys:
-            one = f"Press 1 to {min(len(names), NUMBER_KEYS)} to land one."
-            help_lines = STOP_HELP, f"{KEY_HELP} {one}" if has_keys else ""
-            print_lines("\n".join(filter(None, help_lines)))
-            self._panel = FleetPanel(sys.stderr, help_lines)
-            coordinator.confirm()
-            while not coordinator.has_ended:
-                self._look(coordinator)
-                if not coordinator.started:
-                    self._refuse_failed(coordinator)
-                time.sleep(DISPLAY_PERIOD_S)
-        self._look(coordinator)
-        if not coordinator.started:
+        has_keys = stack.enter_context(cut_key(self._switch, stdin_number(), on_keys))
+        one = f"Press 1 to {min(len(names), NUMBER_KEYS)} to land one."
+        help_lines = STOP_HELP, f"{KEY_HELP} {one}" if has_keys else ""
+        print_lines("\n".join(filter(None, help_lines)))
+        self._panel = FleetPanel(sys.stderr, help_lines)
+        coordinator.confirm()
+        while not (coordinator.has_ended or self._is_given_up()):
+            self._look(coordinator)
             self._refuse_failed(coordinator)
+            time.sleep(DISPLAY_PERIOD_S)
+        self._look(coordinator)
+        self._refuse_failed(coordinator)
+        if coordinator.started:
+            self._write_record(coordinator)
+
+    def _is_given_up(self) -> bool:
+        """True once vehicles had their time to end after the coordinator's failure."""
+        now_s = time.monotonic()
+        return self._failed_s is not None and now_s - self._failed_s > ENDING_TIMEOUT_S
 
     def _look(self, coordinator: fleets.Coordinator) -> None:
-        """Show what is new, and keep the record. Raises PerchError if nobody orders any more."""
-        if self._failure is not None:
-            raise PerchError(
-                f"the fleet's orders have stopped ({self._failure}): every vehicle lands by itself"
-            )
+        """Show what is new, and keep the record."""
+        if coordinator.failure is not None and coordinator.started and self._failed_s is None:
+            self._failed_s = time.monotonic()
+            self._problems.append(f"{_failure_text(coordinator.failure)}: all vehicles land")
+            self._tell(self._problems[-1])
         views = coordinator.views
         for view in views:
             stage, reason = _stage_and_reason(view)
@@ -281,6 +287,7 @@ class FleetSession:
             started_s=self._started_s,
             results={v.name: v.result for v in coordinator.views if v.result is not None},
             problems=tuple(self._problems),
+            failed=coordinator.failure is not None,
         )
 
     def _end(self, error: BaseException) -> None:
@@ -299,6 +306,10 @@ class FleetSession:
                 say(self._panel.failure)
         if self._unwritten is not None:
             say(self._unwritten)
+
+
+def _failure_text(failure: str) -> str:
+    return f"the fleet's coordinator failed ({failure})"
 
 
 def _has_ended(child: fleets.VehicleProcess) -> bool:

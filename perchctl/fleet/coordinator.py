@@ -3,10 +3,15 @@
 `Coordinator.step` does one round and waits for nobody; `run` repeats it in a thread of its own. So
 neither a screen that stands still nor a question that nobody answers holds up a stop, and a parent
 whose rounds hang sends no more orders, upon which every vehicle lands by itself.
+
+What if a round raises? Then no judgement can be relied on, and `Coordinator.step_stopping` takes
+the place of `step` for good: it orders all to land, and to cut their motors if the operator says
+so. It needs neither the plan nor what the vehicles report.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -14,8 +19,8 @@ from dataclasses import replace
 from typing import Protocol
 
 from perchctl.errors import PerchError, SafetyAbort
+from perchctl.extensions import error_at
 from perchctl.fleet.dispatch import (
-    Decision,
     NearPair,
     VehicleView,
     are_all_ready,
@@ -24,7 +29,7 @@ from perchctl.fleet.dispatch import (
     find_unwatched,
 )
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
-from perchctl.fleet.outcome import worst_code
+from perchctl.fleet.outcome import LOOK_FIRST, worst_code
 from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator
@@ -68,6 +73,7 @@ class Coordinator:
         reasons: why vehicles were ordered to land, other than by the operator.
         near_pairs: pairs that were ordered to land, as they came too near each other.
         unwatched: vehicles in the air whose distance to another one is not known now.
+        failure: the error that a round has raised, since when all are ordered to land; else None.
     """
 
     def __init__(
@@ -81,6 +87,7 @@ class Coordinator:
         self.reasons: dict[str, str] = {}
         self.near_pairs: tuple[NearPair, ...] = ()
         self.unwatched: tuple[str, ...] = ()
+        self.failure: str | None = None
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
         self._landed: frozenset[str] = frozenset()
@@ -133,12 +140,36 @@ class Coordinator:
         decision = decide(self._plan, self._views, started=self.started, word=word, landed=landed)
         for name, why in decision.reasons.items():
             self.reasons.setdefault(name, why)
-        self._send(decision, now_s)
+        for name, order in decision.orders.items():
+            self._send(name, order, now_s)
 
     def run(self, until: threading.Event) -> None:
-        """Repeat `step` until `until` is set."""
+        """Repeat `step` until `until` is set; after a round that raised, `step_stopping`."""
         while not until.wait(ROUND_S):
-            self.step()
+            if self.failure is None:
+                try:
+                    self.step()
+                except Exception as error:
+                    self.failure = error_at(error)
+            if self.failure is not None:
+                self.step_stopping()
+
+    def step_stopping(self) -> None:
+        """Order all to land, or to cut their motors by the operator's word, and hear whom still can
+        be heard. What failed in one vehicle's place does not keep the others from their orders."""
+        now_s, word = self._clock(), self._switch.read()
+        order = Order(word=Operator.STOP if word is Operator.STOP else Operator.LAND)
+        for name in self._children:
+            with contextlib.suppress(Exception):
+                self._send(name, order, now_s)
+        views = []
+        for before in self._views:
+            try:
+                view = self._heard(before.name, self._children[before.name], now_s)
+            except Exception:
+                view = replace(before, silent_s=before.silent_s + ROUND_S)
+            views.append(view)
+        self._views = tuple(views)
 
     def _watch_distances(self) -> None:
         """Land both of two that are too near each other; they do not go on once they are apart."""
@@ -187,19 +218,18 @@ class Coordinator:
         return Result(
             exit_code=SafetyAbort.exit_code,
             outcome=VehicleOutcome.FAILED,
-            reason=f"{problem}: look where the vehicle is before you reach for it",
+            reason=f"{problem}: {LOOK_FIRST}",
             has_flown=True,
             log=None if status is None else status.log,
         )
 
-    def _send(self, decision: Decision, now_s: float) -> None:
-        for name, order in decision.orders.items():
-            due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
-            if name not in self._results and (due or order != self._sent.get(name)):
-                self._sent[name], self._sent_s[name] = order, now_s
-                if order.may_take_off:  # it need not have told of its take-off before it is lost
-                    self._may_have_flown.add(name)
-                self._children[name].send(order)
+    def _send(self, name: str, order: Order, now_s: float) -> None:
+        due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
+        if name not in self._results and (due or order != self._sent.get(name)):
+            self._sent[name], self._sent_s[name] = order, now_s
+            if order.may_take_off:  # it need not have told of its take-off before it is lost
+                self._may_have_flown.add(name)
+            self._children[name].send(order)
 
 
 def _explained(result: Result, why: str | None) -> Result:

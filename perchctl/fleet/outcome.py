@@ -30,6 +30,8 @@ from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import FlyOptions
 
 RECORD_NAME = "fleet.json"
+LOOK_FIRST = "look where the vehicle is before you reach for it"
+"""Advice on a vehicle of which nobody knows how it ended."""
 _WORST_FIRST: tuple[type[PerchError], ...] = (
     EmergencyStopped,
     SafetyAbort,
@@ -88,6 +90,7 @@ class FleetOutcome:
         started, started_s: when it began, as a date, and on `time.monotonic`.
         results: of the vehicles that have ended, by name.
         problems: what has befallen several of them, such as a dead dongle, a sentence each.
+        failed: the parent itself has failed, and landed all.
     """
 
     plan: FleetPlan
@@ -96,6 +99,7 @@ class FleetOutcome:
     started_s: float
     results: Mapping[str, Result]
     problems: tuple[str, ...] = ()
+    failed: bool = False
 
     @property
     def unfinished(self) -> tuple[str, ...]:
@@ -105,9 +109,11 @@ class FleetOutcome:
 
     @property
     def exit_code(self) -> int:
-        """That of whoever fared worst; a vehicle without a result counts as a failure."""
+        """That of whoever fared worst; a vehicle without a result counts as a failure, and so does
+        the parent's own."""
         codes = [result.exit_code for result in self.results.values()]
-        return worst_code(codes + [PerchError.exit_code] * len(self.unfinished))
+        failures = len(self.unfinished) + int(self.failed)
+        return worst_code(codes + [PerchError.exit_code] * failures)
 
     @property
     def hanging(self) -> int:
@@ -167,11 +173,12 @@ class FleetOutcome:
         }
 
     def text(self) -> str:
-        """The outcome for people, a line for each vehicle that has ended."""
+        """The outcome for people, a line for each vehicle."""
         lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
             outcome = result.outcome.value
             lines.append(vehicle_line(name, result.hangs, outcome, result.miss_m, result.reason))
+        lines += [f"{name:<12}unknown: {LOOK_FIRST}" for name in self.unfinished]
         ratio = self.ratio
         if ratio is not None and any(each.simulated for each in self.options.values()):
             lines.append(f"{'pace':<12}{ratio:.2f} s of simulated time per second")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -333,6 +334,74 @@ def test_a_stop_in_the_round_of_the_start_keeps_the_fleet_on_the_floor(
     assert rig.fleet.started == (rig.permitted != [])
     rig.fleet.step()
     assert rig.words == [Operator.LAND] * 4
+
+
+class Rounds(threading.Event):
+    """Lets `Coordinator.run` do so many rounds of `BEAT_S`, without waiting for any."""
+
+    def __init__(self, rig: Rig, count: int) -> None:
+        super().__init__()
+        self._rig, self._left = rig, count
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self._rig.now_s += BEAT_S
+        self._left -= 1
+        return self._left < 0
+
+
+@pytest.fixture
+def failed(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """Two fly, and a round has raised over the status of the first."""
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+
+    def newest() -> tuple[Status | None, float]:
+        raise RuntimeError("a status that nobody foresaw")
+
+    monkeypatch.setattr(rig["v0"], "newest", newest)
+    rig.fleet.run(Rounds(rig, 1))
+    return rig
+
+
+def test_a_round_that_raises_lands_all(failed: Rig) -> None:
+    assert "RuntimeError: a status that nobody foresaw" in (failed.fleet.failure or "")
+    assert failed.words == [Operator.LAND] * 4
+    assert failed.permitted == []
+
+
+def test_after_a_failure_the_operator_still_cuts_all_and_orders_are_repeated(failed: Rig) -> None:
+    before = len(failed["v1"].orders)
+    failed.fleet.run(Rounds(failed, 5))
+    assert failed.words == [Operator.LAND] * 4
+    assert len(failed["v1"].orders) - before == 5, "signs of life"
+    failed.switch.cut()
+    failed.fleet.run(Rounds(failed, 1))
+    assert failed.words == [Operator.STOP] * 4
+    assert failed.fleet.failure is not None
+
+
+def test_after_a_failure_nothing_takes_off_and_results_are_still_collected(failed: Rig) -> None:
+    failed["v1"].ended = PERCHED
+    failed.fleet.confirm()
+    failed.fleet.run(Rounds(failed, 2))
+    assert failed.permitted == []
+    views = {view.name: view for view in failed.fleet.views}
+    assert views["v1"].result == PERCHED
+    assert views["v0"].result is None
+    assert views["v0"].silent_s > 0.0
+    assert not failed.fleet.has_ended
+
+
+def test_one_that_cannot_be_ordered_keeps_no_other_from_its_order(
+    failed: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def send(order: Order) -> None:
+        raise RuntimeError("no way")
+
+    monkeypatch.setattr(failed["v0"], "send", send)
+    failed.switch.cut()
+    failed.fleet.run(Rounds(failed, 1))
+    assert failed.words[1:] == [Operator.STOP] * 3
 
 
 def test_a_key_lands_one_and_the_next_group_still_flies() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,10 +17,24 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
 from perchctl.commands.fly_fleet import FleetSession
 from perchctl.display.fleet_panel import FleetRow, fleet_table
-from perchctl.fleet import load_fleet, make_plan, prepare
+from perchctl.errors import PerchError
+from perchctl.fleet import (
+    FleetPlan,
+    Radios,
+    VehicleView,
+    coordinator,
+    flight_options,
+    load_fleet,
+    make_plan,
+    prepare,
+)
+from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
+from perchctl.flight import FlyOptions
+from perchctl.mission import Operator, Phase
 from perchctl.profile import load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -75,7 +90,9 @@ def test_a_dead_dongle_and_its_return_are_told_once(
     plan = make_plan(load_fleet())
     radios: Any = SimpleNamespace(problems=lambda: dict(problems))
     session = FleetSession(plan, {}, radios, tmp_path, datetime.now(UTC), 0.0)
-    nobody: Any = SimpleNamespace(views=(), started=False, near_pairs=(), unwatched=())
+    nobody: Any = SimpleNamespace(
+        views=(), started=False, near_pairs=(), unwatched=(), failure=None
+    )
     session._look(nobody)
     problems["0"] = "the radio hub has not reported for 1.1 s"
     session._look(nobody)
@@ -89,6 +106,87 @@ def test_a_dead_dongle_and_its_return_are_told_once(
         "perchctl: dongle 0: it works again",
     ]
     assert len(session._outcome(nobody).record()["problems"]) == 1
+
+
+class FakeProcess:
+    """A vehicle's process that is ready at once, flies once it may, and lands when ordered to."""
+
+    def __init__(self, name: str, options: FlyOptions) -> None:
+        self._status = Status(stage=Stage.READY)
+        self._result: Result | None = None
+        self.orders: list[Order] = []
+
+    def send(self, order: Order) -> None:
+        self.orders.append(order)
+        if order.may_take_off:
+            self._status = Status(stage=Stage.FLYING, phase=Phase.ALIGN)
+        elif order.word is not Operator.NONE and self._result is None:
+            self._result = Result(
+                exit_code=130,
+                outcome=VehicleOutcome.LANDED,
+                reason="operator",
+                has_flown=self._status.stage is Stage.FLYING,
+            )
+
+    def newest(self) -> tuple[Status | None, float]:
+        return self._status, time.monotonic()
+
+    def result(self) -> Result | None:
+        return self._result
+
+    def end_of_process(self) -> str | None:
+        return None
+
+    def kill(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSession:
+    """A session with fake processes, without a terminal."""
+    monkeypatch.setattr(fleets, "VehicleProcess", FakeProcess, raising=False)
+    plan = make_plan(load_fleet())
+    options = flight_options(plan, tmp_path, 0, None)
+    return FleetSession(plan, options, Radios({}), tmp_path, datetime.now(UTC), time.monotonic())
+
+
+def test_a_coordinator_that_fails_in_flight_lands_all_and_is_reported(
+    session: FleetSession,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def find_near_pairs(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[()]:
+        if any(view.is_in_air for view in views):
+            raise RuntimeError("nobody foresaw this")
+        return ()
+
+    monkeypatch.setattr(coordinator, "find_near_pairs", find_near_pairs)
+    outcome = session.fly(asks=False)
+    assert [each.outcome for each in outcome.results.values()] == [VehicleOutcome.LANDED] * 4
+    assert outcome.exit_code == 1
+    problem = "the fleet's coordinator failed (RuntimeError: nobody foresaw this"
+    assert outcome.problems[0].startswith(problem)
+    assert outcome.problems[0].endswith("all vehicles land")
+    assert f"{problem}" in capsys.readouterr().err
+    record = json.loads((tmp_path / "fleet.json").read_text())
+    assert (record["exit_code"], record["unfinished"]) == (1, [])
+
+
+def test_a_coordinator_that_fails_on_the_ground_is_an_error_and_nothing_is_armed(
+    session: FleetSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def find_near_pairs(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[()]:
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(coordinator, "find_near_pairs", find_near_pairs)
+    with pytest.raises(PerchError, match=r"coordinator failed .* no vehicle was armed"):
+        session.fly(asks=True)
+    processes: Any = session._children.values()
+    assert not any(order.may_take_off for each in processes for order in each.orders)
 
 
 def test_nobody_to_ask_is_no_yes(tmp_path: Path) -> None:

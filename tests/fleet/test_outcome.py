@@ -106,9 +106,13 @@ def test_a_record_of_a_fleet_that_still_flies_claims_no_success(tmp_path: Path) 
     record = flying.record()
     assert (record["exit_code"], record["error"]) == (1, EXIT_CODES[1])
     assert record["unfinished"] == names[1:]
+    for name in names[1:]:
+        assert f"{name:<12}unknown: look where the vehicle is" in flying.text()
     ended_record = replace(flying, results=dict.fromkeys(names, PERCHED)).record()
     assert (ended_record["exit_code"], ended_record["error"]) == (0, None)
     assert ended_record["unfinished"] == []
+    results = dict.fromkeys(names, PERCHED)
+    assert replace(flying, results=results, failed=True).exit_code == 1, "the parent's own failure"
 
 
 def test_each_simulated_vehicle_has_a_seed_and_a_target_of_its_own(tmp_path: Path) -> None:
