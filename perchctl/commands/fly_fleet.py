@@ -24,6 +24,7 @@ from perchctl.commands.output import (
 )
 from perchctl.display import FleetPanel, FleetRow
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.extensions import error_at
 from perchctl.files import write_files
 from perchctl.flight import (
     KEY_HELP,
@@ -215,34 +216,44 @@ class FleetSession:
         return self._failed_s is not None and now_s - self._failed_s > ENDING_TIMEOUT_S
 
     def _look(self, coordinator: fleets.Coordinator) -> None:
-        """Show what is new, and keep the record."""
+        """Show what is new, and keep the record. What raises in one part is reported once; it ends
+        no flight, and keeps no other part from its work."""
+        parts = (
+            self._look_at_coordinator,
+            self._look_at_stages,
+            self._look_at_radios,
+            self._look_at_distances,
+            self._show_rows,
+            self._keep_record,
+        )
+        for part in parts:
+            try:
+                part(coordinator)
+            except Exception as error:
+                self._report(f"the display failed: {error_at(error)}: the flights continue")
+
+    def _look_at_coordinator(self, coordinator: fleets.Coordinator) -> None:
         if coordinator.failure is not None and coordinator.started and self._failed_s is None:
             self._failed_s = time.monotonic()
-            self._problems.append(f"{_failure_text(coordinator.failure)}: all vehicles land")
-            self._tell(self._problems[-1])
-        views = coordinator.views
-        for view in views:
+            self._report(f"{_failure_text(coordinator.failure)}: all vehicles land")
+
+    def _look_at_stages(self, coordinator: fleets.Coordinator) -> None:
+        """Tell of each vehicle's new stage or phase, and how it ended."""
+        for view in coordinator.views:
             stage, reason = _stage_and_reason(view)
             # What has kept a fleet on the floor is one sentence, at its end.
             is_told = coordinator.started or view.result is None
             if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
-        for view in views:
+
+    def _look_at_radios(self, coordinator: fleets.Coordinator) -> None:
+        """Leave the share of a vehicle that has ended to the others. Tell of a dongle that is of no
+        use any more, or again."""
+        for view in coordinator.views:
             if view.result is not None and view.name not in self._slowed:
                 self._slowed.add(view.name)
                 self._radios.slow_down(self._options[view.name].uri)
-        self._look_at_radios()
-        self._look_at_distances(coordinator)
-        if self._panel is not None:
-            self._panel.show([_row(number, view) for number, view in enumerate(views, 1)])
-        ended = sum(view.result is not None for view in views)
-        if coordinator.started and ended > self._recorded:
-            self._recorded = ended
-            self._write_record(coordinator)
-
-    def _look_at_radios(self) -> None:
-        """Tell of a dongle that is of no use any more, or again."""
         before, self._radio_problems = self._radio_problems, self._radios.problems()
         for dongle in before.keys() - self._radio_problems.keys():
             self._tell(f"dongle {dongle}: it works again")
@@ -260,24 +271,46 @@ class FleetSession:
             for name in coordinator.unwatched
         ]
         for problem in (*near, *unknown):
-            if problem not in self._problems:
-                self._problems.append(problem)
-                self._tell(problem)
+            self._report(problem)
+
+    def _show_rows(self, coordinator: fleets.Coordinator) -> None:
+        if self._panel is not None:
+            views = enumerate(coordinator.views, 1)
+            self._panel.show([_row(number, view) for number, view in views])
+
+    def _keep_record(self, coordinator: fleets.Coordinator) -> None:
+        """Write the record again if another vehicle has ended."""
+        ended = sum(view.result is not None for view in coordinator.views)
+        if coordinator.started and ended > self._recorded:
+            self._recorded = ended
+            self._write_record(coordinator)
+
+    def _report(self, problem: str) -> None:
+        """Tell a problem, and put it into the record; once only."""
+        if problem not in self._problems:
+            self._problems.append(problem)
+            self._tell(problem)
 
     def _tell(self, line: str) -> None:
+        if self._panel is not None and self._panel.failure is not None:
+            say(self._panel.failure)
+            self._panel.close()
+            self._panel = None
         if self._panel is None:
             say(line)
         else:
             self._panel.event(f"[{time.monotonic() - self._started_s:7.2f} s] {line}")
 
     def _write_record(self, coordinator: fleets.Coordinator) -> None:
-        """Write what is known so far. A full disk is no reason to land."""
-        record = json.dumps(self._outcome(coordinator).record(), indent=1)
+        """Write what is known so far. A full disk is no reason to land, nor is any other error."""
         try:
+            record = json.dumps(self._outcome(coordinator).record(), indent=1)
             write_files({self._folder / fleets.RECORD_NAME: f"{record}\n".encode()})
             self._unwritten = None
         except (OSError, PerchError) as error:
             self._unwritten = f"{fleets.RECORD_NAME} cannot be written: {error}"
+        except Exception as error:
+            self._unwritten = f"{fleets.RECORD_NAME} cannot be written: {error_at(error)}"
 
     def _outcome(self, coordinator: fleets.Coordinator) -> fleets.FleetOutcome:
         return fleets.FleetOutcome(

@@ -20,9 +20,11 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
 from perchctl.commands.fly_fleet import FleetSession
+from perchctl.display import FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
 from perchctl.errors import PerchError
 from perchctl.fleet import (
+    FleetOutcome,
     FleetPlan,
     Radios,
     VehicleView,
@@ -108,8 +110,17 @@ def test_a_dead_dongle_and_its_return_are_told_once(
     assert len(session._outcome(nobody).record()["problems"]) == 1
 
 
+PERCHED = Result(
+    exit_code=0, outcome=VehicleOutcome.PERCHED, reason="hanging still", has_flown=True
+)
+
+
 class FakeProcess:
-    """A vehicle's process that is ready at once, flies once it may, and lands when ordered to."""
+    """A vehicle's process that is ready at once, flies once it may, and lands when ordered to.
+
+    With `END` it ends so after 0.3 s in the air."""
+
+    END: Result | None = None
 
     def __init__(self, name: str, options: FlyOptions) -> None:
         self._status = Status(stage=Stage.READY)
@@ -120,6 +131,8 @@ class FakeProcess:
         self.orders.append(order)
         if order.may_take_off:
             self._status = Status(stage=Stage.FLYING, phase=Phase.ALIGN)
+            if sum(order.may_take_off for order in self.orders) > 3:
+                self._result = self.END
         elif order.word is not Operator.NONE and self._result is None:
             self._result = Result(
                 exit_code=130,
@@ -174,6 +187,52 @@ def test_a_coordinator_that_fails_in_flight_lands_all_and_is_reported(
     assert f"{problem}" in capsys.readouterr().err
     record = json.loads((tmp_path / "fleet.json").read_text())
     assert (record["exit_code"], record["unfinished"]) == (1, [])
+
+
+def test_a_display_that_fails_is_reported_once_and_ends_no_flight(
+    session: FleetSession,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(session._radios, "problems", fail)
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    outcome = session.fly(asks=False)
+    assert [each.outcome for each in outcome.results.values()] == [VehicleOutcome.PERCHED] * 4
+    assert outcome.exit_code == 0
+    assert len(outcome.problems) == 1
+    assert outcome.problems[0].startswith("the display failed: RuntimeError: nobody foresaw this")
+    assert capsys.readouterr().err.count("nobody foresaw this") == 1
+    assert json.loads((tmp_path / "fleet.json").read_text())["hanging"] == 4
+
+
+def test_a_record_that_cannot_be_made_ends_no_flight(
+    session: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(FleetOutcome, "record", fail)
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    assert session.fly(asks=False).exit_code == 0
+    assert "fleet.json cannot be written: RuntimeError: nobody" in capsys.readouterr().err
+
+
+def test_events_are_still_told_once_the_panel_has_failed(
+    session: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(panel: FleetPanel) -> None:
+        raise RuntimeError("no room on the screen")
+
+    monkeypatch.setattr(FleetPanel, "_draw_once", fail)
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    session.fly(asks=False)
+    said = capsys.readouterr().err
+    assert said.count("the display failed: RuntimeError: no room on the screen") == 1
+    assert "west: hangs: hanging still" in said
 
 
 def test_a_coordinator_that_fails_on_the_ground_is_an_error_and_nothing_is_armed(
