@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import string
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -115,6 +117,7 @@ class FleetSession:
         self._told: dict[str, str] = {}
         self._radio_problems: dict[str, str] = {}
         self._problems: list[str] = []
+        self._answers: deque[str] = deque()  # to the keys, from their thread
         self._slowed: set[str] = set()
         self._recorded = 0
         self._failed_s: float | None = None
@@ -186,17 +189,14 @@ class FleetSession:
             raise UsageError("not confirmed: nothing was started")
 
     def _fly(self, coordinator: fleets.Coordinator, stack: contextlib.ExitStack) -> None:
-        names = list(self._options)
-
         def on_keys(keys: bytes) -> None:
             for key in keys:
-                number = key - ord("0")
-                if 1 <= number <= min(len(names), NUMBER_KEYS):
-                    coordinator.land(names[number - 1])
+                if (digit := chr(key)) in string.digits:
+                    self._answers.append(self._land_by_key(coordinator, int(digit)))
 
         self._switch.listening = True
         has_keys = stack.enter_context(cut_key(self._switch, stdin_number(), on_keys))
-        one = f"Press 1 to {min(len(names), NUMBER_KEYS)} to land one."
+        one = f"Press 1 to {self._keys} to land one."
         help_lines = STOP_HELP, f"{KEY_HELP} {one}" if has_keys else ""
         print_lines("\n".join(filter(None, help_lines)))
         self._panel = FleetPanel(sys.stderr, help_lines)
@@ -210,6 +210,24 @@ class FleetSession:
         if coordinator.started:
             self._write_record(coordinator)
 
+    @property
+    def _keys(self) -> int:
+        """How many vehicles have a key of their own."""
+        return min(len(self._options), NUMBER_KEYS)
+
+    def _land_by_key(self, coordinator: fleets.Coordinator, number: int) -> str:
+        """Land the vehicle with this number at once; return the answer to the operator. Called in
+        the keys' thread, which must not be held up."""
+        if not 1 <= number <= self._keys:
+            return f"no vehicle has the key {number}: press 1 to {self._keys} to land one"
+        view = coordinator.views[number - 1]
+        coordinator.land(view.name)
+        if view.result is not None:
+            return f"{view.name}: it has ended already"
+        if view.stage.is_before_takeoff:
+            return f"{view.name}: by key {number}, it does not take off"
+        return f"{view.name}: by key {number}, it lands"
+
     def _is_given_up(self) -> bool:
         """True once vehicles had their time to end after the coordinator's failure."""
         now_s = time.monotonic()
@@ -220,6 +238,7 @@ class FleetSession:
         no flight, and keeps no other part from its work."""
         parts = (
             self._look_at_coordinator,
+            self._answer_keys,
             self._look_at_stages,
             self._look_at_radios,
             self._look_at_distances,
@@ -236,6 +255,10 @@ class FleetSession:
         if coordinator.failure is not None and coordinator.started and self._failed_s is None:
             self._failed_s = time.monotonic()
             self._report(f"{_failure_text(coordinator.failure)}: all vehicles land")
+
+    def _answer_keys(self, _: fleets.Coordinator) -> None:
+        while self._answers:
+            self._tell(self._answers.popleft())
 
     def _look_at_stages(self, coordinator: fleets.Coordinator) -> None:
         """Tell of each vehicle's new stage or phase, and how it ended."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from perchctl.errors import PerchError, SafetyAbort
+from perchctl.errors import InvalidValue, PerchError, SafetyAbort
 from perchctl.extensions import error_at
 from perchctl.fleet.dispatch import (
     NearPair,
@@ -121,7 +121,11 @@ class Coordinator:
         self._confirmed = True
 
     def land(self, name: str) -> None:
-        """Land one vehicle; one on the floor does not take off any more."""
+        """Land one vehicle; one on the floor does not take off any more. Raises InvalidValue if
+        the fleet has no vehicle of this name."""
+        if name not in self._children:
+            known = ", ".join(self._children)
+            raise InvalidValue(f"the fleet has no vehicle {name!r}; it has {known}")
         self._landed = self._landed | {name}
 
     # --- one round ---

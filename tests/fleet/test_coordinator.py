@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from perchctl.corridor import Point
+from perchctl.errors import InvalidValue
 from perchctl.fleet import make_plan
 from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, Coordinator
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
@@ -416,6 +417,12 @@ def test_a_key_lands_one_and_the_next_group_still_flies() -> None:
     )
     rig.end("v1")
     assert {"v2", "v3"} <= set(rig.permitted)
+
+
+def test_a_name_that_the_fleet_lacks_is_refused() -> None:
+    rig = Rig().started()
+    with pytest.raises(InvalidValue, match=r"no vehicle 'v9'; it has v0, v1, v2, v3"):
+        rig.fleet.land("v9")
 
 
 def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,11 +19,13 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
+from perchctl.commands import fly_fleet
 from perchctl.commands.fly_fleet import FleetSession
 from perchctl.display import FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
 from perchctl.errors import PerchError
 from perchctl.fleet import (
+    Coordinator,
     FleetOutcome,
     FleetPlan,
     Radios,
@@ -35,7 +37,7 @@ from perchctl.fleet import (
     prepare,
 )
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
-from perchctl.flight import FlyOptions
+from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.mission import Operator, Phase
 from perchctl.profile import load_profile
 from perchctl.record import read_log
@@ -118,7 +120,7 @@ PERCHED = Result(
 class FakeProcess:
     """A vehicle's process that is ready at once, flies once it may, and lands when ordered to.
 
-    With `END` it ends so after 0.3 s in the air."""
+    With `END` it ends so after 0.7 s in the air."""
 
     END: Result | None = None
 
@@ -131,7 +133,7 @@ class FakeProcess:
         self.orders.append(order)
         if order.may_take_off:
             self._status = Status(stage=Stage.FLYING, phase=Phase.ALIGN)
-            if sum(order.may_take_off for order in self.orders) > 3:
+            if sum(order.may_take_off for order in self.orders) > 7:
                 self._result = self.END
         elif order.word is not Operator.NONE and self._result is None:
             self._result = Result(
@@ -233,6 +235,48 @@ def test_events_are_still_told_once_the_panel_has_failed(
     said = capsys.readouterr().err
     assert said.count("the display failed: RuntimeError: no room on the screen") == 1
     assert "west: hangs: hanging still" in said
+
+
+def test_each_number_key_is_answered(
+    session: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @contextlib.contextmanager
+    def keys(
+        switch: OperatorSwitch, terminal: int, on_keys: Callable[[bytes], None]
+    ) -> Iterator[bool]:
+        def press(coordinator: Coordinator) -> None:
+            if coordinator.started and not pressed:
+                pressed.append(b"0x41\x00\xb2")
+                on_keys(pressed[0])
+
+        monkeypatch.setattr(session, "_show_rows", press)
+        yield True
+
+    pressed: list[bytes] = []
+    monkeypatch.setattr(fly_fleet, "cut_key", keys)
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    outcome = session.fly(asks=False)
+    ends = [each.outcome.value for each in outcome.results.values()]
+    assert ends == ["landed", "perched", "perched", "landed"]
+    said = [re.sub(r"^\[.*\] ", "", line) for line in capsys.readouterr().err.splitlines()]
+    assert [line for line in said if "key" in line and "cuts" not in line] == [
+        "no vehicle has the key 0: press 1 to 4 to land one",
+        "west: by key 4, it does not take off",
+        "north: by key 1, it lands",
+    ]
+
+
+def test_a_number_key_is_answered_by_what_it_does(session: FleetSession) -> None:
+    flying = Status(stage=Stage.FLYING, phase=Phase.ALIGN)
+    views = (
+        VehicleView(name="north", status=flying),
+        VehicleView(name="east", status=flying, result=PERCHED),
+    )
+    landed: list[str] = []
+    fleet: Any = SimpleNamespace(views=views, land=landed.append)
+    assert session._land_by_key(fleet, 1) == "north: by key 1, it lands"
+    assert session._land_by_key(fleet, 2) == "east: it has ended already"
+    assert landed == ["north", "east"]
 
 
 def test_a_coordinator_that_fails_on_the_ground_is_an_error_and_nothing_is_armed(
