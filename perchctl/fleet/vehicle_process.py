@@ -44,18 +44,21 @@ def main(channel: Channel) -> None:
             line = ParentLine(channel, switch)
         except (EOFError, OSError, Interrupted):  # the parent is gone, or wants no flight any more
             return
+        reporter = StatusReporter(line, switch)
         try:
-            result = fly_vehicle(options, switch, line)
+            result = fly_vehicle(options, switch, line, reporter)
         except BaseException as error:  # a signal while another failure was being dealt with
-            result = StatusReporter(line, switch).result_of_error(error, None, lost=switch.lost)
+            result = reporter.failure or reporter.result_of_error(error, lost=switch.lost)
         line.finish(result)
     sys.stdout.flush()
     os._exit(0)  # a library's thread that hangs must not keep the process
 
 
-def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> Result:
-    """Fly once; whatever happens becomes a `Result`."""
-    reporter = StatusReporter(line, switch)
+def fly_vehicle(
+    options: FlyOptions, switch: ParentSwitch, line: ParentLine, reporter: StatusReporter
+) -> Result:
+    """Fly once; whatever happens becomes a `Result`. A second error, while the first is being dealt
+    with, is raised: `reporter` knows how far the flight has come."""
     log: LogWatcher | None = None
     try:
         line.may_interrupt = True
@@ -79,9 +82,10 @@ def fly_vehicle(options: FlyOptions, switch: ParentSwitch, line: ParentLine) -> 
         return reporter.result_of(outcome, summary, str(log.path), lost=switch.lost)
     except BaseException as error:
         line.may_interrupt = False
+        result = reporter.failure = reporter.result_of_error(error, lost=switch.lost)
         if log is not None:
             log.abandon(str(error) or type(error).__name__)
-        return reporter.result_of_error(error, log, lost=switch.lost)
+        return result
 
 
 class ParentLine:
@@ -172,6 +176,7 @@ class StatusReporter(Watcher):
 
     Attributes:
         log: the file of the flight's log, once it is open.
+        failure: the result of a flight that has raised.
     """
 
     name = "the status for the fleet"
@@ -179,6 +184,7 @@ class StatusReporter(Watcher):
 
     def __init__(self, line: ParentLine, switch: ParentSwitch) -> None:
         self.log: str | None = None
+        self.failure: Result | None = None
         self._line, self._switch = line, switch
         self._first: tuple[float, float, float] | None = None  # loop, wall and computing time, s
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -224,9 +230,7 @@ class StatusReporter(Watcher):
             log=log,
         )
 
-    def result_of_error(
-        self, error: BaseException, log: LogWatcher | None, *, lost: str | None
-    ) -> Result:
+    def result_of_error(self, error: BaseException, *, lost: str | None) -> Result:
         """The result of a flight that raised: refused on the ground, or rescued in the air."""
         match error:
             case PerchError():
@@ -241,7 +245,7 @@ class StatusReporter(Watcher):
         if lost is not None:
             reason = f"{lost}: {reason}"
         result = self._result(code, VehicleOutcome.FAILED, reason)
-        return replace(result, log=str(log.path) if log is not None and log.has_begun else None)
+        return replace(result, log=None if self._tick is None else self.log)  # deleted without one
 
     def _result(self, code: int, outcome: VehicleOutcome, reason: str) -> Result:
         tick = self._tick

@@ -1,0 +1,65 @@
+"""The process of one vehicle: what it tells its parent, and what it takes from it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from perchctl.children import Channel
+from perchctl.errors import Interrupted
+from perchctl.fleet import flight_options, load_fleet, make_plan, vehicle_process
+from perchctl.fleet.messages import Result, Status, VehicleOutcome
+from perchctl.flight import FlyOptions
+from tests.helpers.live_page import tick
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[Channel, Channel]]:
+    """The parent's and the vehicle's end of a line."""
+    parent, vehicle = (Channel(each.detach()) for each in socket.socketpair())
+    with parent, vehicle:
+        yield parent, vehicle
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> FlyOptions:
+    return flight_options(make_plan(load_fleet()), tmp_path, 0, None)["north"]
+
+
+def received(parent: Channel) -> tuple[list[Status], Result]:
+    """All statuses and the result that a vehicle's process has sent."""
+    statuses = []
+    while not isinstance(message := parent.receive(5.0), Result):
+        statuses.append(message)
+    return statuses, message
+
+
+def test_a_second_error_does_not_hide_that_the_vehicle_has_flown(
+    ends: tuple[Channel, Channel], options: FlyOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal comes while the log of a flight that raised is being closed."""
+
+    def fly_session(options: FlyOptions, watchers: Any, *_: object, **__: object) -> None:
+        for watcher in watchers:
+            watcher.tick(tick())
+        raise RuntimeError("nobody foresaw this")
+
+    def abandon(log: object, reason: str) -> None:
+        raise Interrupted("a second signal")
+
+    parent, vehicle = ends
+    monkeypatch.setattr(vehicle_process, "fly_session", fly_session)
+    monkeypatch.setattr(vehicle_process.LogWatcher, "abandon", abandon)
+    monkeypatch.setattr(vehicle_process.os, "_exit", lambda code: None)
+    parent.send(options)
+    vehicle_process.main(vehicle)
+    _, result = received(parent)
+    assert result.has_flown
+    assert (result.outcome, result.exit_code) == (VehicleOutcome.FAILED, 1)
+    assert "nobody foresaw this" in result.reason, "the first error"
+    assert result.log is not None
+    assert Path(result.log).is_file()
