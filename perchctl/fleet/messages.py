@@ -129,7 +129,8 @@ class Result:
     Attributes:
         has_flown: False if it has never left the floor by its own doing.
         ended_s: `time.monotonic` at its last tick, None without one; one clock for all processes.
-        place_m: its last place, in the axes of its estimate.
+        place_m: its last place, in the axes of its estimate; None if the estimate could not be
+            trusted then, or was old.
     """
 
     exit_code: int

@@ -18,6 +18,7 @@ import time
 from dataclasses import replace
 
 from perchctl.children import Channel
+from perchctl.corridor import Point
 from perchctl.errors import Interrupted, PerchError
 from perchctl.fleet.messages import BEAT_S, Pace, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
@@ -190,7 +191,7 @@ class StatusReporter(Watcher):
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._setpoint_s: float | None = None
         self._gaps_s: list[float] = []
-        self._rest = ""
+        self._rest: str | None = None  # of a vehicle that was rescued
         self._tick: Tick | None = None
 
     def may_take_off(self, waiting: str) -> bool:
@@ -240,7 +241,7 @@ class StatusReporter(Watcher):
             case _:
                 code = PerchError.exit_code
                 reason = f"unforeseen {type(error).__name__}: {error}"
-        if self._rest:
+        if self._rest is not None:
             reason = f"{reason}; {self._rest}"
         if lost is not None:
             reason = f"{lost}: {reason}"
@@ -253,9 +254,10 @@ class StatusReporter(Watcher):
             exit_code=code,
             outcome=outcome,
             reason=reason,
-            has_flown=tick is not None,
+            # The first setpoint is sent before its tick is seen; what fails in between is rescued.
+            has_flown=tick is not None or self._rest is not None,
             ended_s=None if tick is None else self._last[1],
-            place_m=None if tick is None else tick.telemetry.position_m[:2],
+            place_m=None if tick is None else _valid_place_m(tick),
             pace=self._pace(),
         )
 
@@ -290,6 +292,13 @@ def flight_status(tick: Tick) -> Status:
         telemetry_age_s=tick.telemetry_age_s,
         place_m=(x_m, y_m) if state.belief.is_position_trusted else None,
     )
+
+
+def _valid_place_m(tick: Tick) -> Point | None:
+    """Where the vehicle is, in the axes of its estimate; None if nobody knows."""
+    place_m = tick.telemetry.position_m[:2]
+    is_known = tick.state.belief.is_position_valid and all(map(math.isfinite, place_m))
+    return place_m if is_known else None
 
 
 def _say(sentence: str) -> None:

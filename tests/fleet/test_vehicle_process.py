@@ -10,10 +10,14 @@ from typing import Any
 import pytest
 
 from perchctl.children import Channel
-from perchctl.errors import Interrupted
+from perchctl.errors import Interrupted, SafetyAbort
 from perchctl.fleet import flight_options, load_fleet, make_plan, vehicle_process
 from perchctl.fleet.messages import Result, Status, VehicleOutcome
+from perchctl.fleet.parent_watch import ParentSwitch
+from perchctl.fleet.vehicle_process import StatusReporter
 from perchctl.flight import FlyOptions
+from perchctl.mission import Event, RestState, Tick
+from perchctl.values import replace
 from tests.helpers.live_page import tick
 
 
@@ -36,6 +40,50 @@ def received(parent: Channel) -> tuple[list[Status], Result]:
     while not isinstance(message := parent.receive(5.0), Result):
         statuses.append(message)
     return statuses, message
+
+
+class FakeLine:
+    """A line to a parent that is not there."""
+
+    def note_turn(self) -> None:
+        pass
+
+    def tell(self, status: Status) -> None:
+        pass
+
+
+@pytest.fixture
+def reporter() -> StatusReporter:
+    line: Any = FakeLine()
+    return StatusReporter(line, ParentSwitch())
+
+
+def result_at(reporter: StatusReporter, last: Tick) -> Result:
+    """Of a flight whose last tick this was."""
+    reporter.tick(last)
+    return reporter.result_of_error(SafetyAbort("so it was"), lost=None)
+
+
+def test_the_last_place_is_told_only_if_it_is_known(reporter: StatusReporter) -> None:
+    """The parent believes who says that it stands at its home, and lets its neighbour take off."""
+    good = tick()
+    assert result_at(reporter, good).place_m == good.telemetry.position_m[:2]
+    belief = good.state.belief
+    diverged = replace(good, state=replace(good.state, belief=replace(belief, diverged=True)))
+    assert result_at(reporter, diverged).place_m is None
+    later = replace(belief.obs, t_s=belief.obs.t_s + 30.0)
+    old = replace(good, state=replace(good.state, belief=replace(belief, obs=later)))
+    assert result_at(reporter, old).place_m is None
+
+
+def test_a_vehicle_that_was_rescued_before_its_first_tick_has_flown(
+    reporter: StatusReporter,
+) -> None:
+    error = RuntimeError("nobody foresaw this")
+    assert not reporter.result_of_error(error, lost=None).has_flown
+    reporter.event(Event.from_rescue(1.0, error, RestState.UNKNOWN, "it may fly"))
+    result = reporter.result_of_error(error, lost=None)
+    assert (result.has_flown, result.place_m) == (True, None)
 
 
 def test_a_second_error_does_not_hide_that_the_vehicle_has_flown(
