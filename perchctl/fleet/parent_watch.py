@@ -28,7 +28,7 @@ class ParentSwitch(OperatorSwitch):
     """An `OperatorSwitch` that is operated by the parent's orders.
 
     `take` and `lose_parent` are called by the thread that reads the orders. Silence is counted from
-    the first order on, by `read`, on `clock`.
+    the first reading on, by `read`, on `clock`.
     """
 
     may_take_off: bool = False
@@ -40,14 +40,16 @@ class ParentSwitch(OperatorSwitch):
     _counting: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def take(self, order: Order) -> None:
-        """Take an order in. Its word only adds to what was ordered before."""
+        """Take an order in. Its word only adds to what was ordered before; a lost parent that is
+        heard again can still cut the motors, but permits nothing."""
         self._heard = True
         if order.word is not Operator.NONE:
             self.land()
         if order.word is Operator.STOP:
             self.cut()
         # After the word: permission must not be read before it.
-        self.may_take_off = order.may_take_off and order.word is Operator.NONE
+        permitted = order.may_take_off and order.word is Operator.NONE
+        self.may_take_off = permitted and self.lost is None
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:
         """Land, and never take off: nobody can stop this vehicle any more."""

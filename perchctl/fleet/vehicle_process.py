@@ -20,10 +20,11 @@ from dataclasses import replace
 from perchctl.children import Channel
 from perchctl.corridor import Point
 from perchctl.errors import Interrupted, PerchError
-from perchctl.fleet.messages import BEAT_S, Pace, Result, Stage, Status, VehicleOutcome
+from perchctl.extensions import error_at
+from perchctl.fleet.messages import BEAT_S, Order, Pace, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
 from perchctl.flight import FlyOptions, fly_session, operator_signals
-from perchctl.mission import Event, Tick, Watcher
+from perchctl.mission import Event, Operator, Tick, Watcher
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
 
@@ -92,8 +93,9 @@ def fly_vehicle(
 class ParentLine:
     """The line to the parent, kept by a thread of its own; no method waits but `finish`.
 
-    If the parent is gone or sends nonsense, the vehicle lands. Before the flight loop listens, a
-    word ends the process's start as a signal would.
+    If the parent is gone or sends what is no order, the vehicle lands; in the latter case the line
+    goes on, as the operator may still have the motors cut. Before the flight loop listens, a word
+    ends the process's start as a signal would.
 
     Attributes:
         may_interrupt: the main thread can take an `Interrupted` now.
@@ -141,8 +143,12 @@ class ParentLine:
                     turned_s = self._turned_s
                     age_s = None if turned_s is None else now_s - turned_s
                     self._channel.send(replace(self._status, loop_age_s=age_s))
-        except Exception:  # EOFError, OSError; or bytes that are no message
+        except (EOFError, OSError):
             self._switch.lose_parent()
+            self._ended.set()
+            self._interrupt_start_alone()
+        except Exception as error:
+            self._switch.lose_parent(f"the line to the parent process failed ({error_at(error)})")
             self._ended.set()
             self._interrupt_start_alone()
         finally:
@@ -151,11 +157,28 @@ class ParentLine:
     def _take_orders(self) -> None:
         """Take all waiting orders in. After a pause of this process there are many, and permission
         counts only if the newest still gives it."""
-        order = self._channel.recv()
+        order = self._next_order()
         while self._channel.poll(0.0):
-            self._switch.take(replace(order, may_take_off=False))
-            order = self._channel.recv()
-        self._switch.take(order)
+            if order is not None:
+                self._switch.take(replace(order, may_take_off=False))
+            order = self._next_order()
+        if order is not None:
+            self._switch.take(order)
+
+    def _next_order(self) -> Order | None:
+        """The next message, if it is an order; else land, and return None. Raises EOFError or
+        OSError if the parent is gone."""
+        try:
+            message = self._channel.recv()
+        except (EOFError, OSError):
+            raise
+        except Exception as error:  # whatever unpickling it raises
+            self._switch.lose_parent(f"a message of the parent is unreadable ({error_at(error)})")
+            return None
+        if isinstance(message, Order) and isinstance(message.word, Operator):
+            return message
+        self._switch.lose_parent(f"the parent sent a {type(message).__name__} instead of an order")
+        return None
 
     def _interrupt_start_alone(self) -> None:
         """Without a parent: wait until the start can be interrupted, or the loop listens."""

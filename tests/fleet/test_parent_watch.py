@@ -59,6 +59,9 @@ def test_a_parent_that_comes_back_does_not_take_the_landing_back() -> None:
     readings(switch, clock, 2 * PARENT_SILENCE_S)
     switch.take(Order(may_take_off=True))
     assert switch.read() is Operator.LAND
+    assert not switch.may_take_off
+    switch.take(Order(word=Operator.STOP))
+    assert switch.read() is Operator.STOP
 
 
 def test_signs_of_life_keep_it_flying_for_ever() -> None:

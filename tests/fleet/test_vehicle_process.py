@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,13 +13,14 @@ import pytest
 from perchctl.children import Channel
 from perchctl.errors import Interrupted, SafetyAbort
 from perchctl.fleet import flight_options, load_fleet, make_plan, vehicle_process
-from perchctl.fleet.messages import Result, Status, VehicleOutcome
+from perchctl.fleet.messages import Order, Result, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
-from perchctl.fleet.vehicle_process import StatusReporter
+from perchctl.fleet.vehicle_process import ParentLine, StatusReporter
 from perchctl.flight import FlyOptions
-from perchctl.mission import Event, RestState, Tick
+from perchctl.mission import Event, Operator, RestState, Tick
 from perchctl.values import replace
 from tests.helpers.live_page import tick
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
@@ -40,6 +42,9 @@ def received(parent: Channel) -> tuple[list[Status], Result]:
     while not isinstance(message := parent.receive(5.0), Result):
         statuses.append(message)
     return statuses, message
+
+
+# --- The result ---
 
 
 class FakeLine:
@@ -111,3 +116,51 @@ def test_a_second_error_does_not_hide_that_the_vehicle_has_flown(
     assert "nobody foresaw this" in result.reason, "the first error"
     assert result.log is not None
     assert Path(result.log).is_file()
+
+
+# --- What comes from the parent ---
+
+
+@pytest.fixture
+def line(ends: tuple[Channel, Channel]) -> Iterator[tuple[Channel, ParentSwitch]]:
+    """The parent's end of a vehicle's line, and the switch that it operates."""
+    parent, vehicle = ends
+    switch = ParentSwitch(listening=True)
+    kept = ParentLine(vehicle, switch)
+    yield parent, switch
+    kept.finish(Result(exit_code=0, outcome=VehicleOutcome.PERCHED, reason="over"))
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        (pickle.dumps("land"), "the parent sent a str instead of an order"),
+        (pickle.dumps(Order(word="land")), "the parent sent a Order instead"),  # type: ignore[arg-type]
+        (b"no pickle", "a message of the parent is unreadable"),
+    ],
+    ids=["text", "word", "bytes"],
+)
+def test_what_is_no_order_lands_and_the_motors_can_still_be_cut(
+    line: tuple[Channel, ParentSwitch], sent: bytes, why: str
+) -> None:
+    parent, switch = line
+    parent.send(Order(may_take_off=True))
+    until(lambda: switch.may_take_off)
+    parent.send_bytes(sent)
+    until(lambda: switch.lost)
+    assert (switch.lost or "").startswith(why)
+    parent.send(Order(may_take_off=True))
+    parent.send(Order(may_take_off=True))
+    assert switch.read() is Operator.LAND
+    assert not switch.may_take_off
+    parent.send(Order(word=Operator.STOP))
+    until(lambda: switch.read() is Operator.STOP)
+    assert isinstance(parent.receive(1.0), Status), "it goes on telling where it is"
+
+
+def test_a_parent_that_is_gone_lands_the_vehicle(line: tuple[Channel, ParentSwitch]) -> None:
+    parent, switch = line
+    parent.close()
+    until(lambda: switch.lost)
+    assert switch.lost == "the parent process is gone"
+    assert switch.read() is Operator.LAND
