@@ -8,16 +8,17 @@ import threading
 import time
 from pathlib import Path
 
-from perchctl.children import Channel, last_line, spawn, wait_or_kill
+from perchctl.children import last_line, spawn, wait_or_kill
 from perchctl.errors import InvalidValue
-from perchctl.fleet.messages import Order, Result, Status
+from perchctl.extensions import error_at
+from perchctl.fleet.messages import Order, Result, Status, find_fault
 from perchctl.flight import FlyOptions
 
 PROCESS_END_TIMEOUT_S = 5.0
 """For a process to end after its result. Longer, and the fleet ends later; shorter, and one that is
 only slow is killed."""
 # The parent hears that it is up before the libraries are loaded.
-_CHILD = (
+VEHICLE_PROGRAM = (
     "from perchctl.children import connect_to_parent; channel = connect_to_parent(); "
     "from perchctl.fleet.vehicle_process import main; main(channel)"
 )
@@ -28,7 +29,7 @@ class VehicleProcess:
     it, with what it prints in a file of the flight's folder.
 
     A thread takes its messages in. One that is stopped in the middle of a message holds up that
-    thread only.
+    thread only. A message that cannot be used is left out, and `fault` says why.
     """
 
     def __init__(self, name: str, options: FlyOptions) -> None:
@@ -37,7 +38,8 @@ class VehicleProcess:
         self._status: Status | None = None
         self._result: Result | None = None
         self._heard_s = time.monotonic()
-        self._killed = self._closed = False
+        self._fault: str | None = None
+        self._closed = False
         self._output_path = Path(options.log_dir) / f"{name}.txt"
         try:
             self._output_path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,7 +49,7 @@ class VehicleProcess:
                 f"{self._output_path} cannot be written ({error.strerror}): name another folder "
                 f"with --log-dir"
             ) from None
-        self._process, self._channel = spawn(_CHILD, self._output)
+        self._process, self._channel = spawn(VEHICLE_PROGRAM, self._output)
         self.pid = self._process.pid
         with contextlib.suppress(OSError):  # it is gone already, which its end will tell
             self._channel.send(options)
@@ -67,17 +69,20 @@ class VehicleProcess:
     def result(self) -> Result | None:
         return self._result
 
+    def fault(self) -> str | None:
+        return self._fault
+
     def end_of_process(self) -> str | None:
         if self._reader.is_alive() or self._result is not None:
             return None
+        # One that runs without a line to the fleet lands its vehicle: it must not be ended yet.
         code = self._process.poll()
-        if code is None and not self._killed:
-            return "its process has closed the line to the fleet"
-        how = "" if code is None else f" (signal {-code})" if code < 0 else f" (exit {code})"
-        return f"its process has ended unexpectedly{how}{last_line(self._output)}"
+        if code is None:
+            return None
+        how = f"signal {-code}" if code < 0 else f"exit {code}"
+        return f"its process has ended unexpectedly ({how}){last_line(self._output)}"
 
     def kill(self) -> None:
-        self._killed = True
         self._process.kill()
 
     def close(self) -> None:
@@ -96,15 +101,23 @@ class VehicleProcess:
 
     def _read(self) -> None:
         with contextlib.suppress(EOFError, OSError):
-            while True:
-                message = self._receive()
-                self._heard_s = time.monotonic()
-                if isinstance(message, Status):
-                    self._status = message
-                elif isinstance(message, Result):
-                    self._result = message
-                    return
+            while self._result is None:
+                self._take_message()
 
-    def _receive(self) -> object:
-        channel: Channel = self._channel
-        return channel.receive()
+    def _take_message(self) -> None:
+        """Take the next message in. Raises EOFError or OSError if the process is gone."""
+        try:
+            message = self._channel.receive()
+        except (EOFError, OSError):
+            raise
+        except Exception as error:  # whatever unpickling it raises
+            self._fault = f"it sent what is unreadable ({error_at(error)})"
+            return
+        self._heard_s = time.monotonic()
+        fault = None if message is None else find_fault(message)  # None: it is up
+        if fault is not None:
+            self._fault = f"it sent {fault}"
+        elif isinstance(message, Status):
+            self._status = message
+        elif isinstance(message, Result):
+            self._result = message

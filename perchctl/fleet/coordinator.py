@@ -58,6 +58,9 @@ class Child(Protocol):
     def result(self) -> Result | None:
         """Its result, once it has sent one and ended."""
 
+    def fault(self) -> str | None:
+        """What it has sent that cannot be used, in words; None if there is nothing."""
+
     def end_of_process(self) -> str | None:
         """How the process has ended without a result, in words; None if it runs."""
 
@@ -92,6 +95,7 @@ class Coordinator:
         self._confirmed = False
         self._landed: frozenset[str] = frozenset()
         self._were_near: frozenset[str] = frozenset()
+        self._garbled: frozenset[str] = frozenset()
         self._results: dict[str, Result] = {}
         self._views = tuple(VehicleView(name=name) for name in children)
         self._sent: dict[str, Order] = {}
@@ -140,7 +144,8 @@ class Coordinator:
         if self._confirmed and are_all_ready(self._views) and word is Operator.NONE:
             self.started = True
         self._watch_distances()
-        landed = self._landed | self._were_near
+        self._watch_messages()
+        landed = self._landed | self._were_near | self._garbled
         decision = decide(self._plan, self._views, started=self.started, word=word, landed=landed)
         for name, why in decision.reasons.items():
             self.reasons.setdefault(name, why)
@@ -186,6 +191,14 @@ class Coordinator:
                 self.reasons.setdefault(name, pair.why(name))
             self._were_near |= both
 
+    def _watch_messages(self) -> None:
+        """Land whoever has sent what cannot be used: what it reports is not known then."""
+        for name, child in self._children.items():
+            fault = child.fault()
+            if fault is not None and name not in self._garbled:
+                self._garbled |= {name}
+                self.reasons.setdefault(name, fault)
+
     def _heard(self, name: str, child: Child, now_s: float) -> VehicleView:
         status, heard_s = child.newest()
         silent_s = now_s - max(heard_s, self._begun_s)
@@ -194,7 +207,7 @@ class Coordinator:
         if name not in self._results:
             result = child.result() or self._lost(name, child, status, silent_s)
             if result is not None:
-                if name in self._were_near and result.exit_code != 0:
+                if name in self._were_near | self._garbled and result.exit_code != 0:
                     code = worst_code((result.exit_code, SafetyAbort.exit_code))
                     result = replace(result, exit_code=code)
                 self._results[name] = _explained(result, self.reasons.get(name))

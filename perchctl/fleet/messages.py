@@ -149,3 +149,32 @@ class Result:
     def hangs(self) -> bool:
         """True if it is known to hang with its motors off."""
         return self.outcome is VehicleOutcome.PERCHED
+
+
+def find_fault(message: object) -> str | None:
+    """What is wrong with a message of a vehicle; None of a `Status` or `Result` whose parts that
+    decide something are of their types."""
+    match message:
+        case Status():
+            numbers = (message.telemetry_age_s, message.loop_age_s)
+            is_good = isinstance(message.stage, Stage) and all(map(_is_number, numbers))
+        case Result():
+            is_good = type(message.exit_code) is int
+            is_good = is_good and isinstance(message.outcome, VehicleOutcome)
+        case _:
+            return f"{type(message).__name__} instead of its status"
+    if not (is_good and _is_place(message.place_m)):
+        return f"{type(message).__name__} with parts of a wrong type"
+    return None
+
+
+def _is_number(value: object) -> bool:
+    return value is None or isinstance(value, int | float)
+
+
+def _is_place(value: object) -> bool:
+    if value is None:
+        return True
+    if not (isinstance(value, tuple) and len(value) == 2):
+        return False
+    return all(isinstance(part, int | float) for part in value)

@@ -34,6 +34,7 @@ class FakeChild:
     status: Status | None = None
     heard_s: float = 0.0
     ended: Result | None = None
+    garbled: str | None = None
     gone: str | None = None
     hangs: bool = False
     killed: bool = False
@@ -47,6 +48,9 @@ class FakeChild:
 
     def result(self) -> Result | None:
         return self.ended
+
+    def fault(self) -> str | None:
+        return self.garbled
 
     def end_of_process(self) -> str | None:
         return self.gone
@@ -403,6 +407,21 @@ def test_one_that_cannot_be_ordered_keeps_no_other_from_its_order(
     failed.switch.cut()
     failed.fleet.run(Rounds(failed, 1))
     assert failed.words[1:] == [Operator.STOP] * 3
+
+
+def test_one_that_sends_nonsense_lands_and_says_why() -> None:
+    rig = Rig().started()
+    rig.fly("v0", "v1")
+    rig["v0"].garbled = "it sent str instead of its status"
+    rig.pass_s()
+    rig["v0"].garbled = None
+    rig.pass_s()
+    assert rig.words == [Operator.LAND, *[Operator.NONE] * 3], "for good"
+    rig.end("v0", replace(ABORTED, outcome=VehicleOutcome.LANDED, exit_code=130))
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert result.reason.startswith("it sent str instead of its status: ")
+    assert result.exit_code == 52, "no operator has landed it"
 
 
 def test_a_key_lands_one_and_the_next_group_still_flies() -> None:

@@ -149,6 +149,9 @@ class FakeProcess:
     def result(self) -> Result | None:
         return self._result
 
+    def fault(self) -> str | None:
+        return None
+
     def end_of_process(self) -> str | None:
         return None
 
