@@ -23,6 +23,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from perchctl.corridor import Point
+from perchctl.errors import Interrupted
 from perchctl.fleet.fleet import FleetVehicle
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
@@ -111,7 +112,13 @@ def decide(
         landed: vehicles that the operator lands one by one.
     """
     ended = {view.name: view.result for view in views if view.result is not None}
-    failed = next((name for name, result in ended.items() if result.exit_code != 0), None)
+    # Whom the operator has landed alone has not failed, once the fleet flies.
+    by_key = {
+        name
+        for name, result in ended.items()
+        if started and name in landed and result.exit_code == Interrupted.exit_code
+    }
+    failed = next((n for n, r in ended.items() if r.exit_code != 0 and n not in by_key), None)
     group = next((g for g in plan.schedule.groups if not ended.keys() >= set(g)), ())
     orders, reasons = {}, {}
     for view in views:

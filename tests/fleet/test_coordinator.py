@@ -409,6 +409,16 @@ def test_one_that_cannot_be_ordered_keeps_no_other_from_its_order(
     assert failed.words[1:] == [Operator.STOP] * 3
 
 
+@pytest.mark.parametrize(("code", "word"), [(130, Operator.NONE), (52, Operator.LAND)])
+def test_a_vehicle_landed_by_key_has_not_failed_unless_it_has(code: int, word: Operator) -> None:
+    """The others continue also with ``on_failure: land-all``."""
+    rig = Rig(on_failure="land-all").started()
+    rig.fly("v0", "v1")
+    rig.fleet.land("v0")
+    rig.end("v0", replace(ABORTED, outcome=VehicleOutcome.LANDED, exit_code=code))
+    assert rig.words[1:] == [word] * 3
+
+
 def test_one_that_sends_nonsense_lands_and_says_why() -> None:
     rig = Rig().started()
     rig.fly("v0", "v1")
