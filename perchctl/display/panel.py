@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import threading
-from collections import deque
 from typing import TextIO
 
-from rich.console import Console
-from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from perchctl.display.terminal import (
+    PANEL_PERIOD_S,
+    TerminalDisplay,
+    age_text,
+    frame_table,
+    phase_style,
+)
 from perchctl.mission import Event, EventKind, ExternalPositions, Tick
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -34,8 +35,8 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
     stage = "none" if target is None else target.stage.value
     height_m = tick.telemetry.position_m[2] - state.belief.ground_z_m
     ages = (
-        f"link {_age(tick.telemetry_age_s)}   camera {_age(tick.camera_age_s)}"
-        f"   loop late {_age(tick.loop_late_s)}"
+        f"link {age_text(tick.telemetry_age_s)}   camera {age_text(tick.camera_age_s)}"
+        f"   loop late {age_text(tick.loop_late_s)}"
     )
     return [
         ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
@@ -69,11 +70,7 @@ def _whole(seconds: float) -> str:
 def _outside_text(outside: ExternalPositions) -> str:
     if outside.problem is not None:
         return outside.problem
-    return f"position {outside.rate_hz:.0f} Hz   {_age(outside.age_s)}"
-
-
-def _age(seconds: float) -> str:
-    return f"{1e3 * seconds:.0f} ms" if seconds < 10.0 else "none" if seconds > 1e6 else ">10 s"
+    return f"position {outside.rate_hz:.0f} Hz   {age_text(outside.age_s)}"
 
 
 def event_text(event: Event) -> str:
@@ -88,22 +85,7 @@ def event_text(event: Event) -> str:
     return f"{text} (simulated: {event.simulated})" if event.simulated else text
 
 
-# --- The live display: a panel on a terminal, one plain line an event elsewhere ---
-# The flight loop only leaves its newest tick and its events here; a thread of
-# the display's own draws them. So neither an exception nor a terminal that stands
-# still (Ctrl-S, a stalled ssh) reaches the loop.
-
-
-PANEL_PERIOD_S = 0.1
-PANEL_CLOSE_TIMEOUT_S = 1.0
-EVENTS_KEPT = 1000
-PANEL_COLUMNS = 78
-"""Of 80: a terminal echoes ^C behind the panel, which must not wrap."""
-
-_STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
-
-
-class FlightPanel:
+class FlightPanel(TerminalDisplay):
     """Watcher of the flight loop that prints events and, on a terminal, a status panel below them.
     No method raises, and only `close` waits (bounded). A failing display must not land the vehicle:
     `problem` is always None, `failure` says why the output stopped.
@@ -115,20 +97,11 @@ class FlightPanel:
     """Sentences in the panel's frame, at most 60 columns each: below, and above."""
 
     def __init__(self, stream: TextIO) -> None:
-        self.failure: str | None = None
-        self._stream = stream
-        self._live: Live | None = None
-        if stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
-            self._live = new_live(stream)
-        self._wake = threading.Event()
-        self._closing = threading.Event()
-        self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._tick: Tick | None = None
         self._drawn: Tick | None = None
         self._start_s: float | None = None
         self._next_s = -math.inf
-        self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
-        self._thread.start()
+        super().__init__(stream)
 
     def tick(self, tick: Tick) -> None:
         """Show a tick of the loop at once if its phase is new, else at most every 0.1 s; the last
@@ -143,57 +116,14 @@ class FlightPanel:
         """Print an event as one line, at once."""
         if self._start_s is None:
             self._start_s = event.t_s
-        self._lines.append(f"[{event.t_s - self._start_s:7.2f} s] {event_text(event)}")
-        self._wake.set()
+        self._add_line(f"[{event.t_s - self._start_s:7.2f} s] {event_text(event)}")
 
-    def close(self) -> None:
-        """Print what is pending and release the terminal; waits at most a second."""
-        self._closing.set()
-        self._wake.set()
-        self._thread.join(PANEL_CLOSE_TIMEOUT_S)
-
-    def _draw(self) -> None:
-        try:
-            with self._live or contextlib.nullcontext():
-                while not self._closing.is_set():
-                    self._wake.wait()
-                    self._wake.clear()
-                    self._draw_once()
-                    self._closing.wait(PANEL_PERIOD_S)  # in lockstep the loop's time runs faster
-                self._draw_once()
-        except Exception as error:
-            self.failure = f"the display failed: {error.__class__.__name__}: {error}"
-
-    def _draw_once(self) -> None:
-        while self._lines:
-            line = self._lines.popleft()
-            if self._live is not None:
-                self._live.console.print(Text(line), soft_wrap=True)
-            else:
-                self._stream.write(line + "\n")
-                self._stream.flush()
+    def _new_panel(self) -> Panel | None:
         tick = self._tick
-        if self._live is not None and tick is not None and tick is not self._drawn:
-            self._drawn = tick
-            self._live.update(status_panel(tick, *self.help), refresh=True)
-
-
-def phase_style(phase: str) -> str:
-    """How a phase is written on a terminal."""
-    return _STYLES.get(phase, "bold")
-
-
-def new_live(stream: TextIO) -> Live:
-    """A live display on a terminal, drawn by `update` only."""
-    console = Console(
-        file=stream,
-        force_terminal=True,
-        highlight=False,  # no colours in URIs and paths
-        markup=False,
-        emoji=False,
-    )
-    # stdout is for data and is left alone; what others write on stderr goes above the panel.
-    return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
+        if tick is None or tick is self._drawn:
+            return None
+        self._drawn = tick
+        return status_panel(tick, *self.help)
 
 
 def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
@@ -206,11 +136,4 @@ def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
         style = phase_style(tick.state.phase.value) if name == "phase" else ""
         style = "bold yellow" if name == "held" else style
         table.add_row(Text(name, style="dim"), Text(text, style=style))
-    return Panel(
-        table,
-        title=Text(f"perchctl: {above}" if above else "perchctl"),
-        subtitle=Text(below) if below else None,
-        title_align="left",
-        subtitle_align="left",
-        width=PANEL_COLUMNS,
-    )
+    return frame_table(table, below, above)

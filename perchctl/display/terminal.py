@@ -1,0 +1,119 @@
+"""What the panels of a flight and of a fleet share: lines, and on a terminal a panel below them.
+
+Whoever flies only leaves what is new here; a thread of the display's own draws it. So neither an
+exception nor a terminal that stands still (Ctrl-S, a stalled ssh) reaches the flight.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from typing import TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+PANEL_PERIOD_S = 0.1
+PANEL_CLOSE_TIMEOUT_S = 1.0
+EVENTS_KEPT = 1000
+PANEL_COLUMNS = 78
+"""Of 80: a terminal echoes ^C behind the panel, which must not wrap."""
+
+_STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
+
+
+class TerminalDisplay:
+    """Prints lines and, on a terminal, a panel below them, in a thread of its own.
+
+    No method raises, and only `close` waits (bounded). `failure` says why the output stopped.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.failure: str | None = None
+        self._stream = stream
+        is_terminal = stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+        self._live: Live | None = new_live(stream) if is_terminal else None
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
+        self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Print what is pending and release the terminal; waits at most a second."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join(PANEL_CLOSE_TIMEOUT_S)
+
+    def _add_line(self, line: str) -> None:
+        """Print a line above the panel, at once."""
+        self._lines.append(line)
+        self._wake.set()
+
+    def _new_panel(self) -> Panel | None:
+        """The panel, if it shows what the one before did not; called in the display's thread."""
+        return None
+
+    def _draw(self) -> None:
+        try:
+            with self._live or contextlib.nullcontext():
+                while not self._closing.is_set():
+                    self._wake.wait()
+                    self._wake.clear()
+                    self._draw_once()
+                    self._closing.wait(PANEL_PERIOD_S)  # in lockstep the loop's time runs faster
+                self._draw_once()
+        except Exception as error:
+            self.failure = f"the display failed: {error.__class__.__name__}: {error}"
+
+    def _draw_once(self) -> None:
+        while self._lines:
+            line = self._lines.popleft()
+            if self._live is not None:
+                self._live.console.print(Text(line), soft_wrap=True)
+            else:
+                self._stream.write(line + "\n")
+                self._stream.flush()
+        panel = None if self._live is None else self._new_panel()
+        if self._live is not None and panel is not None:
+            self._live.update(panel, refresh=True)
+
+
+def new_live(stream: TextIO) -> Live:
+    """A live display on a terminal, drawn by `update` only."""
+    console = Console(
+        file=stream,
+        force_terminal=True,
+        highlight=False,  # no colours in URIs and paths
+        markup=False,
+        emoji=False,
+    )
+    # stdout is for data and is left alone; what others write on stderr goes above the panel.
+    return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
+
+
+def frame_table(table: Table, below: str = "", above: str = "") -> Panel:
+    """A panel of `PANEL_COLUMNS` columns; `below` and `above` are sentences in its frame."""
+    return Panel(
+        table,
+        title=Text(f"perchctl: {above}" if above else "perchctl"),
+        subtitle=Text(below) if below else None,
+        title_align="left",
+        subtitle_align="left",
+        width=PANEL_COLUMNS,
+    )
+
+
+def phase_style(phase: str) -> str:
+    """How a phase is written on a terminal."""
+    return _STYLES.get(phase, "bold")
+
+
+def age_text(seconds: float) -> str:
+    """An age in at most six columns."""
+    return f"{1e3 * seconds:.0f} ms" if seconds < 10.0 else "none" if seconds > 1e6 else ">10 s"
