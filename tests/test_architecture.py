@@ -358,3 +358,35 @@ def test_a_constants_name_has_one_value() -> None:
             values.setdefault(name, {})[value] = module_name(path)
     assert len(values) > 500
     assert [f"{name}: {at}" for name, at in values.items() if len(at) > 1] == []
+
+
+ONE_VALUE_EACH = ("analysis", "commands", "fleet", "positioning")
+"""Packages in which also a constant that is no number has a value of its own in the whole code."""
+
+
+def constants_of(source: str) -> dict[str, str]:
+    """The module's constants, private ones too, each with its value as it is written."""
+    found = {}
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            pairs = [(target, node.value)]
+            if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                pairs = list(zip(target.elts, node.value.elts, strict=True))
+            for each, value in pairs:
+                is_type = ast.unparse(value).startswith(("TypeVar(", "ParamSpec("))
+                if isinstance(each, ast.Name) and each.id.isupper() and not is_type:
+                    found[each.id] = ast.unparse(value)
+    return found
+
+
+@pytest.mark.parametrize("package", ONE_VALUE_EACH)
+def test_a_name_of_these_packages_has_one_value(package: str) -> None:
+    values: dict[str, set[str]] = {}
+    for path in ROOT.rglob("*.py"):
+        for name, value in constants_of(path.read_text(encoding="utf-8")).items():
+            values.setdefault(name, set()).add(value)
+    own = [constants_of(p.read_text(encoding="utf-8")) for p in (ROOT / package).rglob("*.py")]
+    names = {name for each in own for name in each}
+    assert len(names) > 10
+    assert sorted(name for name in names if len(values[name]) > 1) == []

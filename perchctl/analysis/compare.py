@@ -10,7 +10,7 @@ from typing import Any
 from perchctl.analysis.flight import FlightAnalysis, Measures
 from perchctl.analysis.show import printable_text, with_hanging_indent
 
-_NAME, _CELL = 32, 14
+_HEADING, _CELL = 32, 14
 _NOT_THERE = "not there"
 
 
@@ -86,7 +86,9 @@ class FlightComparison:
         )
         for key, values in self.changed_keys.items():
             a, b = ("none" if value is None else value for value in values)
-            yield from with_hanging_indent(f"  {printable_text(key):<{_NAME - 2}}  ", f"{a}  {b}")
+            yield from with_hanging_indent(
+                f"  {printable_text(key):<{_HEADING - 2}}  ", f"{a}  {b}"
+            )
 
     def _measure_rows(self) -> Iterator[str]:
         a, b = (flight.measures for flight in self.flights)
@@ -111,7 +113,7 @@ def _flight_record(flight: FlightAnalysis) -> dict[str, Any]:
 
 
 def _row(name: str, a: str, b: str, difference: str) -> str:
-    return f"{name:<{_NAME}}{a:>{_CELL}}{b:>{_CELL}}{difference:>{_CELL}}".rstrip()
+    return f"{name:<{_HEADING}}{a:>{_CELL}}{b:>{_CELL}}{difference:>{_CELL}}".rstrip()
 
 
 def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, Any]]:

@@ -29,7 +29,7 @@ from perchctl.mission import Phase
 from perchctl.record import path_beside, read_log, recorded_pictures, wrap_log_errors
 
 UNFINISHED = "unfinished"
-TITLES = {
+OUTCOME_TITLES = {
     "perched": "Perched",
     "landed": "Landed",
     "aborted": "Aborted",
@@ -121,7 +121,8 @@ class ReportedFlight:
     def title(self) -> str:
         """The vehicle's name in a fleet, the outcome and, if known, the miss distance."""
         miss_m = self.flight.summary.miss_m
-        title = (f"{self.name}: " if self.name else "") + TITLES.get(self.outcome, self.outcome)
+        title = OUTCOME_TITLES.get(self.outcome, self.outcome)
+        title = f"{self.name}: {title}" if self.name else title
         return title if miss_m is None else f"{title}, {length_text(miss_m)} off centre"
 
     @property

@@ -29,7 +29,7 @@ ACTIONS = {
     "RECOVER": "it backed off",
     "LANDING": "it landed",
 }
-ENDS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
+FINAL_PHASE_TEXTS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
 SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH"})
 """Phases whose sentence tells where the target was as they began."""
 MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
@@ -64,8 +64,8 @@ def _step(flight: FlightAnalysis, stay: PhaseSpan) -> Sentence:
     text = _upper(stay.reason)
     if stay.phase in SIGHTED:
         text += _where(flight, stay.start_s)
-    if stay.phase in ENDS:
-        text = f"{ENDS[stay.phase]}: {stay.reason}".rstrip(": ")
+    if stay.phase in FINAL_PHASE_TEXTS:
+        text = f"{FINAL_PHASE_TEXTS[stay.phase]}: {stay.reason}".rstrip(": ")
     else:
         text = f"{text}: {ACTIONS.get(stay.phase, stay.phase)}"
     if stay.simulated:

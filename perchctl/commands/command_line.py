@@ -73,14 +73,14 @@ COMMANDS: dict[str, str] = {
 
 _CLOSE = 0.75
 """Alike enough to be a misspelt command rather than a file's name."""
-_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
+_CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
 class Group(TyperGroup):
     """A group of subcommands; the first is the main subcommand, which runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        named = (*self.commands, *_SETTINGS["help_option_names"])
+        named = (*self.commands, *_CONTEXT_SETTINGS["help_option_names"])
         # A shell that completes words asks for what may come, and wants no main one.
         if not ctx.resilient_parsing and (not args or args[0] not in named):
             # A file or a source has more in its name than letters.
@@ -96,7 +96,9 @@ class Group(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help of the main subcommand, with the others listed below it."""
         name, main_command = next(iter(self.commands.items()))
-        inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
+        inner = typer.Context(
+            main_command, info_name=ctx.info_name, parent=ctx.parent, **_CONTEXT_SETTINGS
+        )
         main_command.format_help(inner, formatter)
         with formatter.section(f"Subcommands (default: {name})"):
             formatter.write_dl(
@@ -135,7 +137,7 @@ def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
         add_completion=cls is _Commands,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
-        context_settings=_SETTINGS,
+        context_settings=_CONTEXT_SETTINGS,
     )
 
 

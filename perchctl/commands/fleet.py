@@ -73,7 +73,7 @@ def check(
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
-    loaded = fleets.load_fleet(file or fleets.EXAMPLE)
+    loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     refusal: InvalidValue | None = None
     plan: fleets.FleetPlan | None = None
     try:
@@ -130,7 +130,7 @@ def fly(
     stay. Press it again to cut the motors. The space bar cuts the motors at once. The key with a
     vehicle's number lands that one. The exit code is 0 only if all vehicles hang.
     """
-    loaded = fleets.load_fleet(file or fleets.EXAMPLE)
+    loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     try:
         plan = fleets.make_plan(loaded)
     except InvalidValue as error:
@@ -232,7 +232,7 @@ def simulate(
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
     names = () if faults is None else fleets.select_fleet_faults(faults)
-    loaded = fleets.load_fleet(file or fleets.EXAMPLE)
+    loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     try:
         plan = fleets.make_plan(loaded)
     except InvalidValue as error:

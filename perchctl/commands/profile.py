@@ -81,12 +81,12 @@ def _say_doubts(profile: Profile) -> None:
 
 # --- A new profile ---
 
-EXAMPLE = "example_640x480.yaml"
+EXAMPLE_CALIBRATION = "example_640x480.yaml"
 SIMULATED = "sim://"
 QUESTIONS: dict[str, str] = {
     "link.uri": "radio://0/80/2M/E7E7E7E7E7",
     "camera.source": "camera:0",
-    "camera.calibration": EXAMPLE,
+    "camera.calibration": EXAMPLE_CALIBRATION,
     "camera.latency_s": "0.08",
     "front": "top",
     "left": "",

@@ -32,13 +32,13 @@ from perchctl.profile import (
     target_keys,
 )
 
-EXAMPLE = "four"
+EXAMPLE_FLEET = "four"
 """The shipped fleet that is used where none is named."""
 FARTHEST_M = 50.0
 """Of a home or target from the room's origin: farther off, millimetres were meant."""
 _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
+_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
 _PROFILE_KEYS = tuple(name for name in Profile.model_fields if name not in ("name", "description"))
 _SECTIONS = tuple(name for name in _PROFILE_KEYS if name != "date")
 _ALSO_TEXT = ("target", "positioning")
@@ -56,7 +56,7 @@ class _Common(Section):
 
 
 class _Vehicle(_Common):
-    name: str = key(..., "name of the vehicle", pattern=_NAME)
+    name: str = key(..., "name of the vehicle", pattern=_NAME_PATTERN)
     home_m: tuple[_Length, _Length] = key(..., "where it stands before take-off: x, y")
     target_m: tuple[_Length, _Length] | None = key(None, "where its target hangs: x, y")
     body: str | None = key(None, "its rigid body in the motion capture", min_length=1)
@@ -90,7 +90,7 @@ def find_fleet(name: str) -> Path:
     return found
 
 
-def load_fleet(name: str | Path = EXAMPLE) -> Fleet:
+def load_fleet(name: str | Path = EXAMPLE_FLEET) -> Fleet:
     """The fleet with path or name `name`, checked, each vehicle with its profile and target.
 
     Errors: NotFound, InvalidValue.

@@ -56,14 +56,16 @@ CAUSE_S = (1.0, 25.0)
 FOR_GOOD_S = 1e3
 """A common cause that lasts longer than any flight is over for no later group."""
 _FAULT_STREAM = 32
-_BY_NAME = {fault.name: fault for fault in FAULTS}
-_CAUSES = {cause.name: cause for cause in COMMON_CAUSES}
+_FAULT_BY_NAME = {fault.name: fault for fault in FAULTS}
+_CAUSE_BY_NAME = {cause.name: cause for cause in COMMON_CAUSES}
 
 
 def fleet_faults() -> dict[str, str]:
     """All faults of one vehicle and all common causes: name and description."""
-    causes = {name: f"in several vehicles: {c.fault.description}" for name, c in _CAUSES.items()}
-    return {name: fault.description for name, fault in _BY_NAME.items()} | causes
+    causes = {
+        name: f"in several vehicles: {c.fault.description}" for name, c in _CAUSE_BY_NAME.items()
+    }
+    return {name: fault.description for name, fault in _FAULT_BY_NAME.items()} | causes
 
 
 def plan_sha256(plan: FleetPlan) -> str:
@@ -77,9 +79,9 @@ def select_fleet_faults(names: str) -> tuple[str, ...]:
     """The names of faults and common causes that stand in `names` between commas; ``all``: every
     fault and every cause. Errors: UsageError."""
     if names == "all":
-        return (*_BY_NAME, *_CAUSES)
+        return (*_FAULT_BY_NAME, *_CAUSE_BY_NAME)
     found = [part.strip() for part in names.split(",")]
-    unknown = next((name for name in found if name not in {*_BY_NAME, *_CAUSES}), None)
+    unknown = next((name for name in found if name not in {*_FAULT_BY_NAME, *_CAUSE_BY_NAME}), None)
     if unknown is not None:
         raise UsageError(f"fault {unknown!r} is unknown; `--faults list` shows all there are")
     return tuple(found)
@@ -111,11 +113,11 @@ def draw_trouble(
     rng = np.random.default_rng([seed, _FAULT_STREAM])
     name = faults[int(rng.integers(len(faults)))]
     number = int(rng.integers(len(placed)))
-    if name in _BY_NAME:
+    if name in _FAULT_BY_NAME:
         one = placed[number]
-        case = draw_case(vehicle_seed(seed, number), one.scenario, [_BY_NAME[name]])
+        case = draw_case(vehicle_seed(seed, number), one.scenario, [_FAULT_BY_NAME[name]])
         return Trouble(name=name, cases={one.name: case})
-    cause = _CAUSES[name]
+    cause = _CAUSE_BY_NAME[name]
     case = cause.draw(rng, placed[number].scenario)
     whom = _whom(cause.whom, plan, [each.name for each in placed], number, rng)
     cases = dict.fromkeys(whom, case)

@@ -38,7 +38,7 @@ UP_TIMEOUT_S = 15.0
 """Time for the child's Python to start, s: a busy computer is not a silent motion capture."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
-_CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
+CAPTURE_PROGRAM = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class MotionCapture:
         self._ended: str | None = None
         self._failed: CaptureFailure | None = None
         self._last_line = ""
-        self._child, self._channel = spawn(_CHILD, subprocess.PIPE)
+        self._child, self._channel = spawn(CAPTURE_PROGRAM, subprocess.PIPE)
         self._threads = [threading.Thread(target=self._read_output, daemon=True)]
         self._threads[0].start()
         try:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.story import ACTIONS, ENDS, Sentence, tell_story
+from perchctl.analysis.story import ACTIONS, FINAL_PHASE_TEXTS, Sentence, tell_story
 from perchctl.mission import Phase
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
@@ -25,7 +25,7 @@ def only(told: list[Sentence], words: str) -> Sentence:
 
 
 def test_each_phase_has_its_sentence_at_its_time() -> None:
-    assert {*ACTIONS, *ENDS} == {phase.value for phase in Phase}
+    assert {*ACTIONS, *FINAL_PHASE_TEXTS} == {phase.value for phase in Phase}
     told = story()
     steps = [s for s in told if s.grade in ("step", "good") and "motors were" not in s.text]
     begins, at_s = [], 0.0
