@@ -235,7 +235,15 @@ class StatusReporter(Watcher):
             self._setpoint_s = now_s
         else:
             self._setpoint_s = None
-        self._line.tell(replace(flight_status(tick), log=self.log))
+        try:
+            status = flight_status(tick)
+        except Exception as error:  # a reporter that is detached looks like a loop that hangs
+            status = Status(
+                stage=Stage.FLYING,
+                phase=tick.state.phase,
+                reason=f"its status is unknown: {error_at(error)}",
+            )
+        self._line.tell(replace(status, log=self.log))
 
     def event(self, event: Event) -> None:
         if event.rest is not None:

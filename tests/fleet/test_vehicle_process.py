@@ -13,11 +13,11 @@ import pytest
 from perchctl.children import Channel
 from perchctl.errors import Interrupted, SafetyAbort
 from perchctl.fleet import flight_options, load_fleet, make_plan, vehicle_process
-from perchctl.fleet.messages import Order, Result, Status, VehicleOutcome
+from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
 from perchctl.fleet.vehicle_process import ParentLine, StatusReporter
 from perchctl.flight import FlyOptions
-from perchctl.mission import Event, Operator, RestState, Tick
+from perchctl.mission import Event, Operator, Phase, RestState, Tick
 from perchctl.values import replace
 from tests.helpers.live_page import tick
 from tests.helpers.waiting import until
@@ -50,17 +50,34 @@ def received(parent: Channel) -> tuple[list[Status], Result]:
 class FakeLine:
     """A line to a parent that is not there."""
 
+    def __init__(self) -> None:
+        self.told: list[Status] = []
+
     def note_turn(self) -> None:
         pass
 
     def tell(self, status: Status) -> None:
-        pass
+        self.told.append(status)
 
 
 @pytest.fixture
 def reporter() -> StatusReporter:
     line: Any = FakeLine()
     return StatusReporter(line, ParentSwitch())
+
+
+def test_a_status_that_cannot_be_made_is_an_unknown_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A watcher that raises is detached; its parent would then end the process in the air."""
+
+    def fail(_: Tick) -> Status:
+        raise RuntimeError("nobody foresaw this")
+
+    line: Any = FakeLine()
+    monkeypatch.setattr(vehicle_process, "flight_status", fail)
+    StatusReporter(line, ParentSwitch()).tick(tick())
+    (status,) = line.told
+    assert (status.stage, status.phase, status.place_m) == (Stage.FLYING, Phase.ALIGN, None)
+    assert status.reason.startswith("its status is unknown: RuntimeError: nobody foresaw this")
 
 
 def result_at(reporter: StatusReporter, last: Tick) -> Result:
