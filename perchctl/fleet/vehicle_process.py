@@ -19,7 +19,7 @@ from dataclasses import replace
 
 from perchctl.children import Channel
 from perchctl.corridor import Point
-from perchctl.errors import Interrupted, PerchError
+from perchctl.errors import Interrupted, PerchError, SafetyAbort
 from perchctl.extensions import error_at
 from perchctl.fleet.messages import BEAT_S, Order, Pace, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
@@ -50,7 +50,7 @@ def main(channel: Channel) -> None:
         try:
             result = fly_vehicle(options, switch, line, reporter)
         except BaseException as error:  # a signal while another failure was being dealt with
-            result = reporter.failure or reporter.result_of_error(error, lost=switch.lost)
+            result = reporter.failure or reporter.result_of_error(error)
         line.finish(result)
     sys.stdout.flush()
     os._exit(0)  # a library's thread that hangs must not keep the process
@@ -81,10 +81,10 @@ def fly_vehicle(
         assert summary is not None, "it was closed with a report"
         for sentence in report.detached:
             _say(sentence)
-        return reporter.result_of(outcome, summary, str(log.path), lost=switch.lost)
+        return reporter.result_of(outcome, summary, str(log.path))
     except BaseException as error:
         line.may_interrupt = False
-        result = reporter.failure = reporter.result_of_error(error, lost=switch.lost)
+        result = reporter.failure = reporter.result_of_error(error)
         if log is not None:
             log.abandon(str(error) or type(error).__name__)
         return result
@@ -249,20 +249,17 @@ class StatusReporter(Watcher):
         if event.rest is not None:
             self._rest = event.reason
 
-    def result_of(
-        self, outcome: VehicleOutcome, summary: FlightSummary, log: str, *, lost: str | None
-    ) -> Result:
+    def result_of(self, outcome: VehicleOutcome, summary: FlightSummary, log: str) -> Result:
         """The result of a flight that has ended by itself."""
-        reason = summary.reason if lost is None else f"{lost}: {summary.reason}"
         return replace(
-            self._result(summary.exit_code, outcome, reason),
+            self._result(summary.exit_code, outcome, summary.reason),
             attempts=summary.attempts,
             miss_m=summary.miss_m,
             battery_min_v=summary.battery_min_v,
             log=log,
         )
 
-    def result_of_error(self, error: BaseException, *, lost: str | None) -> Result:
+    def result_of_error(self, error: BaseException) -> Result:
         """The result of a flight that raised: refused on the ground, or rescued in the air."""
         match error:
             case PerchError():
@@ -274,19 +271,22 @@ class StatusReporter(Watcher):
                 reason = f"unforeseen {type(error).__name__}: {error}"
         if self._rest is not None:
             reason = f"{reason}; {self._rest}"
-        if lost is not None:
-            reason = f"{lost}: {reason}"
         result = self._result(code, VehicleOutcome.FAILED, reason)
         return replace(result, log=None if self._tick is None else self.log)  # deleted without one
 
     def _result(self, code: int, outcome: VehicleOutcome, reason: str) -> Result:
-        tick = self._tick
+        tick, lost = self._tick, self._switch.lost
+        if lost is not None:
+            reason = f"{lost}: {reason}"
+        # The first setpoint is sent before its tick is seen; what fails in between is rescued.
+        has_flown = tick is not None or self._rest is not None
+        if has_flown and lost is not None and code == Interrupted.exit_code:
+            code = SafetyAbort.exit_code  # no operator has landed it
         return Result(
             exit_code=code,
             outcome=outcome,
             reason=reason,
-            # The first setpoint is sent before its tick is seen; what fails in between is rescued.
-            has_flown=tick is not None or self._rest is not None,
+            has_flown=has_flown,
             ended_s=None if tick is None else self._last[1],
             place_m=None if tick is None else _valid_place_m(tick),
             pace=self._pace(),

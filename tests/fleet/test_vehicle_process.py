@@ -83,7 +83,7 @@ def test_a_status_that_cannot_be_made_is_an_unknown_one(monkeypatch: pytest.Monk
 def result_at(reporter: StatusReporter, last: Tick) -> Result:
     """Of a flight whose last tick this was."""
     reporter.tick(last)
-    return reporter.result_of_error(SafetyAbort("so it was"), lost=None)
+    return reporter.result_of_error(SafetyAbort("so it was"))
 
 
 def test_the_last_place_is_told_only_if_it_is_known(reporter: StatusReporter) -> None:
@@ -102,10 +102,23 @@ def test_a_vehicle_that_was_rescued_before_its_first_tick_has_flown(
     reporter: StatusReporter,
 ) -> None:
     error = RuntimeError("nobody foresaw this")
-    assert not reporter.result_of_error(error, lost=None).has_flown
+    assert not reporter.result_of_error(error).has_flown
     reporter.event(Event.from_rescue(1.0, error, RestState.UNKNOWN, "it may fly"))
-    result = reporter.result_of_error(error, lost=None)
+    result = reporter.result_of_error(error)
     assert (result.has_flown, result.place_m) == (True, None)
+
+
+def test_a_landing_without_a_parent_is_a_safety_abort_and_not_the_operators() -> None:
+    line: Any = FakeLine()
+    switch = ParentSwitch()
+    reporter = StatusReporter(line, switch)
+    landed = Interrupted("operator")
+    reporter.tick(tick())
+    assert reporter.result_of_error(landed).exit_code == 130
+    switch.lose_parent()
+    assert reporter.result_of_error(landed).exit_code == 52
+    grounded = StatusReporter(line, switch)
+    assert grounded.result_of_error(landed).exit_code == 130
 
 
 def test_a_second_error_does_not_hide_that_the_vehicle_has_flown(
