@@ -78,9 +78,14 @@ class VehicleView:
         return status.telemetry_age_s + status.loop_age_s + self.silent_s
 
     @property
+    def is_silent(self) -> bool:
+        """True if its status is too old to count."""
+        return self.silent_s >= FRESH_STATUS_S
+
+    @property
     def is_ready(self) -> bool:
         """True if nothing but permission keeps it on the floor."""
-        return self.result is None and self.stage is Stage.READY and self.silent_s < FRESH_STATUS_S
+        return self.result is None and self.stage is Stage.READY and not self.is_silent
 
 
 @dataclass(frozen=True, kw_only=True)
