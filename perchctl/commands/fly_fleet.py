@@ -351,6 +351,8 @@ class FleetSession:
         that hang after the operator's stop."""
         self._switch.land()
         hung = isinstance(error, Interrupted) and self._switch.listening
+        if self._panel is not None and not (hung or all(map(_has_ended, self._children.values()))):
+            self._tell(f"the command failed ({error_at(error)}): all vehicles land")
         end_s = time.monotonic() + (0.0 if hung else ENDING_TIMEOUT_S)
         while time.monotonic() < end_s and not all(map(_has_ended, self._children.values())):
             time.sleep(DISPLAY_PERIOD_S)
@@ -386,7 +388,7 @@ def _row(number: int, view: fleets.VehicleView) -> FleetRow:
     status = view.status
     if status is None:
         return FleetRow(number=number, name=view.name, phase=phase, reason=reason)
-    silent = view.result is None and view.silent_s > 1.0
+    silent = view.result is None and view.is_silent
     return FleetRow(
         number=number,
         name=view.name,

@@ -214,6 +214,23 @@ def test_a_display_that_fails_is_reported_once_and_ends_no_flight(
     assert json.loads((tmp_path / "fleet.json").read_text())["hanging"] == 4
 
 
+def test_an_error_of_the_command_in_flight_lands_all_and_is_told_at_once(
+    session: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(coordinator: Coordinator) -> None:
+        if any(view.is_in_air for view in coordinator.views):
+            raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(session, "_refuse_failed", refuse)
+    with pytest.raises(RuntimeError, match="nobody foresaw this"):
+        session.fly(asks=False)
+    processes: Any = session._children.values()
+    assert all(each.result().outcome is VehicleOutcome.LANDED for each in processes)
+    said = capsys.readouterr().err
+    assert "the command failed (RuntimeError: nobody foresaw this" in said
+    assert "all vehicles land" in said
+
+
 def test_a_record_that_cannot_be_made_ends_no_flight(
     session: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
