@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from perchctl.mission.belief.belief import Belief
+from perchctl.mission.belief.contact import Support, find_support
 from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.observation import Observation
 from perchctl.mission.state import PlannerState
@@ -37,6 +38,11 @@ class Context:
     def in_phase_s(self) -> float:
         """Time since the phase began, s."""
         return self.t_s - self.state.entry.t_s
+
+    @property
+    def support(self) -> Support:
+        """What supports the vehicle in this tick; for how long is the condition's `held_s`."""
+        return find_support(self.belief)
 
     def held_s(self, condition: Condition[Any]) -> float:
         """Seconds for which a condition has been true; -1 while it is false."""

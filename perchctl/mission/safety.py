@@ -15,10 +15,7 @@ from perchctl.mission.belief.contact import (
     HANGING_DWELL_S,
     PRESS_SATURATION_FRACTION,
     SATURATED_THRUST,
-    contact_offset,
-    is_at_contact_height,
-    is_at_target,
-    last_touch_offset,
+    Support,
     max_press_thrust,
     newest_contact_offset,
     possible_contact_tolerance_m,
@@ -251,20 +248,14 @@ def mounting_reason(c: Context) -> str:
 
 def is_held_by_target(c: Context) -> bool:
     """True if the target's magnet already holds the vehicle."""
-    if c.held_s(HANGING) < HANGING_DWELL_S:
-        return False
-    touched, radius_m = last_touch_offset(c.belief), c.planner.perch.contact_xy_m
-    near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
-    return near or is_at_target(c.belief)
+    hangs = c.held_s(HANGING) >= HANGING_DWELL_S
+    return hangs and c.support is Support.MAGNET
 
 
 def is_held_elsewhere(c: Context) -> bool:
     """True if something holds the vehicle away from the target's height or from its axis."""
-    touched = last_touch_offset(c.belief)
-    offset = touched or contact_offset(c.belief)
-    at_its_height = touched is not None or is_at_contact_height(c.belief)
-    is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
-    return c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S and (is_off_axis or not at_its_height)
+    hangs = c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S
+    return hangs and c.support is Support.HELD_BY_OTHER
 
 
 def is_blocked(c: Context) -> bool:

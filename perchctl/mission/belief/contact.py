@@ -12,11 +12,16 @@ height (`CONTACT`), against an obstacle if its setpoint is above it (`BLOCKED`),
 unknown object without a position (`SUPPORTED_BY_IMU`, which also covers too little thrust).
 `HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
 (`is_thrust_too_low_to_fly`).
+
+`find_support` says in one word what these conditions show: the vehicle flies, presses, hangs on the
+magnet, hangs on something else, stands, or it is unknown. How long the evidence has lasted is the
+condition's `held_s`; each row chooses its own dwell time by what a mistake would cost.
 """
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
 from perchctl.mission.belief.evidence import Condition, Dependency
@@ -385,6 +390,47 @@ SUPPORT_CONDITIONS = (
     SATURATED_THRUST,
 )
 """All conditions of this module."""
+
+
+class Support(Enum):
+    """What supports the vehicle."""
+
+    AIR = "nothing: it flies"
+    PRESSED = "the target or an obstacle, against which it presses"
+    MAGNET = "the target's magnet"
+    HELD_BY_OTHER = "something away from the target, on which it hangs or stands"
+    FLOOR = "the floor"
+    UNKNOWN = "unknown"
+
+
+def find_support(b: Belief) -> Support:
+    """Return what supports the vehicle, from the conditions that are true in this tick.
+
+    A vehicle that hangs is on the magnet only if its gear is certainly within the magnet's radius,
+    and on something else only if it is certainly outside, or at another height than the target. In
+    between it is unknown, and a row must treat it as the worse of the two. It is also unknown while
+    the thrust or the position is, while the vehicle accelerates, and in the tick in which a new
+    maneuver begins.
+    """
+    if HANGING in b.since:
+        return _find_support_of_hanging(b)
+    if ON_FLOOR in b.since:
+        return Support.FLOOR
+    if CONTACT in b.since or BLOCKED in b.since:
+        return Support.PRESSED
+    flies = is_hover_thrust(b) and not is_thrust_too_low_to_fly(b) and not is_above_hover_thrust(b)
+    return Support.AIR if flies else Support.UNKNOWN
+
+
+def _find_support_of_hanging(b: Belief) -> Support:
+    touched, radius_m = last_touch_offset(b), b.profile.planner.perch.contact_xy_m
+    was_near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
+    if was_near or is_at_target(b):
+        return Support.MAGNET
+    offset = newest_contact_offset(b)
+    is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > radius_m
+    at_its_height = touched is not None or is_at_contact_height(b)
+    return Support.UNKNOWN if at_its_height and not is_off_axis else Support.HELD_BY_OTHER
 
 
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
