@@ -256,8 +256,9 @@ def _find_floor_detection_s(
 def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
     """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
-    # Late pictures may place the floor half a metre too low.
-    low = height_m <= NEAR_FLOOR_HEIGHT_M or b.mismatch.later_s != 0.0
+    # Late pictures, and positions that have diverged, may place the floor half a metre too low.
+    is_height_wrong = b.mismatch.later_s != 0.0 or b.diverged
+    low = height_m <= NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
     if _camera_motion(c) is not None:
         sink_mps = CAMERA_SINK_SETPOINT_MPS

@@ -395,6 +395,17 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
 
+@pytest.mark.parametrize("diverged", [False, True])
+def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -> None:
+    """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
+    at the speed that is meant for free air."""
+    reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S), velocity_mps=(0.0, 0.0, -0.4))
+    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning, diverged=diverged)
+    _, command = descent.act(c)
+    assert isinstance(command, RawThrust)
+    assert (command.thrust > 0.97 * HOVER_THRUST) is diverged
+
+
 @pytest.mark.parametrize("hung", [0.9, 1.1])
 @pytest.mark.parametrize("positioning", PROFILES)
 def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: float) -> None:
