@@ -93,6 +93,25 @@ def test_the_rebound_of_an_impact_is_no_fall(rate_hz: float, speed_mps: float) -
     assert watched(blow, rate_hz).fell_s < 1.0
 
 
+@given(RATES_HZ, st.floats(0.1, 0.65), st.floats(1.0, 3.0), st.floats(1.0, 3.0))
+def test_a_climb_that_is_braked_is_no_fall(
+    rate_hz: float, speed_mps: float, gains_mps2: float, brakes_mps2: float
+) -> None:
+    climbs = [(0.0, 1.0), (gains_mps2, speed_mps / gains_mps2)]
+    stops = [(-brakes_mps2, speed_mps / brakes_mps2), (0.0, 1.0)]
+    assert watched([*climbs, *stops], rate_hz).fell_s < 1.0
+
+
+@given(RATES_HZ, st.floats(0.1, 3.0), st.floats(0.1, 0.3))
+def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
+    rate_hz: float, speed_mps: float, part: float
+) -> None:
+    falls_mps2 = part * GRAVITY_MPS2
+    late_s = (0.25 + 0.5) / (0.8 * falls_mps2)
+    flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
+    assert watched(flight, rate_hz).fell_s > 1.0
+
+
 @given(RATES_HZ, st.floats(-1.0, 0.55), st.floats(0.0, 5.0))
 def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_says(
     rate_hz: float, reads_g: float, up_mps2: float

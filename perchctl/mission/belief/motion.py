@@ -61,8 +61,12 @@ a fall is detected 5 cm later."""
 FALL_SINK_MPS = -0.25
 """Downward speed, gained within `SINK_TIME_CONSTANT_S`, at which the vehicle falls whatever the
 accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
+MAX_RISE_MPS = 0.5
+"""Largest upward speed, gained within `SINK_TIME_CONSTANT_S`, that a vehicle must lose before it
+falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a climb that is braked
+counts as a fall."""
 SINK_TIME_CONSTANT_S = 1.5
-"""Time constant with which a gained downward speed is forgotten, s. Larger: an offset accumulates
+"""Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
 OFFSET_TIME_CONSTANT_S = 3.0
 """Time constant with which the vertical offset is learned, s. Smaller: a slow fall is learned as an
@@ -196,13 +200,13 @@ class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
     Let a be the vertical acceleration minus its slowly learned offset, with decelerations harder
-    than `CEILING_IMPACT_G` cut off. The downward speed gained recently is
+    than `CEILING_IMPACT_G` cut off. The vertical speed gained recently is
 
-        sink' = min(0, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
+        sink' = min(MAX_RISE_MPS, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
 
-    The vehicle fell if that speed is beyond `FALL_SINK_MPS`, or if the accelerometer has read less
-    than `FREE_FALL_G` for longer than a rebound lasts. A sink that is slow enough for the offset to
-    learn it goes undetected.
+    so that braking a climb is no fall. The vehicle fell if that speed is beyond `FALL_SINK_MPS`, or
+    if the accelerometer has read less than `FREE_FALL_G` for longer than a rebound lasts. A sink
+    that is slow enough for the offset to learn it goes undetected.
     """
 
     fell_s: float = -math.inf  # last fall, or descent to the floor
@@ -220,7 +224,7 @@ class FallDetector:
         ) * min(1.0, dt_s / OFFSET_TIME_CONSTANT_S)
         corrected_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
         sink = self.sink_mps + corrected_mps2 * dt_s
-        sink = min(0.0, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
+        sink = min(MAX_RISE_MPS, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
         light = min(self.light_since_s, t_s) if reads_g < FREE_FALL_G else math.inf
         fell = sink < FALL_SINK_MPS or t_s - light >= FREE_FALL_S
         return replace(
