@@ -169,13 +169,7 @@ def _sightings(
         for frame, name in frames:
             right = unmirror_frame(frame) if turns else frame
             for picture, output, notes in tracker.process(right):
-                sighting = Sighting(picture.index, picture.t_s, name, {}, note="; ".join(notes))
-                if output is not None and output.detections.markers:
-                    markers = {each.marker: each for each in output.detections.markers}
-                    at = None if attitude is None else attitude(picture.t_s)
-                    sighting = replace(sighting, markers=markers)
-                    sighting = _add_pose(sighting, tracker.state, at, tracker.pipeline)
-                yield sighting
+                yield tracker.make_sighting(picture, output, notes, name)
 
 
 def _polled(source: FrameSource, camera: CameraModel) -> Iterator[Named]:
@@ -226,12 +220,9 @@ class Tracker:
         bare = profile if attitude else make_camera_only_profile(profile)
         self.pipeline = make_pipeline(bare, camera)
         self._perception = Perception(self.pipeline, stills=stills, attitude=attitude)
+        self._attitude = attitude
         self._config, self._live, self._stills = profile.camera, live, stills
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
-
-    @property
-    def state(self) -> PipelineState:
-        return self._perception.state
 
     def process(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput | None, list[str]]]:
         """Yield the frame, or both fields of an interlaced one, with the pipeline's output and
@@ -246,6 +237,22 @@ class Tracker:
             return
         for picture, output in self._perception.process_fields(frame):
             yield picture, output, [*about, *self._notes(output)]
+
+    def make_sighting(
+        self,
+        picture: Frame,
+        output: PipelineOutput | None,
+        notes: list[str],
+        name: str | None = None,
+    ) -> Sighting:
+        """Return the sighting for what `process` has just yielded; `name` is its file's."""
+        seen = Sighting(picture.index, picture.t_s, name, {}, note="; ".join(notes))
+        if output is None or not output.detections.markers:
+            return seen
+        markers = {each.marker: each for each in output.detections.markers}
+        attitude = None if self._attitude is None else self._attitude(picture.t_s)
+        seen = replace(seen, markers=markers)
+        return _add_pose(seen, self._perception.state, attitude, self.pipeline)
 
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
         if output.fields != "whole":

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import re
+import socket
 import sys
 import time
 from collections import Counter
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -41,11 +43,11 @@ from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.display import live_page, make_sketch
-from perchctl.errors import ConnectionFailed, Interrupted, NotFound
-from perchctl.geometry import Array, rot_z, yaw_of
+from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
+from perchctl.geometry import Array, quaternion_from_rotation, rot_z, yaw_of
 from perchctl.places import is_shipped_example
 from perchctl.profile import find_calibration, load_profile
-from perchctl.sighting import TRACK_POLL_S, Tracker
+from perchctl.sighting import TRACK_POLL_S, Sighting, Tracker
 from perchctl.vision import (
     MARKERS,
     Frame,
@@ -60,7 +62,7 @@ app = new_app()
     app,
     "perchctl track camera:0 --view",
     "perchctl track video:flight.mp4 --json > poses.jsonl",
-    "perchctl track 'images:pictures/*.png' --json",
+    "perchctl track camera:0 --udp 127.0.0.1:9870",
 )
 def track(
     source: SourceArgument,
@@ -73,6 +75,18 @@ def track(
         ),
     ] = None,
     as_json: JsonOption = False,
+    udp: Annotated[
+        str | None,
+        typer.Option(
+            "--udp",
+            metavar="HOST:PORT",
+            help="Also send the JSON object of each picture to this address, as a UDP datagram.",
+        ),
+    ] = None,
+    frame_id: Annotated[
+        str,
+        typer.Option("--frame-id", help="Name of the camera frame in JSON, as in your tf tree."),
+    ] = "camera_optical_frame",
     view: ViewOption = False,
 ) -> None:
     """Find the target in a camera stream, a video or pictures, without a vehicle.
@@ -82,18 +96,27 @@ def track(
 
     \b
     frame         file name of the picture, or index of the frame
-    t_s           time of the frame
+    t_s           time of exposure; for a live source, on the monotonic clock
+    unix_s        the same as Unix time, or null for a recording
     stage         detected markers: large, both, small or none
     large, small  null, or corners_px (TL TR BR BL), rvec_rad, tvec_m and
                   reprojection_px
     target        null, or rvec_rad, tvec_m, yaw_rad, sigma_m and sigma_yaw_rad
+    pose          null, or frame_id, child_frame_id, position_m, quaternion_xyzw
+                  and covariance
     note          what is wrong with the picture, or why a pose is not the
                   target's; otherwise empty
 
     If both markers are in view, target is their joint pose. Except for still pictures, target is
     filtered, and continues for a few frames after stage becomes none. yaw_rad is
     atan2(R[1,0], R[0,0]), the marker's heading in the picture plane. sigma_m is along the camera's
-    x, y and z axes. If a live source is lost for good, the exit code is 10.
+    x, y and z axes.
+
+    pose is the target's pose from this picture alone, for ROS 2 and filters of your own. Its axes
+    are the marker's, turned by 180 deg about x, so that z points away from the camera. covariance
+    has 36 numbers, row by row: x, y, z (m), then small rotations about the camera's x, y, z (rad).
+
+    If a live source is lost for good, the exit code is 10.
     """
     flown = load_profile(profile)
     source = parse_source(source).spec
@@ -102,6 +125,7 @@ def track(
     start_s = time.monotonic()
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
+        sender = None if udp is None else stack.enter_context(DatagramSender(udp))
         camera = load_calibration(file)
         opened = open_camera(source, time.monotonic, flown.camera, size_px=camera.size_px)
         stack.callback(opened.close)
@@ -128,12 +152,17 @@ def track(
                 tracked = TrackResult(name, picture, notes=notes)
                 if output is not None:
                     target = target_in_camera(output, target)
-                    tracked = TrackResult(name, picture, output, target, notes)
+                    seen = tracker.make_sighting(picture, output, notes)
+                    tracked = TrackResult(name, picture, output, target, notes, seen)
                 summary.add(tracked)
+                if as_json or sender is not None:
+                    epoch_s = time.time() - time.monotonic() if opened.live else None
+                    record = json.dumps(track_record(tracked, frame_id, epoch_s))
+                if sender is not None:
+                    sender.send(record)
                 if lines:
-                    line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
                     # A live result is worth nothing late.
-                    print(line, flush=opened.live)
+                    print(record if as_json else text_line(tracked), flush=opened.live)
                 if page is not None:
                     sketch = make_sketch(tracked.picture, tracked.output, flown.target.large.side_m)
                     page.show(sketch)
@@ -199,6 +228,7 @@ class TrackResult:
         output: the pipeline's output; None if the picture was not searched.
         target: the target's pose; at stage ``none`` predicted by the filter.
         notes: remarks on the picture, a sentence each.
+        sighting: the pose by this picture alone; None if the picture was not searched.
     """
 
     name: str | int
@@ -206,6 +236,7 @@ class TrackResult:
     output: PipelineOutput | None = None
     target: TargetInCamera | None = None
     notes: Sequence[str] = ()
+    sighting: Sighting | None = None
 
     @property
     def stage(self) -> str:
@@ -240,17 +271,28 @@ def target_in_camera(
 # --- What is printed ---
 
 
-def track_record(tracked: TrackResult) -> dict[str, Any]:
-    """Return a result for a line of `track --json`; values that are not finite are None."""
-    target, output = tracked.target, tracked.output
+TARGET_FRAME_ID = "target"
+"""The target's frame in a `pose`, with the axes of docs/conventions.md, as in recordings."""
+
+
+def track_record(
+    tracked: TrackResult, frame_id: str, epoch_s: float | None = None
+) -> dict[str, Any]:
+    """Return a result for a line of `track --json`; values that are not finite are None.
+
+    `epoch_s`: the Unix time at which the frames' clock was zero; None if that has no meaning.
+    """
+    target, output, t_s = tracked.target, tracked.output, tracked.picture.t_s
     return {
         "frame": tracked.name,
-        "t_s": _finite(tracked.picture.t_s),
+        "t_s": _finite(t_s),
+        "unix_s": None if epoch_s is None else _finite(epoch_s + t_s),
         "stage": tracked.stage,
         **{name: None if output is None else _marker_record(output, name) for name in MARKERS},
         "target": None
         if target is None
         else {key: _finite(value) for key, value in vars(target).items()},
+        "pose": _pose_record(tracked.sighting, frame_id),
         "note": "; ".join(tracked.notes),
     }
 
@@ -265,6 +307,19 @@ def _marker_record(
     return {"corners_px": _finite(marker.corners_px)} | {
         key: None if pose is None else _finite(getattr(pose, key))
         for key in ("rvec_rad", "tvec_m", "reprojection_px")
+    }
+
+
+def _pose_record(seen: Sighting | None, frame_id: str) -> dict[str, Any] | None:
+    if seen is None or seen.T_cam_target is None or seen.covariance is None:
+        return None
+    w, x, y, z = quaternion_from_rotation(seen.T_cam_target[:3, :3])
+    return {
+        "frame_id": frame_id,
+        "child_frame_id": TARGET_FRAME_ID,
+        "position_m": _finite(seen.T_cam_target[:3, 3]),
+        "quaternion_xyzw": [x, y, z, w],
+        "covariance": _finite(seen.covariance.ravel()),
     }
 
 
@@ -296,6 +351,55 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
         ["target", _target_text(tracked)],
     ]
     return {"rows": rows, "note": "; ".join(tracked.notes)}
+
+
+class DatagramSender:
+    """Sends texts by UDP, each as one datagram. It does not notice whether anybody receives them.
+
+    An address that the operating system cannot reach is reported once per outage, and the tracking
+    continues. Raises InvalidValue for a text that is not an address, or a host without one.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._text = address
+        try:
+            place = urlsplit(f"//{address}")
+            host, port = place.hostname, place.port
+        except ValueError:
+            host, port = None, None
+        if not host or not port or place.netloc != address or "@" in address:
+            raise InvalidValue(
+                f"--udp takes HOST:PORT, such as 127.0.0.1:9870, with a port from 1 to 65535; "
+                f"found {address!r}"
+            )
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        except OSError as error:
+            raise InvalidValue(
+                f"--udp {address}: {host} has no address ({error.strerror}); check the name, or "
+                "give its IP address"
+            ) from None
+        self._address = found[0][4]
+        self._socket = socket.socket(found[0][0], socket.SOCK_DGRAM)
+        self._socket.setblocking(False)  # a full buffer must not delay the next picture
+        self._is_failing = False
+
+    def __enter__(self) -> DatagramSender:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._socket.close()
+
+    def send(self, text: str) -> None:
+        """Send a text. Never raises."""
+        try:
+            self._socket.sendto(text.encode(), self._address)
+        except OSError as error:
+            if not self._is_failing:
+                say(f"nothing can be sent to {self._text}: {error.strerror}; still trying")
+            self._is_failing = True
+        else:
+            self._is_failing = False
 
 
 class TrackSummary:

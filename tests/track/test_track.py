@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import signal
+import socket
 import sys
+import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,11 +17,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import TrackResult, TrackSummary, poll_until_stopped, text_line
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.geometry import wrap_rad, yaw_of
+from perchctl.geometry import R_MARKER_TARGET, wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sighting import Tracker
 from perchctl.vision import Frame, project, square_corners
@@ -96,18 +99,22 @@ SHAPES = {
     "target": {
         "rvec_rad": (3,), "tvec_m": (3,), "yaw_rad": (), "sigma_m": (3,), "sigma_yaw_rad": (),
     },
+    "pose": {"position_m": (3,), "quaternion_xyzw": (4,), "covariance": (36,)},
 }  # fmt: skip
 SHAPES["small"] = SHAPES["large"]
 
 
 def check_schema(line: dict[str, Any]) -> None:
-    assert list(line) == ["frame", "t_s", "stage", "large", "small", "target", "note"]
+    keys = ["frame", "t_s", "unix_s", "stage", "large", "small", "target", "pose", "note"]
+    assert list(line) == keys
+    assert line["unix_s"] is None  # of recordings
     seen = {"large": (1, 0), "small": (0, 1), "both": (1, 1), "none": (0, 0)}[line["stage"]]
     assert (line["large"] is not None, line["small"] is not None) == seen
     for name, shapes in SHAPES.items():
         if line[name] is not None:
-            assert {key: np.shape(value) for key, value in line[name].items()} == shapes
-            assert all(np.isfinite(value).all() for value in line[name].values())
+            values = {key: v for key, v in line[name].items() if not key.endswith("frame_id")}
+            assert {key: np.shape(value) for key, value in values.items()} == shapes
+            assert all(np.isfinite(value).all() for value in values.values())
     if line["target"] is not None:
         assert min(*line["target"]["sigma_m"], line["target"]["sigma_yaw_rad"]) > 0.0
 
@@ -379,6 +386,8 @@ def test_a_live_source_that_is_lost_for_good_is_no_success(monkeypatch: pytest.M
     assert tracked.code == ConnectionFailed.exit_code
     *seen, failure = tracked.lines
     assert [line["stage"] for line in seen] == ["both"] * 3
+    epoch_s = time.time() - time.monotonic()
+    assert [line["unix_s"] - line["t_s"] for line in seen] == pytest.approx([epoch_s] * 3, abs=5.0)
     assert "unplugged" in failure["error"]
     assert "3 frames in" in tracked.stderr
 
@@ -392,6 +401,61 @@ def test_a_picture_of_another_size_is_named(number: int, tmp_path: Path) -> None
     assert tracked.code == InvalidValue.exit_code
     for words in (f"{number}.png", "320x240", "640x480"):
         assert words in tracked.stderr
+
+
+# --- poses for other programs ---------------------------------------------------------------
+
+
+def test_each_json_object_is_sent_as_a_datagram(pictures: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(10.0)
+        words = ["--udp", "localhost:{1}".format(*receiver.getsockname()), "--frame-id", "cf1"]
+        said = run("track", str(pictures), "--calibration", str(CALIBRATION), "--json", *words)
+        assert said.code == 0, said.stderr
+        received = [receiver.recv(65535).decode() for _ in VIEWS]
+    assert received == said.stdout.splitlines()
+    for line in map(json.loads, received):
+        name = line["frame"].removesuffix(".png")
+        if name == "away":
+            assert line["pose"] is None
+            continue
+        R, t = true_pose(VIEWS[name])
+        assert line["pose"]["position_m"] == pytest.approx(t, abs=0.003)
+        found = Rotation.from_quat(line["pose"]["quaternion_xyzw"]).as_matrix()
+        assert np.abs(found - R @ R_MARKER_TARGET).max() < 0.03
+        assert (line["pose"]["frame_id"], line["pose"]["child_frame_id"]) == ("cf1", "target")
+
+
+@pytest.mark.parametrize(
+    "address", ["", "9870", ":9870", "localhost", "a:0", "a:65536", "a:b", "a/b:9", "u@a:9"]
+)
+def test_what_is_not_an_address_is_named(address: str, pictures: Path) -> None:
+    said = run("track", str(pictures), "--udp", address)
+    assert said.code == 30
+    assert "--udp takes HOST:PORT, such as 127.0.0.1:9870" in said.complaint
+
+
+def test_a_host_without_an_address_is_named(
+    pictures: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*place: Any, **kinds: Any) -> Any:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr("perchctl.commands.track.socket.getaddrinfo", fail)
+    said = run("track", str(pictures), "--udp", "robot:9870")
+    assert said.code == 30
+    assert "--udp robot:9870: robot has no address (Name or service not known)" in said.complaint
+
+
+def test_an_address_out_of_reach_is_said_once_and_tracking_goes_on(pictures: Path) -> None:
+    # The operating system refuses broadcasts that nobody has permitted.
+    said = run(
+        "track", str(pictures), "--calibration", str(CALIBRATION), "--udp", "255.255.255.255:9"
+    )
+    assert said.code == 0
+    assert said.stderr.count("nothing can be sent to 255.255.255.255:9: ") == 1
+    assert len(said.stdout.splitlines()) == len(VIEWS)
 
 
 # --- the page, the end, bad input -----------------------------------------------------------
