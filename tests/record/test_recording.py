@@ -15,6 +15,7 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.record import recorded_pictures
 from tests.helpers import recorded
+from tests.helpers.flights import ROOT
 
 FLIGHT = recorded.flown(120)
 STARTED = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
@@ -84,6 +85,19 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     assert schemas == own | theirs
     assert len(found["/camera/image"]) == len(found["/camera/frame"]) == len(FLIGHT.frames)
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
+
+
+def test_foxglove_s_layout_shows_what_a_recording_holds(found: dict[str, list[Any]]) -> None:
+    panels = json.loads((ROOT / "docs" / "foxglove.json").read_text())["configById"]
+    image = panels["Image!picture"]["imageMode"]
+    assert {image["imageTopic"], *image["annotations"]} <= found.keys()
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
+    assert len(paths) > 5
+    for topic, _, field in (path.partition(".") for path in paths):
+        assert any(json.loads(message).get(field) is not None for message in found[topic]), field
+    grid = panels["3D!space"]
+    frames = {t.parent_frame_id for message in found["/tf"] for t in message.transforms}
+    assert {grid["followTf"], grid["layers"]["grid"]["frameId"]} <= frames
 
 
 def test_people_s_times_count_from_the_first_flown_turn_and_messages_by_the_wall(
