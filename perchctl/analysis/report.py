@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-import perchctl
 from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
@@ -27,6 +24,7 @@ from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
 from perchctl.record import path_beside, read_log, recorded_pictures, wrap_log_errors
+from perchctl.report_page import data_url, render_template
 
 UNFINISHED = "unfinished"
 OUTCOME_TITLES = {
@@ -155,9 +153,6 @@ class ReportedFlight:
 
 # --- the page ---
 
-POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
-"""No script, nothing from elsewhere: the browser holds the page to it."""
-
 
 def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
     """The report of at least one flight as self-contained HTML. Raises InvalidValue for
@@ -180,30 +175,18 @@ def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> s
         flights=flights,
         articles=articles,
         counts=Report(tuple(flights)).outcome_counts_text,
-        policy=POLICY,
-        version=perchctl.__version__,
     )
 
 
 def _render(name: str, **values: Any) -> Markup:
-    return Markup(_templates().get_template(name).render(values))
-
-
-@cache
-def _templates() -> jinja2.Environment:
-    templates = jinja2.Environment(
-        loader=jinja2.PackageLoader("perchctl.analysis"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    templates.globals.update(
+    return render_template(
+        "perchctl.analysis",
+        name,
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
-        plot_of=lambda flight: _address("image/png", flight_png(flight)),
+        plot_of=lambda flight: data_url("image/png", flight_png(flight)),
         film_of=film_url_and_problem,
+        **values,
     )
-    return templates
 
 
 def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
@@ -221,17 +204,13 @@ def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
             except InvalidValue as error:
                 problem = _without_folder(error, path)
                 continue
-            return _address("video/mp4", film.read_bytes()), problem
+            return data_url("video/mp4", film.read_bytes()), problem
     return "", problem
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
     """The error's text without folders, as a page is sent on."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
-
-
-def _address(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 # --- What the camera saw when the mission decided: out of the recording beside the log ---
@@ -256,7 +235,7 @@ class DecisionPicture:
 
     @property
     def data_url(self) -> str:
-        return _address("image/jpeg", self.jpeg)
+        return data_url("image/jpeg", self.jpeg)
 
 
 def read_reported_flight(log_path: Path) -> ReportedFlight:
