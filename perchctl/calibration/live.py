@@ -14,6 +14,15 @@ CALIBRATION_POLL_S = 0.005
 GONE_AFTER_S = 3.0
 
 
+@dataclass(frozen=True)
+class GuidanceBar:
+    """The filled part of a bar, from `start` to `end` (0..1), and whether it is enough."""
+
+    start: float
+    end: float
+    is_enough: bool
+
+
 @dataclass(frozen=True, eq=False)
 class GuidedFrame:
     """A frame of a guided recording, with the guidance shown beside it.
@@ -21,7 +30,7 @@ class GuidedFrame:
     Attributes:
         index, image: the frame's number and picture (h, w).
         outlines: kind and corners (n, 2) px of each detection.
-        rows: name, text and bar length 0..1 (None: no bar) of each value to show.
+        rows: name, text and bar (None: no bar) of each value to show.
         advice: what to do now.
         status_line: the state in one line, for output to a pipe.
         taken: True if the recording keeps this frame.
@@ -30,7 +39,7 @@ class GuidedFrame:
     index: int
     image: Grey
     outlines: tuple[tuple[str, Array], ...]
-    rows: tuple[tuple[str, str, float | None], ...]
+    rows: tuple[tuple[str, str, GuidanceBar | None], ...]
     advice: str
     status_line: str
     taken: bool = False

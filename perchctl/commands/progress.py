@@ -6,6 +6,7 @@ import contextlib
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
 from functools import partial
 from typing import Any, Protocol, TextIO
 
@@ -138,19 +139,23 @@ def guidance_display(
 
 def _table(guided: GuidedFrame) -> Table:
     table = Table.grid(padding=(0, 1))
-    for name, text, share in guided.rows:
-        if share is None:
+    for name, text, bar in guided.rows:
+        if bar is None:
             table.add_row(name, Text(text), "")
             continue
-        full = round(_BAR_WIDTH * min(max(share, 0.0), 1.0))
-        colour = "green" if share >= 1.0 else "yellow"
-        bar = Text("#" * full, style=colour) + Text("." * (_BAR_WIDTH - full), style="dim")
-        table.add_row(name, bar, text)
+        until = round(_BAR_WIDTH * bar.end)
+        before = max(0, min(round(_BAR_WIDTH * bar.start), until - 1))
+        drawn = Text.assemble(
+            ("." * before, "dim"),
+            ("#" * (until - before), "green" if bar.is_enough else "yellow"),
+            ("." * (_BAR_WIDTH - until), "dim"),
+        )
+        table.add_row(name, drawn, text)
     table.add_row("", Text(guided.advice, style="bold"), "")
     return table
 
 
 def page_state(guided: GuidedFrame) -> dict[str, Any]:
-    """Return the state of the live page: rows (with bar lengths 0..1) and headline."""
-    rows = [[value for value in row if value is not None] for row in guided.rows]
+    """Return the state of the live page: rows (some with a bar) and headline."""
+    rows = [[name, text, bar and asdict(bar)] for name, text, bar in guided.rows]
     return {"rows": rows, "phase": guided.advice}

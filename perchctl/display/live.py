@@ -112,10 +112,11 @@ class LivePage:
     # --- for the server's threads ---
 
     def state(self) -> dict[str, Any]:
-        """The values that the page polls: the keys of `describe` (rows of name, text and
-        optional bar length 0..1; note, phase, battery, over), title, fresh (whether pictures come),
-        orders (``none``, ``ready``, ``land`` or ``cut`` once that was ordered, ``over``), age_s of
-        the values (None if no update is due), and the card of `end`, or None."""
+        """The values that the page polls: the keys of `describe` (rows of name, text and optional
+        bar: start, end in 0..1 and is_enough; note, phase, battery, over), title, fresh (whether
+        pictures come), orders (``none``, ``ready``, ``land`` or ``cut`` once that was ordered,
+        ``over``), age_s of the values (None if no update is due), and the card of `end`, or None.
+        """
         try:
             described = self._describe()
         except Exception as error:

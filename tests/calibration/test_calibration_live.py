@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import itertools
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -26,9 +28,11 @@ from perchctl.calibration.board.capture import (
     view_signature,
 )
 from perchctl.camera import Grey
+from perchctl.commands.progress import guidance_display, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.target import Board
+from perchctl.vision import Frame
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -125,6 +129,42 @@ def test_one_advice_at_a_time_leads_to_the_end() -> None:
             assert min(covered_shares(shown).values()) >= before
             assert len(shown) < 12
     assert given == set(FOLLOWED)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bars_show_where_views_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the terminal, in 80 columns, and on the page: the same bars, filled where views are."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "xterm")
+    camera, rng = draw_camera(np.random.default_rng(3)), np.random.default_rng(4)
+    capture, terminal = GuidedCapture(CHARUCO), Terminal()
+    frame = Frame(0, 0.0, np.zeros((480, 640), np.uint8))
+    for x_m in (-0.3, 0.02):  # of 0.72 m that are seen in that distance, never to the right
+        pose = np.array([0.0, 0.0, 0.0, x_m, -0.1, 0.6])
+        view = corner_view(rng, camera, CHARUCO, pose, 0.0, "v")
+        capture.update(view)
+        assert capture.update(view)
+    with guidance_display(None, terminal) as show:
+        show(capture.guided_frame(frame, view, True))
+    lines = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]", "", terminal.getvalue()).splitlines()
+    assert max(map(len, lines)) < 80
+    bars = {line[:11].strip(): line for line in lines}
+    assert set(bars) >= {"position x", "position y", "size", "skew"}
+    left, filled, right = re.fullmatch(  # type: ignore[union-attr]
+        r"position x (\.+)(#+)(\.+) +\d+ %", bars["position x"].strip()
+    ).groups()
+    assert len(left + filled + right) == 30
+    assert len(right) > len(left)
+    assert len(filled) > 8
+    assert bars["position y"].count("#") == 1  # both views have the same height
+    (bar,) = [row[2] for row in page_state(capture.guided_frame(frame, view, True))["rows"][:1]]
+    assert bar["start"] == pytest.approx(len(left) / 30, abs=0.02)
+    assert bar["end"] == pytest.approx(1.0 - len(right) / 30, abs=0.02)
+    assert not bar["is_enough"]
 
 
 def test_a_board_s_farther_side_is_known() -> None:

@@ -21,7 +21,7 @@ from perchctl.calibration.board.detect import (
 )
 from perchctl.calibration.board.recognise import MOST_PICTURES, describe_other_board
 from perchctl.calibration.board.solve import MIN_VIEWS
-from perchctl.calibration.live import GuidedFrame, poll_frames
+from perchctl.calibration.live import GuidanceBar, GuidedFrame, poll_frames
 from perchctl.camera import FrameSource, Grey, decode_picture
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
@@ -107,8 +107,9 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
 # --- How alike two views are ---
 
 
-COVERAGE_AXES = ("x", "y", "size", "tilt")
-GOALS = {"x": 0.5, "y": 0.5, "size": 0.3, "tilt": 0.4}
+COVERAGE_AXES = ("position x", "position y", "size", "skew")
+"""Called as in ROS's camera_calibration."""
+GOALS = {"position x": 0.5, "position y": 0.5, "size": 0.3, "skew": 0.4}
 """Spread of each over the views, after which it counts as covered."""
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
@@ -144,10 +145,27 @@ def signature_distance(signature: Array, other: Array) -> float:
 
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
-    """For x, y, size and tilt, the spread of the view signatures over its goal, at most 1."""
+    """For each of `COVERAGE_AXES`, the spread of the view signatures over its goal, at most 1; skew
+    is the mean of both tilts."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
-    spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
-    return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in COVERAGE_AXES}
+    spreads = zip(COVERAGE_AXES, (x, y, size, sum(tilts) / 2.0), strict=True)
+    return {axis: float(min(1.0, spread / GOALS[axis])) for axis, spread in spreads}
+
+
+def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
+    """The bar of each of `COVERAGE_AXES`. Those of the positions and the size reach from the least
+    to the most in the view signatures, in shares of the picture, so a gap shows what is missing.
+    That of the skew is its share of the goal."""
+    shares = covered_shares(signatures)
+    reach = dict.fromkeys(COVERAGE_AXES, (0.0, 0.0))
+    if signatures:
+        parts = np.clip(signatures, 0.0, 1.0)[:, :3].T
+        reach |= {
+            axis: (float(part.min()), float(part.max()))
+            for axis, part in zip(COVERAGE_AXES, parts, strict=False)
+        }
+    reach["skew"] = (0.0, shares["skew"])
+    return {axis: GuidanceBar(*reach[axis], shares[axis] >= 1.0) for axis in COVERAGE_AXES}
 
 
 # --- Guided capture ---
@@ -274,8 +292,8 @@ class GuidedCapture:
         if isinstance(view_or_reason, BoardView):
             hull = cv2.convexHull(view_or_reason.corners_px.astype(np.float32)).reshape(-1, 2)
             outlines = (("small" if taken else "large", hull.astype(np.float64)),)
-        shares = covered_shares(self._signatures).items()
-        rows = [(name, f"{100 * share:.0f} %", share) for name, share in shares]
+        shares, bars = covered_shares(self._signatures), coverage_bars(self._signatures)
+        rows = [(name, f"{100 * share:.0f} %", bars[name]) for name, share in shares.items()]
         line = f"{len(self.taken)} views; {', '.join(f'{name} {text}' for name, text, _ in rows)}"
         views = ("views", str(len(self.taken)), None)
         return GuidedFrame(
@@ -298,7 +316,7 @@ def next_advice(signatures: Sequence[Array]) -> str:
     if done[least] >= 1.0:
         return "show the board somewhere new"
     k = COVERAGE_AXES.index(least)
-    if least == "tilt":
+    if least == "skew":
         across, down = np.ptp(signatures, axis=0)[3:]
         k = 3 if across <= down else 4
     shown = [part[k] for part in signatures]

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from perchctl.calibration.live import GuidedFrame, poll_frames
+from perchctl.calibration.live import GuidanceBar, GuidedFrame, poll_frames
 from perchctl.calibration.mounting.pose_reader import PoseReader
 from perchctl.calibration.mounting.recording import (
     MIRRORED,
@@ -111,10 +111,14 @@ class _Progress:
             advice = (*self._missing, "enough; continue a little for a more precise result")[0]
         done = min(self._seconds / self._least_s, 1.0)
         rows = (
-            (recording.part, f"{self._seconds:.0f} s of {self._least_s:.0f}", done),
-            ("target", f"{100 * share:.0f} %", share),
+            (recording.part, f"{self._seconds:.0f} s of {self._least_s:.0f}", _bar(done)),
+            ("target", f"{100 * share:.0f} %", _bar(share)),
             ("pictures", str(len(recording.poses)), None),
             ("missing", ", ".join(self._missing) or "nothing", None),
         )
         line = f"{recording.part}: {advice}"
         return GuidedFrame(frame.index, frame.image, reader.outlines, rows, advice, line)
+
+
+def _bar(share: float) -> GuidanceBar:
+    return GuidanceBar(0.0, share, share >= 1.0)
