@@ -81,7 +81,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 11,
-    "calibration": 17,
+    "calibration": 18,
     "camera": 17,
     "campaign": 22,
     "check": 8,

@@ -2,6 +2,7 @@ from .board.capture import capture_views as capture_views
 from .board.capture import find_views as find_views
 from .board.check import check_calibration as check_calibration
 from .board.detect import FoundViews as FoundViews
+from .board.report import calibration_report as calibration_report
 from .board.solve import calibrate_camera as calibrate_camera
 from .files import calibration_text as calibration_text
 from .files import load_calibration as load_calibration

@@ -16,6 +16,7 @@ import typer
 from perchctl.calibration import (
     FoundViews,
     calibrate_camera,
+    calibration_report,
     calibration_text,
     capture_views,
     check_calibration,
@@ -53,6 +54,7 @@ from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "a calibration"
+REPORT_SUFFIX = ".html"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 
 BoardOption = Annotated[
@@ -103,19 +105,22 @@ def camera(
 ) -> None:
     """Calibrate the camera, and report the resulting error at the target in mm.
 
+    A report next to the calibration file (same name, .html) shows the coverage of the picture, the
+    residuals, the spread of the views, and what to do better.
+
     A view is rejected if its RMS error exceeds 2.5 times that of the median view. A corner is
     rejected if its error exceeds 5 times the spread of its view. The report lists rejected views
     and corners, and pictures without a board.
     """
     pictures = _source(source, view)
     if output is not None:
-        check_output(output, SUFFIXES, force, CONTENT)
+        _check_camera_output(output, force)
     layout = Board.parse(board)
 
     def checked_file(size_px: tuple[int, int]) -> Path:
         """Return where the calibration goes; raises before a person has worked for nothing."""
         file = _file(output, size_px)
-        check_output(file, SUFFIXES, force, CONTENT)
+        _check_camera_output(file, force)
         return file
 
     found = _find_views(pictures, size, layout, view, checked_file)
@@ -128,12 +133,15 @@ def camera(
     result = calibrate_camera(found, seen.notation())
     if found.frames is not None:
         say(found.frames.text)
-    write_files({file: result.file_text(file.stem, _now()).encode()})
+    report, date = file.with_suffix(REPORT_SUFFIX), _now()
+    write_files({file: result.file_text(file.stem, date).encode()})
     for line in result.lines():
         say(line)
 
     say(f"wrote {file}")
-    record = result.record() | {"file": str(file)}
+    write_files({report: calibration_report(result, file.name, date).encode()})
+    say(f"wrote {report}: open it in a browser")
+    record = result.record() | {"file": str(file), "report": str(report)}
     print_result(record if as_json else file)
 
 
@@ -238,6 +246,12 @@ def convert(
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
     return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
+
+
+def _check_camera_output(file: Path, force: bool) -> None:
+    """Check a calibration file and its report. Raises InvalidValue, as `check_output`."""
+    check_output(file, SUFFIXES, force, CONTENT)
+    check_output(file.with_suffix(REPORT_SUFFIX), (REPORT_SUFFIX,), force, "a report")
 
 
 def _now() -> str:

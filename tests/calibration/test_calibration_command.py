@@ -18,6 +18,7 @@ from perchctl.vision import CameraModel
 from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 from tests.helpers.calibrating import calibrate, refused
 from tests.helpers.gear import SIZE_PX, write_turned_about
+from tests.helpers.report_page import Page
 
 pytestmark = pytest.mark.long
 
@@ -59,6 +60,9 @@ def test_pictures_become_a_file(calibrated: Result, rendered: Rendered) -> None:
     assert all(0 < e["axis_mm95"] <= e["mm95"] for e in told["error_mm"])
     assert told["verdict"] == "fly"
     assert "GOOD TO FLY" in calibrated.stderr
+    report = Path(told["file"]).with_suffix(".html")
+    assert told["report"] == str(report)
+    assert "GOOD TO FLY" in Page(report.read_text()).words
 
 
 def test_new_pictures_pass_the_check_and_another_camera_s_fail(
@@ -144,7 +148,8 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "code", "expected"),
     [
-        (["images:{board}", "-o", "mine.yaml"], 30, ["--force"]),
+        (["images:{board}", "-o", "mine.yaml"], 30, ["mine.yaml already exists", "--force"]),
+        (["images:{board}", "-o", "reported.yaml"], 30, ["reported.html already exists"]),
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
         (["images:sizes"], 30, ["3 of 4 pictures are 480x360", "board_02.png is 480x300 px"]),
         (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 pictures"]),
@@ -160,6 +165,7 @@ def test_pictures_that_will_not_do_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text("mine")
+    Path("reported.html").write_text("mine")
     Path("sizes").mkdir()
     files = sorted(rendered[0].iterdir())
     for i, path in enumerate(files[:4] if "images:sizes" in words else []):
@@ -168,7 +174,8 @@ def test_pictures_that_will_not_do_are_refused(
     places = {"board": rendered[0], "one": files[0]}
     given = ["-b", BOARD, "-o", "o.yaml", *(word.format(**places) for word in words)]
     refused(calibrate(*given), code, *(part.format(**places) for part in expected))
-    assert Path("mine.yaml").read_text() == "mine"
+    assert Path("mine.yaml").read_text() == Path("reported.html").read_text() == "mine"
+    assert not Path("reported.yaml").exists()
     assert not Path("o.yaml").exists()
 
 

@@ -315,8 +315,14 @@ def next_advice(signatures: Sequence[Array]) -> str:
     least = min(COVERAGE_AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
         return "show the board somewhere new"
-    k = COVERAGE_AXES.index(least)
-    if least == "skew":
+    return axis_advice(signatures, least)
+
+
+def axis_advice(signatures: Sequence[Array], axis: str) -> str:
+    """Return how to move or tilt the board so that the view signatures, at least one, spread more
+    along one of `COVERAGE_AXES`."""
+    k = COVERAGE_AXES.index(axis)
+    if axis == "skew":
         across, down = np.ptp(signatures, axis=0)[3:]
         k = 3 if across <= down else 4
     shown = [part[k] for part in signatures]

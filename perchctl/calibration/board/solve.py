@@ -20,7 +20,7 @@ from perchctl.calibration.board.adjust import (
     lens_covariance,
     reject_outliers,
 )
-from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection
+from perchctl.calibration.board.detect import BoardView, FoundViews, FrameCounts, Rejection
 from perchctl.calibration.board.predict import (
     ErrorAtRange,
     allowed_error_mm,
@@ -55,6 +55,7 @@ class Calibration:
         errors: predicted position error of the target, by distance.
         covered_cells: mask (rows, columns) of the picture's grid cells that boards covered.
         defects: sentences on the views' defects, with remedies; any rules out the best verdict.
+        frames: of a video or camera, what became of its frames; None for pictures.
     """
 
     board: str
@@ -66,6 +67,7 @@ class Calibration:
     errors: tuple[ErrorAtRange, ...]
     covered_cells: NDArray[np.bool_]
     defects: tuple[str, ...]
+    frames: FrameCounts | None = None
 
     @property
     def camera(self) -> CameraModel:
@@ -194,6 +196,7 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
         errors=predict_errors(fit.camera, covariance, covered),
         covered_cells=covered,
         defects=tuple(_lacks(fit, len(kept), covered)),
+        frames=found.frames,
     )
 
 

@@ -1,0 +1,254 @@
+"""The report of a calibration: what the views cover, how well the lens follows them, what to add.
+
+A residual is the found corner minus the corner that the camera model predicts. Residuals that point
+at random come from noise in the pictures. Neighbours that point the same way, in many views, come
+from a lens that the model does not follow, or from a board that is not flat.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from perchctl.calibration.board.capture import (
+    axis_advice,
+    coverage_bars,
+    covered_shares,
+    view_signature,
+)
+from perchctl.calibration.board.detect import BoardView, Rejection
+from perchctl.calibration.board.predict import CELLS, ErrorAtRange, allowed_error_mm
+from perchctl.calibration.board.solve import ASIDE_FACTOR, TITLES, Calibration, tilts_deg
+from perchctl.calibration.live import GuidanceBar
+from perchctl.geometry import Array
+from perchctl.report_page import render_template
+from perchctl.target import Board
+
+_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
+_LONG_SHARE = 0.04
+"""Length of a long residual as drawn, in picture widths. Larger: neighbours cross. Smaller: their
+directions cannot be seen."""
+_LONG_PERCENTILE = 95.0
+"""Of the residuals' lengths: the length that counts as long. Larger: a few outliers shrink the
+others. Smaller: the longest leave the picture."""
+_LEAST_RESIDUAL_PX = 1e-3
+"""Residuals below this are drawn as if they were so long: exact corners have none."""
+_LEAST_STEPS = 2
+"""The distance axis has so many steps or up to 2.5 times as many. Larger: labels overlap."""
+_STEPS = (1.0, 2.0, 5.0)
+"""Leading digits of the enlargement, the length of the key and the steps of an axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedView:
+    """One view that the camera was computed from.
+
+    Attributes:
+        outline_px: the convex hull of its corners, (n, 2).
+        predicted_px, residuals_px: its corners by the camera model, and the found ones minus those.
+        distance_m: of the board's middle from the camera.
+        tilt_deg: between the board and the image plane.
+        facing: unit vector (2,) in the picture, right and down, of the side that the board faces.
+        rejected_corners: number of corners that were rejected as outliers.
+    """
+
+    name: str
+    outline_px: Array
+    predicted_px: Array
+    residuals_px: Array
+    distance_m: float
+    tilt_deg: float
+    facing: Array
+    rejected_corners: int
+
+    @property
+    def rms_px(self) -> float:
+        """RMS residual, defined as in OpenCV."""
+        return float(np.sqrt((self.residuals_px**2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationReport:
+    """What the page of a calibration shows.
+
+    Attributes:
+        name: of the calibration file.
+        date: in ISO 8601, UTC.
+    """
+
+    result: Calibration
+    name: str
+    date: str
+
+    @property
+    def date_text(self) -> str:
+        """The date to the minute."""
+        return datetime.datetime.fromisoformat(self.date).strftime("%Y-%m-%d %H:%M UTC")
+
+    @property
+    def title(self) -> str:
+        """The verdict."""
+        return TITLES[self.result.verdict]
+
+    @property
+    def grade(self) -> str:
+        """Grade of the verdict: good, warn or bad."""
+        return _GRADES[self.result.verdict]
+
+    @property
+    def verdict(self) -> str:
+        """The expected error in mm, as a sentence."""
+        return self.result.verdict_text.removeprefix(f"{self.title}: ")
+
+    @cached_property
+    def views(self) -> tuple[ReportedView, ...]:
+        """The views used, the largest residuals first."""
+        result = self.result
+        rejected = {r.view: len(r.corner_ids) for r in result.rejections}
+        tilts = tilts_deg(result.fit.poses).tolist()
+        parts = zip(result.views, result.fit.poses, result.fit.residuals, tilts, strict=True)
+        views = [
+            _reported_view(view, pose, residuals, tilt, rejected.get(view.name, 0))
+            for view, pose, residuals, tilt in parts
+        ]
+        return tuple(sorted(views, key=lambda view: -view.rms_px))
+
+    @property
+    def rejections(self) -> list[Rejection]:
+        """The views and pictures that were not used, with the reasons; without single corners."""
+        whole = [r for r in self.result.rejections if not r.corner_ids]
+        return [*whole, *self.result.without_board]
+
+    @cached_property
+    def _signatures(self) -> list[Array]:
+        board = Board.parse(self.result.board)
+        return [view_signature(view, board) for view in self.result.views]
+
+    @property
+    def bars(self) -> dict[str, tuple[GuidanceBar, float]]:
+        """The bars of the capture, each with its share of the goal."""
+        shares = covered_shares(self._signatures)
+        return {axis: (bar, shares[axis]) for axis, bar in coverage_bars(self._signatures).items()}
+
+    @property
+    def advice(self) -> list[str]:
+        """What to do better, a sentence each; empty if nothing is to be done."""
+        advice = [f"{defect}." for defect in self.result.defects]
+        for axis, share in covered_shares(self._signatures).items():
+            if share < 1.0:
+                advice.append(
+                    f"the views reach {100 * share:.0f} % of the goal for {axis}: "
+                    f"{axis_advice(self._signatures, axis)}."
+                )
+        if any(self.is_too_large(error) for error in self.result.errors):
+            advice.append(
+                "the expected error exceeds its limit at some distances: add sharp views, near "
+                "and far, with the board tilted by 20 to 45 deg about both axes."
+            )
+        if any(not r.corner_ids for r in self.result.rejections):
+            advice.append(
+                "some views do not fit the others: take them again with the board flat and still, "
+                "and leave zoom and focus unchanged."
+            )
+        return [sentence[:1].upper() + sentence[1:] for sentence in advice]
+
+    def is_too_large(self, error: ErrorAtRange) -> bool:
+        """True if an expected error rules out the best verdict."""
+        return self.is_ahead_too_large(error) or self.is_aside_too_large(error)
+
+    def is_ahead_too_large(self, error: ErrorAtRange) -> bool:
+        """True if the error straight ahead exceeds its limit."""
+        return error.axis_mm95 > allowed_error_mm(error.z_m)
+
+    def is_aside_too_large(self, error: ErrorAtRange) -> bool:
+        """True if the error off the axis exceeds its limit."""
+        return error.mm95 > ASIDE_FACTOR * allowed_error_mm(error.z_m)
+
+    @cached_property
+    def enlargement(self) -> float:
+        """How many times longer than they are residuals are drawn."""
+        lengths_px = np.linalg.norm(np.concatenate(self.result.fit.residuals), axis=1)
+        long_px = max(float(np.percentile(lengths_px, _LONG_PERCENTILE)), _LEAST_RESIDUAL_PX)
+        return round_down(_LONG_SHARE * self.result.camera.size_px[0] / long_px)
+
+    @property
+    def key_px(self) -> float:
+        """A round residual, drawn as the key: about as long as a long one."""
+        return round_down(_LONG_SHARE * self.result.camera.size_px[0] / self.enlargement)
+
+    @property
+    def largest_px(self) -> float:
+        """The longest residual."""
+        return float(np.linalg.norm(np.concatenate(self.result.fit.residuals), axis=1).max())
+
+    @property
+    def uncovered_boxes_px(self) -> list[tuple[float, float, float, float]]:
+        """Left, top, width and height of the parts of the picture that no board covered: the runs
+        of empty cells in each row of the grid."""
+        w, h = self.result.camera.size_px
+        rows, columns = CELLS
+        boxes = []
+        for row, covered in enumerate(self.result.covered_cells):
+            edges = np.flatnonzero(np.diff(np.concatenate([[1], covered, [1]]).astype(int)))
+            for start, end in edges.reshape(-1, 2).tolist():
+                left, width = w * start / columns, w * (end - start) / columns
+                boxes.append((left, h * row / rows, width, h / rows))
+        return boxes
+
+    @property
+    def distance_ticks_m(self) -> list[float]:
+        """Round distances from 0 to beyond the farthest view."""
+        farthest_m = max(view.distance_m for view in self.views)
+        step_m = round_down(farthest_m / _LEAST_STEPS)
+        return [step_m * k for k in range(int(np.ceil(farthest_m / step_m)) + 1)]
+
+    @property
+    def parameters(self) -> list[tuple[str, float, float]]:
+        """Name, value and standard deviation of focal length and centre, px."""
+        names, result = ("fx", "fy", "cx", "cy"), self.result
+        values, std = result.fit.parameters.tolist(), result.parameter_std.tolist()
+        return list(zip(names, values[:4], std[:4], strict=True))
+
+
+def calibration_report(result: Calibration, name: str, date: str) -> str:
+    """The report of a calibration as one self-contained HTML page; `name` is the calibration
+    file's, and `date` is in ISO 8601."""
+    return render_template(
+        "perchctl.calibration",
+        "calibration.html",
+        report=CalibrationReport(result, name, date),
+        result=result,
+        allowed_error_mm=allowed_error_mm,
+        aside_factor=ASIDE_FACTOR,
+    )
+
+
+def round_down(value: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is at most `value`, which is positive."""
+    power = 10.0 ** np.floor(np.log10(value))
+    digit = max(step for step in _STEPS if step * power <= value * (1.0 + 1e-9))
+    return float(f"{digit * power:.6g}")
+
+
+def _reported_view(
+    view: BoardView, pose: Array, residuals_px: Array, tilt_deg: float, rejected_corners: int
+) -> ReportedView:
+    R = np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=np.float64)
+    middle_m = R @ view.corners_m.mean(axis=0) + pose[3:]
+    normal = -R[:, 2] if R[2, 2] > 0 else R[:, 2]  # towards the camera
+    hull = cv2.convexHull(view.corners_px.astype(np.float32))
+    sideways = float(np.linalg.norm(normal[:2]))
+    return ReportedView(
+        name=view.name,
+        outline_px=np.asarray(hull.reshape(-1, 2), dtype=np.float64),
+        predicted_px=view.corners_px - residuals_px,
+        residuals_px=residuals_px,
+        distance_m=float(np.linalg.norm(middle_m)),
+        tilt_deg=tilt_deg,
+        facing=normal[:2] / max(sideways, 1e-9),
+        rejected_corners=rejected_corners,
+    )
