@@ -30,10 +30,16 @@ def open_video_capture(
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
-        raise NotFound(f"camera:{number} was not found; {_there(find_cameras())}", PLUG_IN)
+        raise _not_found(str(number), find_cameras())
     capture = cv2.VideoCapture(number, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
     if not capture.isOpened():
         capture.release()
+        if not linux:
+            raise NotFound(
+                f"camera:{number} cannot be opened",
+                "plug it in, close other programs that use it, and let the terminal use cameras "
+                "(in the privacy settings of the system)",
+            )
         raise NotFound(
             f"camera:{number} exists but cannot be opened",
             f"close other programs that use it, and check your permission to open "
@@ -181,8 +187,22 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
             f"camera:{wanted} matches {len(fitting)} cameras: {', '.join(map(str, fitting))}",
             "write more of the name, the path, or the number",
         )
-    raise NotFound(f"camera:{wanted} was not found; {_there(known)}", PLUG_IN)
+    raise _not_found(wanted, known)
 
 
-def _there(known: list[ConnectedCamera]) -> str:
-    return f"there are {', '.join(map(str, known))}" if known else "this computer has no camera"
+def _not_found(wanted: str, known: list[ConnectedCamera]) -> NotFound:
+    if not known:
+        nothing = no_camera()
+        return NotFound(f"camera:{wanted} was not found; {nothing.found}", nothing.advice)
+    there = ", ".join(map(str, known))
+    return NotFound(f"camera:{wanted} was not found; there are {there}", PLUG_IN)
+
+
+def no_camera() -> NotFound:
+    """The error for a computer of which no camera is known: it has none, or its system does not
+    list them as Linux does."""
+    if sys.platform.startswith("linux"):
+        return NotFound("this computer has no camera", PLUG_IN, separator=": ")
+    return NotFound(
+        "perchctl lists cameras only on Linux", "use a number, such as camera:0", separator=": "
+    )

@@ -3,6 +3,7 @@ behind a stand-in."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,7 @@ from perchctl.camera.device import (
     open_video_capture,
 )
 from perchctl.camera.source import LiveSource
+from perchctl.commands import check
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
@@ -71,6 +73,25 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
 def test_a_missing_device_says_what_there_is() -> None:
     assert not Path("/dev/video97").exists()
     with pytest.raises(NotFound, match=r"camera:97 was not found; th(ere are|is computer)"):
+        open_video_capture("97", None, None)
+
+
+def test_another_system_than_linux_is_asked_by_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Closed:
+        isOpened = staticmethod(lambda: False)
+        release = staticmethod(lambda: None)
+
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Closed())
+    by_number = "lists cameras only on Linux.*such as camera:0"
+    with pytest.raises(NotFound, match=f"camera:USB was not found; perchctl {by_number}"):
+        camera_number("USB", tmp_path, tmp_path)
+    monkeypatch.setattr(check, "find_cameras", list)
+    with pytest.raises(NotFound, match=by_number):
+        list(check.camera_rows())
+    with pytest.raises(NotFound, match=r"camera:97 cannot be opened; .*privacy settings"):
         open_video_capture("97", None, None)
 
 
