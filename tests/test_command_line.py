@@ -279,12 +279,14 @@ def test_a_program_that_imports_perchctl_keeps_its_ctrl_c(
 AS_ON_WINDOWS = """
 import sys
 sys.platform = "win32"
-sys.modules.update(dict.fromkeys(["fcntl", "pwd", "termios", "tty"]))  # an ImportError each
+lacks = ["fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"]
+sys.modules.update(dict.fromkeys(lacks))  # an ImportError each
 """
 
 
-def test_windows_is_refused_in_one_sentence_with_a_way_to_go_on() -> None:
-    done = run_apart("fly", "--json", before=AS_ON_WINDOWS)
+@pytest.mark.parametrize("words", [*COMMANDS, "log report", "calibrate mount", "--help"])
+def test_windows_is_refused_in_one_sentence_with_a_way_to_go_on(words: str) -> None:
+    done = run_apart(*words.split(), "--json", before=AS_ON_WINDOWS)
     assert done.code == 1
     assert done.complaint.startswith("Windows is not supported: install perchctl in WSL2")
     assert json.loads(done.stdout) == {"error": done.complaint, "exit_code": 1}
