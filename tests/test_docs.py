@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
@@ -35,7 +36,8 @@ from tests.helpers.weights_data import known
 from tests.helpers.weights_data import write as write_session
 
 DOCS = ROOT / "docs"
-PAGES = (ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted(DOCS.glob("*.md")))
+GITHUB = ROOT / ".github"
+PAGES = (ROOT / "README.md", *sorted(ROOT.glob("[CS]*.md")), *sorted(DOCS.glob("*.md")))
 TEXT = {path: path.read_text(encoding="utf-8") for path in PAGES}
 EACH_PAGE = pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 README = TEXT[ROOT / "README.md"]
@@ -450,6 +452,14 @@ def test_the_readme_is_short_and_set_up_is_two_commands() -> None:
     assert [len(block.strip().splitlines()) for block in found] == [1, 1]
     assert found[0].strip().endswith("perchctl fly")
     assert found[1].strip().endswith("pytest")
+
+
+def test_the_issue_form_asks_for_the_log_and_the_check() -> None:
+    text = (GITHUB / "ISSUE_TEMPLATE" / "problem.yml").read_text(encoding="utf-8")
+    asked = {field["id"]: str(field["attributes"]) for field in yaml.safe_load(text)["body"]}
+    assert "perchctl check --json" in asked["check"]
+    assert ".jsonl" in asked["log"]
+    assert "perchctl --version" in asked["version"]
 
 
 def test_pictures_are_made_by_the_command_and_shown() -> None:
