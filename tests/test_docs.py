@@ -8,6 +8,7 @@ import runpy
 import shlex
 import shutil
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -452,6 +453,19 @@ def test_the_readme_is_short_and_set_up_is_two_commands() -> None:
     assert [len(block.strip().splitlines()) for block in found] == [1, 1]
     assert found[0].strip().endswith("perchctl fly")
     assert found[1].strip().endswith("pytest")
+
+
+def test_the_workflow_has_every_python_version_of_its_page() -> None:
+    jobs = yaml.safe_load((GITHUB / "workflows" / "ci.yml").read_text(encoding="utf-8"))["jobs"]
+    setups = [s for job in jobs.values() for s in job["steps"] if "setup-python" in str(s)]
+    tested = {s["with"]["python-version"] for s in setups}
+    tested |= set(jobs["test"]["strategy"]["matrix"]["python"])
+    page = TEXT[DOCS / "platforms.md"].partition("## Python versions")[2]
+    assert set(re.findall(r"3\.\d+", page)) == {v for v in tested if v[0].isdigit()}
+    least = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert least["requires-python"] == f">={min(re.findall(r'3[.][0-9]+', page))}"
+    assert "--resolution lowest-direct" in str(jobs["lowest"])
+    assert "--cov=perchctl" in str(jobs["coverage"])
 
 
 def test_the_issue_form_asks_for_the_log_and_the_check() -> None:
