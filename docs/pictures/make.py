@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import argparse
 import io
+import math
 import re
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Ellipse, PathPatch, Polygon, Rectangle
+from matplotlib.path import Path as MplPath
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
@@ -249,48 +251,44 @@ def report(flown: Flight, file: Path) -> None:
 
 
 def vehicle_drawing(flown: Flight, file: Path) -> None:
-    """The vehicle from the side and from above, to scale: camera, gear, deck, axes."""
-    figure = new_figure(11.0, 4.6, dpi=100)
+    """The vehicle from the side and from above, to scale: camera, gear, decks, dimensions, axes."""
+    figure = new_figure(11.0, 6.0, dpi=100)
     side, above = figure.subplots(1, 2)
     lens_m, gear_m = flown.profile.camera.mount.position_m, flown.profile.vehicle.gear_body_m
     for ax, title in ((side, "from its right side"), (above, "from above")):
         ax.set_title(title, fontsize=11)
         ax.set_aspect("equal")
         ax.set_axis_off()
-    side.set_xlim(-0.085, 0.115)
-    side.set_ylim(-0.045, 0.075)
-    for x, up, width, height, colour in _body_parts(gear_m[2], spins=False):
-        side.add_patch(Rectangle((x, up), width, height, color=colour))
-    side.add_patch(Rectangle((-0.014, -0.012), 0.028, 0.0025, color=ORANGE))
-    side.add_patch(
-        Rectangle((lens_m[0] - 0.006, 0.002), 0.012, lens_m[2] - 0.002, color=VERMILLION)
-    )
+        ax.set_xlim(-0.078, 0.078)
+        ax.set_ylim(-0.078, 0.078)
+    _side_view(side, gear_m[2], lens_m, 0.0)
     side.fill(
         (lens_m[0], lens_m[0] - 0.04, lens_m[0] + 0.04), (lens_m[2], 0.058, 0.058),
         color=VERMILLION, alpha=0.12, linewidth=0.0,
     )  # fmt: skip
-    _label(side, "gear tip: the highest point", (gear_m[0], gear_m[2]), (-0.08, 0.064))
-    _label(side, "camera, looks up", (lens_m[0], lens_m[2]), (0.058, 0.064))
-    _label(side, "battery", (-0.012, 0.006), (-0.084, 0.028))
-    _label(side, "positioning deck, below", (0.0, -0.011), (-0.07, -0.034))
-    _arrow(side, (0.06, -0.03), (0.035, 0.0), "x: front")
-    _arrow(side, (0.06, -0.03), (0.0, 0.026), "z: up")
-    above.set_xlim(-0.085, 0.115)
-    above.set_ylim(-0.072, 0.072)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = sx * MOTOR_M, sy * MOTOR_M
-            above.plot((0.0, x), (0.0, y), color=BLUE, linewidth=5.0)
-            above.add_patch(Circle((x, y), 0.0225, fill=False, color=GREY, linewidth=1.5))
-    above.add_patch(Rectangle((-0.016, -0.011), 0.032, 0.022, color=GREY))
-    above.add_patch(
-        Rectangle((lens_m[0] - 0.006, lens_m[1] - 0.006), 0.012, 0.012, color=VERMILLION)
-    )
-    above.add_patch(Circle(gear_m[:2], 0.004, color=BLACK))
-    _label(above, "gear tip, over the middle", (gear_m[0], gear_m[1]), (-0.083, 0.066))
-    _label(above, "camera", (lens_m[0], lens_m[1]), (0.052, 0.016))
-    _arrow(above, (0.075, -0.04), (0.032, 0.0), "x: front")
-    _arrow(above, (0.075, -0.04), (0.0, 0.032), "y: left")
+    _label(side, "magnet: the highest point", (gear_m[0] - 0.004, gear_m[2]), (-0.076, 0.048))
+    _label(side, "gear", (gear_m[0] - 0.002, 0.02), (-0.05, 0.028))
+    _label(side, "camera, looks up", (lens_m[0] + 0.004, lens_m[2] - 0.003), (0.03, 0.064))
+    _label(side, "battery", (-0.013, 0.004), (-0.07, -0.03))
+    _label(side, "Flow deck", (-0.006, DECK_BELOW_M + 0.001), (-0.052, -0.04))
+    _size(side, (-0.062, FEET_M), (-0.062, ROTOR_M), f"{1e3 * (ROTOR_M - FEET_M):.0f} mm")
+    _size(side, (0.064, 0.0), (0.064, gear_m[2]), f"{1e3 * gear_m[2]:.0f} mm")
+    _size(side, (0.0, -0.03), (lens_m[0], -0.03), f"{1e3 * lens_m[0]:.0f} mm")
+    for at in ((gear_m[0] + 0.007, 0.064, gear_m[2]), (0.045, 0.064, 0.0)):
+        side.plot(at[:2], (at[2], at[2]), color=GREY, linewidth=0.6)
+    _arrow(side, (-0.07, -0.075), (0.03, 0.0), "x: front")
+    _arrow(side, (-0.07, -0.075), (0.0, 0.022), "z: up")
+    _view_from_above(above, gear_m, lens_m)
+    _label(above, "gear: its tip over the middle", (gear_m[0] - 0.003, 0.004), (-0.076, 0.072))
+    _label(above, "camera", (lens_m[0] + 0.006, lens_m[1]), (0.056, 0.006))
+    _label(above, "deck on top", (-0.013, -0.006), (-0.077, -0.006))
+    _size(above, (-MOTOR_M, -0.065), (MOTOR_M, -0.065), f"{2e3 * MOTOR_M:.0f} mm")
+    _size(
+        above, (MOTOR_M - PROPELLER_M, 0.065), (MOTOR_M + PROPELLER_M, 0.065),
+        f"{2e3 * PROPELLER_M:.0f} mm",
+    )  # fmt: skip
+    _arrow(above, (-0.07, -0.075), (0.03, 0.0), "x: front")
+    _arrow(above, (-0.07, -0.075), (0.0, 0.022), "y: left")
     _save_svg(figure, file)
 
 
@@ -309,9 +307,8 @@ def sheet_drawing(flown: Flight, file: Path) -> None:
     ax.add_patch(Rectangle((-half_m, 0.002), 2 * half_m, 0.004, color="#B89B72"))
     ax.add_patch(Rectangle((-0.025, 0.006), 0.05, 0.005, color=VERMILLION))
     ax.add_patch(Rectangle((-half_m, 0.0), 2 * half_m, 0.002, color=BLACK))
-    for x, up, width, height, colour in _body_parts(flown.profile.vehicle.gear_body_m[2], True):
-        z = -flown.profile.vehicle.gear_body_m[2]
-        ax.add_patch(Rectangle((x, z + up - 0.022), width, height, color=colour))
+    gear_m, lens_m = flown.profile.vehicle.gear_body_m[2], flown.profile.camera.mount.position_m
+    _side_view(ax, gear_m, lens_m, -gear_m - 0.012)
     _label(ax, "ceiling or shelf", (-0.14, 0.05), (-0.165, 0.058))
     _label(ax, "spacers, three or more", (0.083, 0.024), (0.1, 0.03))
     _label(ax, "stiff board, flat", (-0.09, 0.004), (-0.168, 0.016))
@@ -344,21 +341,121 @@ def wiring_drawing(_: Flight, file: Path) -> None:
     _save_svg(figure, file)
 
 
+# A Crazyflie 2.1+ by its data sheets, m.
 MOTOR_M = 0.0325
-"""Of a motor from the middle, along x and along y."""
+"""Of a motor from the middle, along x and along y: 92 mm from motor to motor across."""
+PROPELLER_M = 0.0235
+"""The radius of a propeller 47-17."""
+ARM_M = 0.0283
+"""Of the end of the board's arm from the middle, along x and along y."""
+PIN_ROW_M = 0.011
+"""Of a row of deck pins from the middle, along y."""
+DECK_M = 0.028
+"""The side of a deck."""
+FEET_M, ROTOR_M = -0.018, 0.011
+"""The lowest and the highest point of the bare vehicle: 29 mm. The share above the board is an
+estimate, as are the heights of the decks."""
+DECK_BELOW_M, DECK_ABOVE_M = -0.0075, 0.0105
 
 
-def _body_parts(gear_m: float, spins: bool) -> list[tuple[float, float, float, float, str]]:
-    """Rectangles of a Crazyflie from the side, m: x, z, width, height, colour."""
-    parts = [
-        (-0.046, -0.002, 0.092, 0.004, BLUE),
-        (-0.016, 0.002, 0.032, 0.007, GREY),
-        (-0.003, 0.002, 0.006, gear_m - 0.002, BLACK),
-    ]
-    for side in (-0.046, 0.046):
-        parts.append((side - 0.0035, -0.012, 0.007, 0.02, GREY))
-        parts.append((side - 0.0225, 0.008, 0.045, 0.002, GREEN if spins else BLACK))
-    return parts
+def _side_view(ax: Axes, gear_m: float, lens_m: Sequence[float], z_m: float) -> None:
+    """A Crazyflie with its parts from its right side, its board at the height `z_m`."""
+
+    def box(x: float, z: float, width: float, height: float, colour: str, **more: Any) -> None:
+        more = {"facecolor": colour, "edgecolor": BLACK, "linewidth": 0.5} | more
+        ax.add_patch(Rectangle((x, z_m + z), width, height, **more))
+
+    for x in (-MOTOR_M, MOTOR_M):
+        box(x - 0.0046, -0.010, 0.0092, 0.013, "#B9B9B9")  # the mount, and its foot
+        ax.add_patch(
+            Polygon(
+                [(x + dx, z_m + z) for dx, z in ((-0.0046, -0.010), (0.0046, -0.010),
+                                                 (0.0015, FEET_M), (-0.0015, FEET_M))],
+                facecolor="#B9B9B9", edgecolor=BLACK, linewidth=0.5,
+            )
+        )  # fmt: skip
+        box(x - 0.0035, 0.003, 0.007, 0.0045, GREY)  # the motor
+        box(x - 0.0012, 0.0075, 0.0024, ROTOR_M - 0.0075, BLACK)
+        box(x - PROPELLER_M, ROTOR_M - 0.0022, 2 * PROPELLER_M, 0.0012, BLACK, alpha=0.75)
+    box(-ARM_M, -0.0008, 2 * ARM_M, 0.0016, BLUE)
+    box(-0.015, 0.0012, 0.030, 0.007, "#D9D9D9")  # the battery
+    for pin in range(10):
+        box(-0.009 + 0.002 * pin - 0.00025, -0.009, 0.0005, 0.0225, ORANGE, linewidth=0.0)
+    box(-0.0105, DECK_BELOW_M, 0.021, 0.0016, GREEN)
+    box(-0.006, DECK_BELOW_M - 0.002, 0.005, 0.002, BLACK)  # its two sensors
+    box(0.002, DECK_BELOW_M - 0.001, 0.004, 0.001, BLACK)
+    box(-DECK_M / 2, DECK_ABOVE_M, DECK_M, 0.0016, GREEN)
+    foot, top = DECK_ABOVE_M + 0.0016, gear_m - 0.002
+    x = lens_m[0]  # the camera, and the strip that carries it
+    strip = (
+        (DECK_M / 2, DECK_ABOVE_M),
+        (x - 0.008, lens_m[2] - 0.007),
+        (x + 0.006, lens_m[2] - 0.007),
+    )
+    ax.plot([p for p, _ in strip], [z_m + q for _, q in strip], color=BLACK, linewidth=1.5)
+    box(x - 0.006, lens_m[2] - 0.007, 0.012, 0.004, VERMILLION)
+    box(x - 0.0035, lens_m[2] - 0.003, 0.007, 0.003, BLACK)
+    box(-0.010, foot, 0.020, 0.004, "#8A8A8A")  # the gear, as docs/gear.scad has it
+    outline = (
+        (0.0025, foot + 0.004), (0.0025, top - 0.0047), (0.006, top - 0.0012), (0.006, top),
+    )  # fmt: skip
+    shape = [*outline, *((-p, q) for p, q in reversed(outline))]
+    ax.add_patch(
+        Polygon(
+            [(p, z_m + q) for p, q in shape], facecolor="#8A8A8A", edgecolor=BLACK, linewidth=0.5
+        )
+    )
+    box(-0.006, top, 0.012, 0.002, BLACK)
+
+
+def _view_from_above(ax: Axes, gear_m: Sequence[float], lens_m: Sequence[float]) -> None:
+    """A Crazyflie with its parts from above; the front is on the right."""
+    near, far = ARM_M - 0.0035, ARM_M
+    corners = [(far, near), (near, far), (-near, far), (-far, near),
+               (-far, -near), (-near, -far), (near, -far), (far, -near)]  # fmt: skip
+    points, codes = [corners[0]], [MplPath.MOVETO]
+    for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+        if abs(start[0]) != abs(end[0]):  # the end of an arm
+            points, codes = [*points, end], [*codes, MplPath.LINETO]
+            continue
+        # Between two arms the board's edge curves in.
+        inwards = [(0.4 * x, 0.36 * y) if start[1] == end[1] else (0.36 * x, 0.4 * y)
+                   for x, y in (start, end)]  # fmt: skip
+        points, codes = [*points, *inwards, end], [*codes, *[MplPath.CURVE4] * 3]
+    ax.add_patch(PathPatch(MplPath(points, codes), facecolor=BLUE, edgecolor=BLACK, linewidth=0.6))
+    for x in (-MOTOR_M, MOTOR_M):
+        for y in (-MOTOR_M, MOTOR_M):
+            inner = (math.copysign(near - 0.003, x), math.copysign(near - 0.003, y))
+            ax.plot((inner[0], x), (inner[1], y), color="#B9B9B9", linewidth=5.0, zorder=1.0)
+            ax.add_patch(Circle((x, y), PROPELLER_M, facecolor=GREY, alpha=0.12, linewidth=0.0))
+            ax.add_patch(Circle((x, y), PROPELLER_M, fill=False, color=GREY, linewidth=0.6))
+            ax.add_patch(Circle((x, y), 0.0046, facecolor="#B9B9B9", edgecolor=BLACK))
+            turned = 35.0 if x * y > 0 else -35.0
+            ax.add_patch(Ellipse((x, y), 2 * PROPELLER_M, 0.0045, angle=turned, color=BLACK))
+            ax.add_patch(Circle((x, y), 0.0012, color="#B9B9B9"))
+    half = DECK_M / 2
+    ax.add_patch(Rectangle((-half, -half), DECK_M, DECK_M, facecolor=GREEN, edgecolor=BLACK))
+    for y in (-PIN_ROW_M, PIN_ROW_M):
+        ax.add_patch(Rectangle((-0.010, y - 0.0015), 0.020, 0.003, facecolor="#8A8A8A"))
+    ax.add_patch(Rectangle((-0.003, -0.0125), 0.006, 0.025, facecolor="#8A8A8A"))
+    ax.add_patch(Circle(gear_m[:2], 0.006, color=BLACK))
+    ax.add_patch(Circle(gear_m[:2], 0.0025, color="#8A8A8A"))
+    x, y = lens_m[:2]
+    ax.plot((half, x), (y, y), color=BLACK, linewidth=4.0)
+    ax.add_patch(Rectangle((x - 0.006, y - 0.006), 0.012, 0.012, color=VERMILLION))
+    ax.add_patch(Circle((x, y), 0.0035, color=BLACK))
+
+
+def _size(ax: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
+    """A dimension: a line with two arrowheads and its length beside it."""
+    ax.annotate("", end, start, arrowprops={"arrowstyle": "<->", "color": GREY, "linewidth": 0.8,
+                                            "shrinkA": 0.0, "shrinkB": 0.0})  # fmt: skip
+    middle = ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
+    upright = start[0] == end[0]
+    ax.text(
+        middle[0] + (0.0015 if upright else 0.0), middle[1] + (0.0 if upright else 0.0015), text,
+        fontsize=9, ha="left" if upright else "center", va="center" if upright else "bottom",
+    )  # fmt: skip
 
 
 def _label(ax: Axes, text: str, at: tuple[float, float], words: tuple[float, float]) -> None:
