@@ -7,12 +7,14 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
 import sys
 import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
@@ -24,6 +26,7 @@ from perchctl.calibration import MountingRecording, load_calibration
 from perchctl.commands import app
 from perchctl.commands.command_line import COMMANDS
 from perchctl.flight import KEY_HELP, STOP_HELP, fly_lockstep
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.profile import Profile
 from perchctl.profile.keys import keys
 from tests.helpers import log as made_up_log
@@ -455,6 +458,48 @@ def test_the_readme_is_short_and_set_up_is_two_commands() -> None:
     assert [len(block.strip().splitlines()) for block in found] == [1, 1]
     assert found[0].strip().endswith("perchctl fly")
     assert found[1].strip().endswith("pytest")
+
+
+MOST_G = 42.0
+"""The heaviest vehicle that docs/hardware.md allows."""
+PLA_G_PER_MM3 = 1.24e-3
+
+
+def vehicles_to_buy() -> list[tuple[list[float], float]]:
+    """Of each vehicle of the page, the masses of its parts and their sum, as the page has it."""
+    found = []
+    for table in re.findall(r"((?:^\|.*\n)+)", TEXT[DOCS / "parts.md"], re.MULTILINE):
+        lines = [line.strip("| \n").split(" | ") for line in table.splitlines()]
+        if lines[0][-1] == "mass [g]":
+            masses = [float(re.findall(r"[\d.]+", line[-1])[0]) for line in lines[2:]]
+            found.append((masses[:-1], masses[-1]))
+    return found
+
+
+def test_the_vehicles_to_buy_add_up_and_can_be_flown() -> None:
+    assert f"at most {MOST_G:g} g" in TEXT[DOCS / "hardware.md"]
+    assert len(vehicles_to_buy()) == 2
+    page = TEXT[DOCS / "parts.md"]
+    for masses, total in vehicles_to_buy():
+        assert sum(masses) == pytest.approx(total)
+        assert total <= MOST_G
+        assert f"This leaves {MOST_G - total:.1f} g" in page
+        share = total / 1e3 * GRAVITY_MPS2 / 0.48
+        assert f"{100 * share:.0f} % of the full thrust" in page
+
+
+def test_the_printed_gear_weighs_what_its_page_says(tmp_path: Path) -> None:
+    openscad = shutil.which("openscad")
+    if openscad is None:
+        pytest.skip("needs OpenSCAD")
+    made = tmp_path / "gear.stl"
+    subprocess.run([openscad, "-o", made, DOCS / "gear.scad"], check=True, capture_output=True)
+    numbers = re.findall(r"vertex (\S+) (\S+) (\S+)", made.read_text(encoding="utf-8"))
+    corners = np.array(numbers, float).reshape(-1, 3, 3)
+    volume_mm3 = np.linalg.det(corners).sum() / 6.0
+    assert {masses[3] for masses, _ in vehicles_to_buy()} == {round(volume_mm3 * PLA_G_PER_MM3, 1)}
+    height_mm = float(re.findall(r"^height = (\d+);", (DOCS / "gear.scad").read_text(), re.M)[0])
+    assert corners[..., 2].max() < height_mm, "the magnet is the highest point"
 
 
 def test_the_workflow_has_every_python_version_of_its_page() -> None:
