@@ -1,5 +1,4 @@
 from .device import find_cameras as find_cameras
-from .device import no_camera as no_camera
 from .files import RecordedSource as RecordedSource
 from .files import decode_picture as decode_picture
 from .files import image_files as image_files

@@ -30,7 +30,7 @@ def open_video_capture(
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
-        raise _not_found(str(number), find_cameras())
+        raise _not_found(str(number), _known_cameras(DEVICES, NAMES))
     capture = cv2.VideoCapture(number, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
     if not capture.isOpened():
         capture.release()
@@ -136,9 +136,24 @@ class ConnectedCamera:
         return f"camera:{self.number}{name}{path}"
 
 
-def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[ConnectedCamera]:
-    """Return this computer's cameras in order of number, each with its first video node, as others
-    often give no pictures. Nothing is opened."""
+def find_cameras() -> list[ConnectedCamera]:
+    """Return this computer's cameras in order of number. Nothing is opened. Errors: NotFound if
+    none is known: the computer has none, or its system does not list them as Linux does."""
+    if cameras := _known_cameras(DEVICES, NAMES):
+        return cameras
+    raise _no_camera()
+
+
+def _no_camera() -> NotFound:
+    if sys.platform.startswith("linux"):
+        return NotFound("this computer has no camera", PLUG_IN, separator=": ")
+    return NotFound(
+        "perchctl lists cameras only on Linux", "use a number, such as camera:0", separator=": "
+    )
+
+
+def _known_cameras(devices: Path, names: Path) -> list[ConnectedCamera]:
+    """Each camera with its first video node, as others often give no pictures."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):
@@ -174,7 +189,7 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
     wanted = text.strip().strip("\"'").strip()
     if wanted.isascii() and wanted.isdigit():
         return int(wanted)
-    known = find_cameras(devices, names)
+    known = _known_cameras(devices, names)
     if wanted.startswith("/"):
         fitting = [c for c in known if c.number in _video_numbers([Path(wanted).resolve()])]
     else:
@@ -192,17 +207,7 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
 
 def _not_found(wanted: str, known: list[ConnectedCamera]) -> NotFound:
     if not known:
-        nothing = no_camera()
+        nothing = _no_camera()
         return NotFound(f"camera:{wanted} was not found; {nothing.found}", nothing.advice)
     there = ", ".join(map(str, known))
     return NotFound(f"camera:{wanted} was not found; there are {there}", PLUG_IN)
-
-
-def no_camera() -> NotFound:
-    """The error for a computer of which no camera is known: it has none, or its system does not
-    list them as Linux does."""
-    if sys.platform.startswith("linux"):
-        return NotFound("this computer has no camera", PLUG_IN, separator=": ")
-    return NotFound(
-        "perchctl lists cameras only on Linux", "use a number, such as camera:0", separator=": "
-    )

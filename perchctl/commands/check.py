@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.camera import find_cameras, no_camera
+from perchctl.camera import find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
@@ -154,10 +154,7 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 
 def camera_rows() -> Iterator[Row]:
     """Yield a row for each camera; nothing is set, no picture taken. Errors: NotFound if none."""
-    cameras = find_cameras()
-    if not cameras:
-        raise no_camera()
-    for camera in cameras:
+    for camera in find_cameras():
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
         if camera.problem:

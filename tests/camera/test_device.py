@@ -88,7 +88,7 @@ def test_another_system_than_linux_is_asked_by_number(
     by_number = "lists cameras only on Linux.*such as camera:0"
     with pytest.raises(NotFound, match=f"camera:USB was not found; perchctl {by_number}"):
         camera_number("USB", tmp_path, tmp_path)
-    monkeypatch.setattr(check, "find_cameras", list)
+    monkeypatch.setattr("perchctl.camera.device.DEVICES", tmp_path)
     with pytest.raises(NotFound, match=by_number):
         list(check.camera_rows())
     with pytest.raises(NotFound, match=r"camera:97 cannot be opened; .*privacy settings"):
