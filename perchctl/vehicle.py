@@ -18,6 +18,8 @@ MOST_CELL_V = 4.4
 """No single cell has more: a full one of the high-voltage kind rests at 4.35 V, and readings err by
 1 %. With more there is no take-off, and in flight it is no reading."""
 
+MOST_DUTY = 65535
+"""Full duty cycle of a motor: the firmware counts in steps of 1 / 65535."""
 AIRFRAMES = ("Crazyflie 2.0", "Crazyflie 2.1", "Crazyflie 2.1+", "Crazyflie 2.1 Brushless")
 """Device types, by the firmware's names, for which perchctl's thrust and battery figures hold
 (docs/hardware.md, "Which vehicles")."""
@@ -43,6 +45,10 @@ class Telemetry:
     With a deck that only measures the speed over ground, as a Flow deck does, nothing measures the
     horizontal position, and `position_variance_m2` stays at 100 m^2 (docs/firmware.md,
     "Variances"): of the position only `height_variance_m2` says anything there.
+
+    `motor_duty` is the duty cycle of M1 (front right), M2 (back right), M3 (back left) and M4
+    (front left), 0..65535, as old as the battery; None if the vehicle does not report it. No
+    decision of a flight uses it.
     """
 
     t_s: float
@@ -66,6 +72,7 @@ class Telemetry:
     variance_behind_s: float = 0.0
     velocity_variance_m2ps2: float | None = None  # of the estimated velocity: largest of three axes
     height_variance_m2: float | None = None  # of the estimated height
+    motor_duty: tuple[int, int, int, int] | None = None
 
     def has_bit(self, supervisor_bit: int) -> bool:
         return bool(self.supervisor & supervisor_bit)

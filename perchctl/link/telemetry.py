@@ -15,7 +15,7 @@ from typing import Any
 
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.crtp import Packet, Port
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import MOST_DUTY, Telemetry
 
 STATE_BLOCK = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")}
 """Uses 24 of the 26 bytes of a log block."""
@@ -32,8 +32,15 @@ ATTITUDE_BLOCK: dict[str, str] = {
 }
 """Uses all 26 bytes: half floats resolve a force of 0.1 g to 0.1 mg."""
 
-BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
-"""Without this block, the battery is unknown, which the flight tolerates (fault 7)."""
+MOTOR_DUTIES = tuple(f"motor.m{number}" for number in (1, 2, 3, 4))
+"""Left out of their block if the firmware lacks one of them: the battery matters more."""
+BATTERY_BLOCK: dict[str, str] = {
+    "pm.vbat": "float",
+    "pm.state": "int8_t",
+    **dict.fromkeys(MOTOR_DUTIES, "uint16_t"),
+}
+"""Uses 13 bytes. Without this block, the battery is unknown, which the flight tolerates (fault 7).
+The duty cycles are here because their thrust follows from the battery's voltage."""
 
 POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
 VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
@@ -79,6 +86,7 @@ def telemetry_from_log(
         variance_behind_s=variance_behind_s,
         velocity_variance_m2ps2=_largest(values, VELOCITY_VARIANCES),
         height_variance_m2=_largest(values, POSITION_VARIANCES[2:]),
+        motor_duty=_motor_duty(values),
     )
 
 
@@ -89,6 +97,14 @@ def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
     if any(variance == 0.0 for variance in found):
         return None
     return math.nan if any(map(math.isnan, found)) else max(found)
+
+
+def _motor_duty(values: Mapping[str, float]) -> tuple[int, int, int, int] | None:
+    """Return the duty cycles of M1..M4; None if one is missing or is not a duty cycle."""
+    m1, m2, m3, m4 = (values.get(name, math.nan) for name in MOTOR_DUTIES)
+    if not all(0.0 <= duty <= MOST_DUTY for duty in (m1, m2, m3, m4)):
+        return None
+    return round(m1), round(m2), round(m3), round(m4)
 
 
 # --- Conversion of the vehicle's milliseconds to the loop's clock ---
@@ -275,10 +291,16 @@ class LogBlocks:
         Raises NotFound for a refused block, and TimedOut.
         """
         self._started_s = self._clock()
-        for name, variables in BLOCKS.items():
+
+        def is_known(variable: str) -> bool:
+            return log.toc.get_element_by_complete_name(variable) is not None
+
+        absent = () if all(map(is_known, MOTOR_DUTIES)) else MOTOR_DUTIES
+        for name, described in BLOCKS.items():
+            variables = {n: ctype for n, ctype in described.items() if n not in absent}
             if name in FAST_BLOCKS:
                 block = start_block(log, uri, name, variables, period_s, self._on_data)
-            elif all(log.toc.get_element_by_complete_name(n) is not None for n in variables):
+            elif all(map(is_known, variables)):
                 self._awaited.add(name)
                 block = start_block(log, uri, name, variables, SLOW_PERIOD_S, self._on_data)
             else:

@@ -40,6 +40,11 @@ def _axes(name: str, meaning: str) -> dict[str, str]:
     return {name.format(axis): meaning for axis in "xyz"}
 
 
+DUTY_FIELDS = tuple(f"duty_m{motor}" for motor in (1, 2, 3, 4))
+_DUTIES = (
+    "duty cycle of the motor front right (M1), back right, back left and front left, 0..65535, as "
+    "old as the battery voltage"
+)
 FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",
     # the planner
@@ -56,6 +61,7 @@ FIELDS: dict[str, str] = {
     "yaw_rad": "heading, right-handed about world z",
     "acc_z_g": "specific force along body z, +1 at rest",
     "thrust": "thrust command of the vehicle's controller, 0..65535",
+    **dict.fromkeys(DUTY_FIELDS, _DUTIES),
     "battery_v": "battery voltage under the present load",
     "battery_state": "pm.state; 3 is low power",
     "battery_rest_v": "resting voltage according to the energy model",
@@ -185,6 +191,7 @@ def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),
         **{name: getattr(tel, name) for name in same.split()},
+        **dict(zip(DUTY_FIELDS, tel.motor_duty or (), strict=False)),
         "vel_var_m2ps2": tel.velocity_variance_m2ps2,
         "pos_var_m2": tel.position_variance_m2,
         "height_var_m2": tel.height_variance_m2,

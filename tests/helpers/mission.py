@@ -70,6 +70,7 @@ def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:
         height_variance_m2=1e-5,
         velocity_variance_m2ps2=1e-4,
         climb_variance_m2ps2=1e-4,
+        motor_duty=(50_000, 49_500, 50_200, 50_300),
     )
     return replace(sample, **changes)  # type: ignore[arg-type]
 

@@ -187,6 +187,7 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
         until(arrived)
         sample = newest(link)
         assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
+        assert sample.motor_duty == (0, 0, 0, 0)  # it stands still, which is not unknown
         assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
 
 

@@ -4,19 +4,22 @@ of a vehicle that is moved by hand."""
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.link import AttitudeLink
+from perchctl.errors import TimedOut
+from perchctl.link import AttitudeLink, telemetry
 from perchctl.link.listening import MOTION_BLOCK, ReadOnlyLink
 from perchctl.link.telemetry import (
     BLOCKS,
     MOST_CARRIED_S,
     NEEDED,
     WRAP_MS,
+    LogBlocks,
     SampleAssembler,
     Timebase,
     telemetry_from_log,
@@ -68,6 +71,43 @@ def test_each_variance_has_its_own_name() -> None:
     place, height, speed, climb = variances_of(VARIANCES | {"kalman.varZ": math.nan})
     assert (math.isnan(place or 0.0), math.isnan(height or 0.0)) == (True, True)
     assert (speed, climb) == (3e-4, 1e-4)
+
+
+DUTIES = {"motor.m1": 1.0, "motor.m2": 20_000.0, "motor.m3": 0.0, "motor.m4": 65_535.0}
+
+
+def duty_of(values: dict[str, float]) -> tuple[int, ...] | None:
+    return telemetry_from_log(dict.fromkeys(NEEDED, 0.0) | values, 1.5).motor_duty
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -1.0, 65_536.0, None])
+def test_four_duty_cycles_or_none(odd: float | None) -> None:
+    """An absent or odd one is unknown, and the sample is whole without it."""
+    assert duty_of(DUTIES) == (1, 20_000, 0, 65_535)
+    others = {name: duty for name, duty in DUTIES.items() if name != "motor.m3"}
+    assert duty_of(others if odd is None else others | {"motor.m3": odd}) is None
+
+
+@pytest.mark.parametrize("lacks", [None, "motor.m2", "pm.vbat"])
+def test_firmware_without_a_duty_cycle_still_reports_its_battery(
+    monkeypatch: pytest.MonkeyPatch, lacks: str | None
+) -> None:
+    """A block with a variable that the firmware lacks would be refused as a whole."""
+    started: dict[str, list[str]] = {}
+
+    def start(log: object, uri: str, name: str, variables: dict[str, str], *_: object) -> None:
+        started[name] = list(variables)
+
+    monkeypatch.setattr(telemetry, "start_block", start)
+    monkeypatch.setattr(telemetry, "_starting", lambda log, block: [])
+    monkeypatch.setattr(telemetry, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
+    toc = SimpleNamespace(get_element_by_complete_name=lambda n: None if n == lacks else object())
+    with pytest.raises(TimedOut):
+        LogBlocks(lambda: 0.0).start(SimpleNamespace(toc=toc), "usb://0", 0.01)
+    battery = ["pm.vbat", "pm.state"]
+    expected = {None: [*battery, *DUTIES], "motor.m2": battery, "pm.vbat": None}[lacks]
+    assert started.get("battery") == expected
+    assert {"state", "attitude", "variance"} <= started.keys()
 
 
 def test_each_log_block_fits_into_a_packet() -> None:
