@@ -96,7 +96,7 @@ MOST_NAMES = {
     "perception": 5,
     "positioning": 10,
     "profile": 40,
-    "sim": 13,
+    "sim": 14,
     "target": 14,
     "vision": 31,
     "weights": 9,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.analysis.sight import Frames, TargetLoss, percentile, read_frames, target_losses
+from perchctl.analysis.trim import Trim, estimate_trim
 from perchctl.errors import UsageError
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand
@@ -171,6 +172,11 @@ class FlightAnalysis:
     def takeovers(self) -> tuple[Takeover, ...]:
         """Series of commands that other senders than the flight loop sent."""
         return group_takeovers(self.log)
+
+    @cached_property
+    def trim(self) -> Trim | None:
+        """What was asked of the motors in level hover; None if the log does not show it."""
+        return estimate_trim(self.log, simulated=self.summary.simulated)
 
     @cached_property
     def measures(self) -> Measures:

@@ -101,9 +101,11 @@ class ReportedFlight:
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Sentences on the measured latency and mounting that the profile should contain."""
-        findings = self.flight.summary.findings
-        return () if findings is None else findings.advice
+        """Sentences on the measured latency and mounting that the profile should contain, and on
+        the vehicle's motors and balance."""
+        findings, trim = self.flight.summary.findings, self.flight.trim
+        camera = () if findings is None else findings.advice
+        return camera if trim is None else (*camera, *trim.advice)
 
     @property
     def outcome(self) -> str:

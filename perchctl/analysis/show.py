@@ -32,6 +32,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
         "lost_records": end.lost_records,
         "log_problem": end.log_problem,
         **asdict(flight.measures),
+        "trim": None if flight.trim is None else asdict(flight.trim),
         "phases": [_times(stay) for stay in log.phases],
         "holds": [_times(hold) for hold in flight.position_holds],
         "sent": [_times(go) for go in flight.takeovers],
@@ -48,6 +49,7 @@ def _times(part: Any) -> dict[str, Any]:
 def show_text(flight: FlightAnalysis) -> str:
     """Return outcome, figures, phases, holds and takeovers of a flight as text for a terminal."""
     lines = [*_end_lines(flight), *_named("record", _origin(flight.log)), *_measure_lines(flight)]
+    lines += _trim_lines(flight)
     phases = flight.log.phases
     for head, rows in (
         ("phase     why", [(stay, stay.phase, _why(stay)) for stay in phases]),
@@ -145,6 +147,17 @@ def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
     for name, needed, line in _MEASURES:
         if getattr(measures, needed):
             yield from _named(name, line.format_map(texts))
+
+
+def _trim_lines(flight: FlightAnalysis) -> Iterator[str]:
+    trim = flight.trim
+    if trim is None:
+        return
+    yield from _named("motors", trim.motors_text)
+    yield from _named("balance", trim.balance_text)
+    yield from _named("yaw", trim.yaw_text)
+    for sentence in trim.advice:
+        yield from _named("advice", sentence)
 
 
 def printable_text(text: str) -> str:

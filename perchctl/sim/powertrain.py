@@ -68,6 +68,7 @@ def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
     standstill_v = inverse_thrust(curve)(0.0)
 
     def thrust_n(volts: float) -> float:
+        """Return one motor's steady thrust, N, at a motor voltage."""
         if volts <= standstill_v:
             return 0.0
         return c0 + volts * (c1 + volts * (c2 + volts * c3))

@@ -1,0 +1,246 @@
+"""What a level hover says about a vehicle's motors and balance.
+
+The thrust f_i that the firmware asks of each motor follows from its duty cycle and the battery's
+voltage by the thrust curve; what a weak motor gives is less. The shares a_i = 4 f_i / (f_1 + f_2 +
+f_3 + f_4) have the mean 1 and, on an X frame whose motors are `MOTOR_OFFSET_M` to the front and to
+the side, three patterns:
+
+    M4 front left    M1 front right      pitch = (a_1 + a_4 - a_2 - a_3) / 4
+               \\    /                    roll  = (a_3 + a_4 - a_1 - a_2) / 4
+               /    \\                    yaw   = (a_2 + a_4 - a_1 - a_3) / 4
+    M3 back left     M2 back right
+
+- A centre of mass x forward and y left of the middle gives pitch = x / `MOTOR_OFFSET_M` and roll =
+  y / `MOTOR_OFFSET_M`. Weaker motors at the front, or on the left, give the same. Both moments are
+  proportional to the thrust in all free flight, so no flight tells them apart.
+- The centre of mass has no part in the yaw pattern: motors or propellers are unequal, or a motor
+  leans.
+- A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the
+  wind. The vehicle leans against a draught; but the estimated lean has a bias of that size, too. So
+  the lean widens the intervals, and corrects nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from perchctl.geometry import Array
+from perchctl.record import FlightLog
+from perchctl.sim import thrust_n
+from perchctl.vehicle import MOST_CELL_V, MOST_DUTY
+
+MOTOR_OFFSET_M = 0.0325
+"""From the middle to a motor, forward and sideways, m: arms of 46 mm at 45 degrees."""
+WIND_ARM_M = 0.047
+"""Moment over force of a level draught, m: 0.75e-3 N.m and 0.016 N for each m/s, from 104 recorded
+flights of a Crazyflie 2.1."""
+UNSEEN_LEAN_RAD = math.radians(0.3)
+"""Lean against a draught that a bias of the estimated lean may hide, rad, one standard deviation.
+Larger: wider intervals. Smaller: a draught passes for an imbalance."""
+HOVER_CLEARANCE_M = 0.3
+"""Least distance from the floor and from the target, m. Smaller: the air at a surface lifts."""
+HOVER_SPEED_MPS = 0.15
+"""Largest level speed of a hover, m/s. Larger: more samples, but the airspeed adds a moment."""
+HOVER_CLIMB_MPS = 0.3
+"""Largest vertical speed of a hover, m/s; all motors feel it alike."""
+HOVER_LEAN_RAD = math.radians(4.0)
+"""Largest lean of a hover, rad. Larger: samples in which the vehicle changes its speed."""
+SAMPLE_PERIOD_S = 0.1
+"""Of the log packets with duty cycles (`perchctl.link.telemetry`, `SLOW_PERIOD_S`)."""
+LEAST_SAMPLES = 20
+"""For an estimate: 2 s of hover. Smaller: more flights have one, with wide intervals."""
+CORRELATED_SAMPLES = 10
+"""So far apart, samples are independent: 1 s, a few swings of the attitude. Larger: intervals that
+are less certain themselves. Smaller: too narrow ones."""
+HARMLESS_SHIFT_M = 0.0025
+"""Shift of the centre of mass without advice, m: recorded vehicles flew with up to 2.4 mm."""
+HARMLESS_YAW = 0.06
+"""Yaw imbalance without advice: of two recorded vehicles one flew with 0.058, one with 0.165."""
+
+MOTOR_PLACES = ("front right", "back right", "back left", "front left")
+"""Places of M1..M4."""
+_PATTERNS = np.array([(1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), (-1.0, 1.0, -1.0, 1.0)]) / 4.0
+_WAYS = (("forward", "backward"), ("to the left", "to the right"))
+
+
+@dataclass(frozen=True)
+class Trim:
+    """What was asked of the motors in level hover. A margin is half of a 95 % interval.
+
+    Attributes:
+        hover_s: time in hover that was used.
+        shares: thrust asked of M1..M4, over the mean of the four.
+        shift_m: forward and left, where the centre of mass would lie if the motors were equal.
+        yaw_imbalance: how much more than the mean is asked of the motors front left and back right,
+            as a share; of the other two it is as much less.
+        advice: sentences; none for a simulated vehicle, or if no interval excludes its harmless
+            range.
+    """
+
+    hover_s: float
+    shares: tuple[float, ...]
+    shares_margin: tuple[float, ...]
+    shift_m: tuple[float, float]
+    shift_margin_m: tuple[float, float]
+    yaw_imbalance: float
+    yaw_margin: float
+    advice: tuple[str, ...] = ()
+
+    @property
+    def motors_text(self) -> str:
+        """The shares in words, and what they rest on."""
+        each = ", ".join(
+            f"{motor} {_percent(share - 1.0, margin)}"
+            for motor, share, margin in zip(
+                MOTOR_PLACES, self.shares, self.shares_margin, strict=True
+            )
+        )
+        return f"{each} against the mean thrust (95 %, {self.hover_s:.1f} s of level hover)"
+
+    @property
+    def balance_text(self) -> str:
+        """The shift in words, and what a flight cannot know of its cause."""
+        parts = zip(self.shift_m, self.shift_margin_m, _WAYS, strict=True)
+        return (
+            f"centre of mass {' and '.join(_shift(*part) for part in parts)}, if the motors are "
+            "equal; weaker motors on that side look the same in flight"
+        )
+
+    @property
+    def yaw_text(self) -> str:
+        """The yaw imbalance in words, for the pair of motors with more thrust, and its causes."""
+        pair, more = _yaw_pair(self.yaw_imbalance)
+        return (
+            f"{pair} {_percent(more, self.yaw_margin)}; unequal motors or propellers, or a leaning "
+            "motor, cause this, but never the centre of mass"
+        )
+
+
+def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
+    """Estimate the motors' trim from the level hover in a flight's log.
+
+    A sample is a log packet with duty cycles and voltage while the vehicle is in the air, slow,
+    level, and away from floor and target. The interval takes the memory of the noise into account
+    (`mean_and_margin`). The estimate is wrong for a load that swings, and near full duty, where a
+    motor cannot give what is asked. The thrust curve is that of a Crazyflie 2.1; at the voltage at
+    which a Brushless of 40 to 48 g hovers, both curves have the same relative slope within 7 %, and
+    by so much of itself the distance of a share from 1 is wrong.
+
+    Returns None for a log without duty cycles, as an older perchctl wrote it, and for less than 2 s
+    of hover. Raises InvalidValue for a value that is no number. `simulated`: give no advice.
+    """
+    duties = np.stack([log.column(f"duty_m{motor}") for motor in (1, 2, 3, 4)], axis=1)
+    volts = log.column("battery_v")
+    is_known = np.all(duties <= MOST_DUTY, axis=1) & (volts <= MOST_CELL_V)
+    # The same numbers are the same packet: a tick holds the newest one.
+    is_new = np.any(np.diff(duties, axis=0, prepend=np.nan) != 0.0, axis=1)
+    packets = np.flatnonzero(is_known & is_new)
+    motor_v = duties[packets] / MOST_DUTY * volts[packets, np.newaxis]
+    asked_n = np.vectorize(thrust_n, otypes=[np.float64])(motor_v)
+    is_turning = np.all(asked_n > 0.0, axis=1)  # not idling on the ground
+    packets, asked_n = packets[is_turning], asked_n[is_turning]
+    in_hover = _is_hovering(log)[packets]
+    if np.count_nonzero(in_hover) < LEAST_SAMPLES:
+        return None
+    shares = asked_n / np.mean(asked_n, axis=1, keepdims=True)
+    lean_rad = [np.mean(log.column(key)[packets][in_hover]) for key in ("pitch_rad", "roll_rad")]
+    draught = np.hypot(lean_rad, UNSEEN_LEAN_RAD) * WIND_ARM_M / MOTOR_OFFSET_M
+
+    def estimate(series: Array, draught: float) -> tuple[float, float]:
+        mean, margin = mean_and_margin(series, in_hover)
+        return mean, math.hypot(margin, stats.norm.ppf(0.975) * draught)
+
+    motors = [estimate(share, float(np.linalg.norm(draught))) for share in shares.T]
+    pitch, roll, yaw = map(estimate, (shares @ _PATTERNS.T).T, (*draught, 0.0))
+    found = Trim(
+        hover_s=round(int(np.count_nonzero(in_hover)) * SAMPLE_PERIOD_S, 1),
+        shares=tuple(share for share, _ in motors),
+        shares_margin=tuple(margin for _, margin in motors),
+        shift_m=(MOTOR_OFFSET_M * pitch[0], MOTOR_OFFSET_M * roll[0]),
+        shift_margin_m=(MOTOR_OFFSET_M * pitch[1], MOTOR_OFFSET_M * roll[1]),
+        yaw_imbalance=yaw[0],
+        yaw_margin=yaw[1],
+    )
+    return found if simulated else replace(found, advice=tuple(_advice(found)))
+
+
+def mean_and_margin(series: Array, chosen: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the mean of the chosen values of a regular series, and half of its 95 % interval.
+
+    The variance of the mean is by Newey and West (Econometrica 55, 1987): autocovariances up to
+    `CORRELATED_SAMPLES`, with weights that fall linearly. In a short series it comes out too small;
+    its quantile makes up for that (Kiefer and Vogelsang, Econometric Theory 21, 2005, table 1). The
+    interval is at least Student's for independent values, although the attitude control makes
+    neighbours oppose each other. Too narrow for noise with a longer memory. `chosen`: (n,)
+    booleans, at least `LEAST_SAMPLES` of them True.
+    """
+    count = int(np.count_nonzero(chosen))
+    mean = float(np.mean(series[chosen]))
+    off = np.where(chosen, series - mean, 0.0)
+    longer = variance = float(np.sum(off**2)) / (count - 1)
+    bandwidth = CORRELATED_SAMPLES + 1
+    for lag in range(1, bandwidth):
+        covariance = float(np.sum(off[lag:] * off[:-lag])) / (count - 1)
+        longer += 2.0 * (1.0 - lag / bandwidth) * covariance
+    share = min(1.0, bandwidth / count)
+    quantile = 1.96 + share * (2.9694 + share * (0.4160 - 0.5324 * share))
+    independent = float(stats.t.ppf(0.975, count - 1)) * math.sqrt(variance / count)
+    return mean, max(independent, quantile * math.sqrt(max(0.0, longer) / count))
+
+
+def _is_hovering(log: FlightLog) -> NDArray[np.bool_]:
+    """Of each tick, True if the vehicle hovers level in free air."""
+    z_m, target_z_m = log.column("z_m"), log.column("tz_m")
+    seen_m = target_z_m[np.isfinite(target_z_m)]
+    top_m = np.median(seen_m) - HOVER_CLEARANCE_M if seen_m.size else math.inf
+    ground_m = z_m[0] if z_m.size else math.nan
+    level_mps = np.hypot(log.column("vx_mps"), log.column("vy_mps"))
+    lean_rad = np.hypot(log.column("roll_rad"), log.column("pitch_rad"))
+    return np.asarray(
+        (z_m > ground_m + HOVER_CLEARANCE_M)
+        & (z_m < top_m)
+        & (level_mps < HOVER_SPEED_MPS)
+        & (np.abs(log.column("vz_mps")) < HOVER_CLIMB_MPS)
+        & (lean_rad < HOVER_LEAN_RAD)
+    )
+
+
+def _advice(trim: Trim) -> Iterator[str]:
+    away = [
+        _shift(shift_m, margin_m, ways)
+        for shift_m, margin_m, ways in zip(trim.shift_m, trim.shift_margin_m, _WAYS, strict=True)
+        if abs(shift_m) - margin_m > HARMLESS_SHIFT_M
+    ]
+    if away:
+        yield (
+            f"the vehicle flies as if its centre of mass were {' and '.join(away)}: move the "
+            "battery the other way and fly again; if it lies in the middle, check the propellers "
+            "on that side"
+        )
+    if abs(trim.yaw_imbalance) - trim.yaw_margin > HARMLESS_YAW:
+        pair, more = _yaw_pair(trim.yaw_imbalance)
+        yield (
+            f"the motors {pair} have to give {_percent(more, trim.yaw_margin)} to hold the "
+            "heading, whatever the position of the battery: check their propellers, and that "
+            "every motor stands upright"
+        )
+
+
+def _yaw_pair(imbalance: float) -> tuple[str, float]:
+    """The two motors of which more is asked, and how much more."""
+    pairs = ("front left and back right", "front right and back left")
+    return pairs[imbalance < 0.0], abs(imbalance)
+
+
+def _shift(shift_m: float, margin_m: float, ways: tuple[str, str]) -> str:
+    return f"{1e3 * abs(shift_m):.1f} +- {1e3 * margin_m:.1f} mm {ways[shift_m < 0.0]}"
+
+
+def _percent(share: float, margin: float) -> str:
+    return f"{100.0 * share:+.1f} +- {100.0 * margin:.1f} %"
