@@ -13,11 +13,12 @@ the side, three patterns:
 - A centre of mass x forward and y left of the middle gives pitch = x / `MOTOR_OFFSET_M` and roll =
   y / `MOTOR_OFFSET_M`. Weaker motors at the front, or on the left, give the same. Both moments are
   proportional to the thrust in all free flight, so no flight tells them apart.
-- The centre of mass has no part in the yaw pattern: motors or propellers are unequal, or a motor
-  leans.
+- In still air the centre of mass has no part in the yaw pattern: motors or propellers are unequal,
+  or a motor leans.
 - A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the
-  wind. The vehicle leans against a draught; but the estimated lean has a bias of that size, too. So
-  the lean widens the intervals, and corrects nothing.
+  wind. Its push beside the centre of mass (`DRAG_LEVER_M`) adds one to yaw, where the motors have
+  only `YAW_TORQUE_M`. The vehicle leans against a draught; but the estimated lean has a bias of
+  that size, too. So the lean widens the intervals, and corrects nothing.
 """
 
 from __future__ import annotations
@@ -40,6 +41,11 @@ MOTOR_OFFSET_M = 0.0325
 WIND_ARM_M = 0.047
 """Moment over force of a level draught, m: 0.75e-3 N.m and 0.016 N for each m/s, from 104 recorded
 flights of a Crazyflie 2.1."""
+DRAG_LEVER_M = 0.002
+"""How far beside the centre of mass a draught may push, m, one standard deviation: a guess from how
+far it lies off the middle. Larger: wider intervals of yaw. Smaller: too narrow ones in a wind."""
+YAW_TORQUE_M = 0.006
+"""A motor's reaction for its thrust, N.m for each N."""
 UNSEEN_LEAN_RAD = math.radians(0.3)
 """Lean against a draught that a bias of the estimated lean may hide, rad, one standard deviation.
 Larger: wider intervals. Smaller: a draught passes for an imbalance."""
@@ -118,7 +124,7 @@ class Trim:
         pair, more = _yaw_pair(self.yaw_imbalance)
         return (
             f"{pair} {_percent(more, self.yaw_margin)}; unequal motors or propellers, or a leaning "
-            "motor, cause this, but never the centre of mass"
+            "motor, cause this, but not the centre of mass"
         )
 
 
@@ -150,14 +156,15 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
         return None
     shares = asked_n / np.mean(asked_n, axis=1, keepdims=True)
     lean_rad = [np.mean(log.column(key)[packets][in_hover]) for key in ("pitch_rad", "roll_rad")]
-    draught = np.hypot(lean_rad, UNSEEN_LEAN_RAD) * WIND_ARM_M / MOTOR_OFFSET_M
+    push = np.hypot(lean_rad, UNSEEN_LEAN_RAD)  # of the draught, forward and left, over the weight
+    draught = [*push * WIND_ARM_M / MOTOR_OFFSET_M, math.hypot(*push) * DRAG_LEVER_M / YAW_TORQUE_M]
 
     def estimate(series: Array, draught: float) -> tuple[float, float]:
         mean, margin = mean_and_margin(series, in_hover)
         return mean, math.hypot(margin, stats.norm.ppf(0.975) * draught)
 
-    motors = [estimate(share, float(np.linalg.norm(draught))) for share in shares.T]
-    pitch, roll, yaw = map(estimate, (shares @ _PATTERNS.T).T, (*draught, 0.0))
+    motors = [estimate(share, math.hypot(*draught)) for share in shares.T]
+    pitch, roll, yaw = map(estimate, (shares @ _PATTERNS.T).T, draught)
     found = Trim(
         hover_s=round(int(np.count_nonzero(in_hover)) * SAMPLE_PERIOD_S, 1),
         shares=tuple(share for share, _ in motors),
