@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import AiDeckSource
-from perchctl.camera.device import DeviceSource, open_video_capture
+from perchctl.camera.device import DeviceSource, camera_number, open_video_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.camera.source import (
@@ -22,7 +22,7 @@ from perchctl.camera.source import (
     unmirror_frame,
     without_password,
 )
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.extensions import is_extension, make_extension
 from perchctl.profile import CameraConfig
 
@@ -62,6 +62,17 @@ class SourceName:
     def is_own(self) -> bool:
         """True for a camera of your own, ``my_module:MyCamera``."""
         return self.scheme not in SCHEMES
+
+    @property
+    def device(self) -> str:
+        """The same text for all names of one camera of this computer: its number, its name, a path.
+        A camera that is not there keeps its own. Nothing is opened."""
+        if self.scheme != "camera":
+            return str(self)
+        try:
+            return f"camera:{camera_number(self.place)}"
+        except PerchError:
+            return str(self)
 
     def __str__(self) -> str:
         return without_password(self.spec)

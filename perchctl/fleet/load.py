@@ -259,7 +259,7 @@ def _address(vehicle: FleetVehicle) -> str | None:
 def _camera(vehicle: FleetVehicle) -> str | None:
     """None for what is no device: the simulated camera, and recordings."""
     source = parse_source(vehicle.source)
-    return str(source) if source.live and source.scheme != "sim" else None
+    return source.device if source.live and source.scheme != "sim" else None
 
 
 def _body(vehicle: FleetVehicle) -> str | None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from perchctl.camera import device
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.fleet import load_fleet
 from perchctl.fleet.fleet import Fleet
@@ -196,6 +197,16 @@ def test_a_fault_is_one_sentence_that_names_the_vehicle(
     tmp_path: Path, text: str, sentence: str
 ) -> None:
     assert refusal(tmp_path, text).startswith(sentence)
+
+
+def test_two_names_of_one_camera_are_one_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged = [device.ConnectedCamera(0, "FPV receiver", "/dev/v4l/by-id/usb-fpv")]
+    monkeypatch.setattr(device, "find_cameras", lambda *_: plugged)
+    text = two(RADIO.format("01", 0), RADIO.format("02", "receiver"))
+    words = "vehicles north and east have one camera, camera:0: give each its own source"
+    assert refusal(tmp_path, text) == words
 
 
 def test_a_section_may_be_text_and_the_date_is_no_section(tmp_path: Path) -> None:
