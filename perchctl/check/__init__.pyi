@@ -1,4 +1,6 @@
 from .capture import comparison_rows as comparison_rows
+from .identity import Stand as Stand
+from .identity import identity_rows as identity_rows
 from .profile import profile_rows as profile_rows
 from .profile import warnings_before_flight as warnings_before_flight
 from .row import Row as Row

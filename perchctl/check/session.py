@@ -13,14 +13,14 @@ from perchctl.camera import FrameSource, open_camera, parse_source, without_pass
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.profile import offline_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
-from perchctl.check.row import Finding, Row, evaluate_row, failed, passed, skipped, skipped_rows
+from perchctl.check.row import Finding, Row, evaluate_row, passed, skipped, skipped_rows
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight import FlyOptions, WallClock, check_options, start_simulated_vehicle
 from perchctl.link import ProbeLink, check_uri, find_uris_and_problem
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import DISARM_IT
-from perchctl.vision import Pipeline, make_pipeline
+from perchctl.vision import CameraModel, Pipeline, make_pipeline
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,8 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     calibrated = profile_camera(options.profile.camera)
     pipeline = make_pipeline(options.profile, calibrated)
     with contextlib.ExitStack() as stack:
-        uri, spec, profile = options.uri, options.source, options.profile
-        if options.simulated:
-            scope.announce("starting the simulated vehicle")
-            simulated = stack.enter_context(start_simulated_vehicle(options, calibrated))
-            uri = simulated.uri
-            spec = simulated.stream_url if spec.startswith("sim:") else spec
-            if simulated.capture is not None:
-                system, host = simulated.capture
-                config = profile.positioning.model_copy(update={"system": system, "host": host})
-                profile = profile.model_copy(update={"positioning": config})
-        mocap = _open_room(profile, scope, stack)
+        uri, spec, profile = start_if_simulated(options, calibrated, scope, stack)
+        mocap = open_room(profile, scope, stack)
         probe = ProbeLink(uri, profile.link, time.monotonic)
         stack.callback(probe.close)
         session = VehicleChecks(probe, options.uri, profile, mocap, scope)
@@ -93,11 +84,29 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     yield from offline_rows(options)
 
 
+def start_if_simulated(
+    options: FlyOptions, calibrated: CameraModel, scope: CheckScope, stack: contextlib.ExitStack
+) -> tuple[str, str, Profile]:
+    """The URI, camera source and profile to connect with: those of the options, or of a simulated
+    vehicle that is started until `stack` closes."""
+    uri, spec, profile = options.uri, options.source, options.profile
+    if options.simulated:
+        scope.announce("starting the simulated vehicle")
+        simulated = stack.enter_context(start_simulated_vehicle(options, calibrated))
+        uri = simulated.uri
+        spec = simulated.stream_url if spec.startswith("sim:") else spec
+        if simulated.capture is not None:
+            system, host = simulated.capture
+            config = profile.positioning.model_copy(update={"system": system, "host": host})
+            profile = profile.model_copy(update={"positioning": config})
+    return uri, spec, profile
+
+
 MocapOrError = CaptureSource | PerchError | None
 """An open motion capture, or why it could not be opened; None where decks do it."""
 
 
-def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:
+def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:
     config = profile.positioning
     if not config.source.is_mocap:
         return None
@@ -131,11 +140,7 @@ class VehicleChecks:
         try:
             self.probe.connect()
         except ConnectionFailed as error:
-            scheme = self.uri.partition("://")[0]
-            advice = vehicle.ADDRESS_ADVICE[scheme]
-            if error.advice and scheme != "sim":
-                advice = error.advice
-            yield Row("address", *failed(error.found, advice))
+            yield vehicle.unanswered_row(error, self.uri)
             yield from skipped_rows(
                 [*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer"
             )

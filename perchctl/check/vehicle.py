@@ -21,7 +21,7 @@ from perchctl.check.row import (
     warned,
     worst_finding,
 )
-from perchctl.errors import Problem
+from perchctl.errors import ConnectionFailed, Problem
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
@@ -61,6 +61,17 @@ ADDRESS_ADVICE = {
     "that answer",
     "sim": "start it again",
 }
+
+
+def unanswered_row(error: ConnectionFailed, uri: str) -> Row:
+    """The row of a vehicle that does not answer."""
+    scheme = uri.partition("://")[0]
+    advice = ADDRESS_ADVICE[scheme]
+    if error.advice and scheme != "sim":
+        advice = error.advice
+    return Row("address", *failed(error.found, advice))
+
+
 BUSY_ADVICE = "close other programs, or use a faster computer"
 WAKE_PERIOD_S = 0.005
 BUSY_SHARE = 0.5

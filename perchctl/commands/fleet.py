@@ -4,7 +4,9 @@ other programs' lists."""
 from __future__ import annotations
 
 import shlex
+import sys
 import textwrap
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +16,9 @@ import typer
 # By their packages, whose names load as they are used: the help needs no simulator.
 from perchctl import campaign as campaigns
 from perchctl import fleet as fleets
+from perchctl.check import CheckScope, Row
+from perchctl.commands.check import exit_code as rows_exit_code
+from perchctl.commands.check import format_rows
 from perchctl.commands.command_line import (
     EXIT_TABLE,
     ForceOption,
@@ -23,8 +28,14 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.fly_fleet import FleetSettings, fly_fleet, refuse_before_start
-from perchctl.commands.interrupt import handle_signals
-from perchctl.commands.output import add_problem, print_lines, print_result, say
+from perchctl.commands.interrupt import handle_signals, interruptible
+from perchctl.commands.output import (
+    add_problem,
+    ask_to_confirm,
+    print_lines,
+    print_result,
+    say,
+)
 from perchctl.commands.simulate import (
     ClusterOption,
     JobsOption,
@@ -33,7 +44,7 @@ from perchctl.commands.simulate import (
     run_campaign,
     stop_handler,
 )
-from perchctl.errors import InvalidValue, PerchError, UsageError
+from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 from perchctl.flight import FlyOptions
 
@@ -56,20 +67,31 @@ app = new_app(Group)
     app,
     "perchctl fleet check",
     "perchctl fleet check atrium.yaml -o atrium.svg",
-    "perchctl fleet check atrium.yaml --json",
+    "perchctl fleet check atrium.yaml --identify",
     short_help="Plan a fleet's flight, and refuse what cannot be flown.",
 )
 def check(
     file: FleetArgument = None,
     output: PictureOption = None,
+    identify: Annotated[
+        bool,
+        typer.Option(
+            "--identify",
+            help="Also prove on the floor that each vehicle, its camera, its motion-capture body "
+            "and its home belong together.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
     force: ForceOption = False,
-) -> None:
+) -> int:
     """Plan, fly and simulate several vehicles in one room, and convert other lists.
 
     By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
     vehicles, decides who flies together and in which order, and draws the room from above. It
     connects to nothing. A plan that cannot be flown is drawn too, and refused in one sentence.
+
+    With --identify, perchctl then connects to one vehicle after the other, each at its home.
+    Nothing is armed. The exit codes are those of perchctl check.
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
@@ -88,8 +110,51 @@ def check(
         print_lines(fleets.draw_text(loaded))
     if refusal is not None:
         raise refusal
-    if plan is not None:
-        print_result(plan.record() if as_json else plan_text(plan))
+    assert plan is not None, "a plan or its refusal"
+    if identify:
+        return identify_and_report(plan, as_json)
+    print_result(plan.record() if as_json else plan_text(plan))
+    return 0
+
+
+def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
+    """Print the plan, and each vehicle's rows as they are known; return the exit code of the first
+    vehicle with a failing row. Asks on the terminal at each real vehicle."""
+    real = [vehicle for vehicle in plan.fleet.vehicles if not vehicle.simulated]
+    if real and not sys.stdin.isatty():
+        raise UsageError(
+            f"--identify asks about {real[0].name} which vehicle blinks, and the input is not a "
+            f"terminal: run it on one"
+        )
+    if not as_json:
+        print_result(plan_text(plan))
+    found: dict[str, list[Row]] = {vehicle.name: [] for vehicle in plan.fleet.vehicles}
+    rows = fleets.identify_fleet(plan, CheckScope(announce=say), ask_to_confirm)
+    try:
+        with interruptible():
+            for name, row in rows:
+                found[name].append(row)
+    except KeyboardInterrupt:
+        code = Interrupted.exit_code
+        say("stopped by Ctrl-C: these are the checks made so far")
+    except PerchError:
+        if not as_json:
+            print_lines(_identity_text(found, finished=False), stdout=True)
+        raise
+    else:
+        code = next(filter(None, map(rows_exit_code, found.values())), 0)
+    if as_json:
+        records = {name: [asdict(row) for row in each] for name, each in found.items()}
+        print_result(plan.record() | {"identified": records})
+    else:
+        print_result(_identity_text(found, finished=code != Interrupted.exit_code))
+    return code
+
+
+def _identity_text(found: dict[str, list[Row]], *, finished: bool) -> str:
+    return "\n".join(
+        f"\n{name}\n{format_rows(rows, finished=finished)}" for name, rows in found.items() if rows
+    )
 
 
 @command(

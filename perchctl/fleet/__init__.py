@@ -14,6 +14,7 @@ opened or armed. For those who fly, simulate or show a fleet:
     plan.corridors["north"]             # perchctl.corridor.Corridor, in the room's axes
     plan.dongles                        # DongleLoad: which vehicles share a Crazyradio
     draw_text(fleet, groups), draw_svg(fleet, groups)
+    identify_fleet(plan, scope, ask)    # rows of each vehicle on the floor, by name
     fly_fleet(plan, faults, seed)       # FleetResult of one seed, in lockstep: a unit of work
     fleet_summary(results), fleet_table(results)
 
@@ -36,9 +37,9 @@ anything starts, and radio hubs. outcome: exit code and ``fleet.json``; folder: 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
 assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, the
 profiles that keep to them, and who flies when. plan: all of it in one call. drawing: the room from
-above. convert: lists of Crazyflies from other programs. lockstep: a whole fleet's simulated flight.
-room: what its vehicles share. coroutine: how its flights wait for each other. results: how they
-ended.
+above. identify: what belongs together, on the floor. convert: lists of Crazyflies from other
+programs. lockstep: a whole fleet's simulated flight. room: what its vehicles share. coroutine: how
+its flights wait for each other. results: how they ended.
 """
 
 import lazy_loader

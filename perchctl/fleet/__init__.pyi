@@ -5,6 +5,7 @@ from .dispatch import VehicleView as VehicleView
 from .drawing import draw_svg as draw_svg
 from .drawing import draw_text as draw_text
 from .folder import read_fleet_folder as read_fleet_folder
+from .identify import identify_fleet as identify_fleet
 from .load import EXAMPLE_FLEET as EXAMPLE_FLEET
 from .load import load_fleet as load_fleet
 from .lockstep import fleet_faults as fleet_faults

@@ -310,18 +310,21 @@ def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
     """Refuse two targets that one vehicle could take for its own."""
     apart_m = math.dist(first.target_m, second.target_m)
     for one, other in ((first, second), (second, first)):
-        ours, theirs = one.profile.target, other.profile.target
-        alike = {_marker(ours.large), _marker(ours.small)} & {
-            _marker(theirs.large),
-            _marker(theirs.small),
-        }
-        within_m = ours.expected_within_m
-        if alike and apart_m <= within_m:
+        within_m = one.profile.target.expected_within_m
+        if have_common_marker(one, other) and apart_m <= within_m:
             raise InvalidValue(
                 f"the targets of {one.name} and {other.name} have a marker id in common and are "
                 f"{apart_m:.2f} m apart, within target.expected_within_m ({within_m:g} m): print "
                 f"targets with other ids, or hang them farther apart"
             )
+
+
+def have_common_marker(one: FleetVehicle, other: FleetVehicle) -> bool:
+    """True if the targets of both have a marker in common."""
+    ours, theirs = one.profile.target, other.profile.target
+    return not {_marker(ours.large), _marker(ours.small)}.isdisjoint(
+        {_marker(theirs.large), _marker(theirs.small)}
+    )
 
 
 def _marker(marker: MarkerConfig) -> tuple[str, int]:

@@ -1,24 +1,26 @@
 """Links that read a vehicle without commanding it, and the search for vehicles that answer.
 
 `AttitudeLink` reads how a vehicle is moved by hand. `ProbeLink` reads its configuration and the
-quality of the radio. Nothing that is sent here flies, arms or spins a motor.
+quality of the radio, and can blink its LEDs. Nothing that is sent here flies, arms or spins a
+motor.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from perchctl.calibration import AttitudeSample
-from perchctl.errors import NotFound, Problem, TimedOut
+from perchctl.errors import NotFound, PerchError, Problem, TimedOut
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.connection import (
     Connection,
@@ -35,6 +37,7 @@ from perchctl.link.firmware import (
     missing_variables,
     read_device_type,
     read_parameters,
+    set_parameters,
 )
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
@@ -133,13 +136,23 @@ LAST_ECHO_WAIT_S = 0.5
 """Time for the last echo to arrive, s."""
 ECHO_PERIOD_S = 0.02
 """Time between echo packets, s."""
+LED_PARAMETER = "led.bitmask"
+ALL_LEDS, NO_LEDS, FIRMWARES_LEDS = 255, 128, 0
+"""Values of `LED_PARAMETER`: bit 7 takes the LEDs from the firmware, the lower ones light them."""
+BLINK_S = 0.25
+"""For which the LEDs are on, and off, s. Longer: hard to tell from the firmware's own pattern.
+Shorter: more packets."""
+END_BLINKING_TRIES = 3
+"""A late answer to a blink may be taken for that to the last value. More: waits longer for a
+vehicle that does not answer. Fewer: LEDs may keep their state until the next restart."""
 # same length as cflib's own echo, since cflib unpacks every echo as its own
 _ECHO = struct.Struct("<BQ")
 _ECHO_MARK = 1  # cflib's own pings start with 0
 
 
 class ProbeLink(ReadOnlyLink):
-    """A `ReadOnlyLink` that accepts any firmware, since its purpose is to find faults.
+    """A `ReadOnlyLink` that accepts any firmware, since its purpose is to find faults. Only
+    `blinking` sets a parameter.
 
     `quality` is that of the radio link, %: 100 if no packet had to be sent again, None without a
     radio. `missing` names the log variables that perchctl needs and the firmware lacks.
@@ -185,6 +198,34 @@ class ProbeLink(ReadOnlyLink):
     def lost(self) -> str | None:
         """Return why the link is lost; None while it works."""
         return "the link was closed" if self.connection is None else self.connection.lost
+
+    @contextlib.contextmanager
+    def blinking(self) -> Iterator[None]:
+        """Blink all LEDs during the block; then the firmware controls them again.
+
+        Raises, before the block, NotFound for firmware without `LED_PARAMETER`, InvalidValue and
+        TimedOut as `set_parameters`.
+        """
+        cf, ended = self._cf, threading.Event()
+        set_parameters(cf, self._uri, {LED_PARAMETER: ALL_LEDS})
+
+        def blink() -> None:
+            for mask in itertools.cycle((NO_LEDS, ALL_LEDS)):
+                if ended.wait(BLINK_S):
+                    return
+                with contextlib.suppress(Exception):  # an error of the library: no blink
+                    cf.param.set_value(LED_PARAMETER, str(mask))
+
+        thread = start_thread("perchctl-blink", blink)
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            for _ in range(END_BLINKING_TRIES):
+                with contextlib.suppress(PerchError):
+                    set_parameters(cf, self._uri, {LED_PARAMETER: FIRMWARES_LEDS})
+                    break
 
     def round_trips_s(self, duration_s: float) -> list[float]:
         """Send echo packets for `duration_s`, and wait `LAST_ECHO_WAIT_S` for the last one. Return

@@ -32,6 +32,7 @@ class Parameter:
 _PARAMETER_GROUPS: dict[str, str] = {
     "stabilizer": "uint8_t: estimator=2 controller=1 stop=0",
     "system": "uint8_t: selftestPassed=1!",
+    "led": "uint8_t: bitmask=0",
     "commander": "uint8_t: enHighLevel=1",
     "hlCommander": "float: vtoff=0.5* vland=0.5*",
     "supervisor": "uint8_t: infdmp=0 tmblChckEn=1; uint16_t: prefltTimeout=30000"

@@ -1,0 +1,277 @@
+"""Whether vehicle, motion-capture body and camera are those of one home: rows of one vehicle of
+several, on the floor.
+
+```
+vehicle  its LEDs blink, and somebody sees them blink at this home
+body     the motion capture sees its rigid body at this home
+target   its camera sees its target where it must be from this home
+```
+
+Each is compared with the home, so that no two of them can be another vehicle's. What if another
+vehicle's camera would show the same, or the target is not in view? Then somebody covers the lens,
+and the camera is proven by a picture that goes blind. Nothing is armed, and no motor turns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from perchctl.calibration import profile_camera
+from perchctl.camera import FrameSource, open_camera, without_password
+from perchctl.check import camera, capture, vehicle
+from perchctl.check.rehearsal import Rehearsal, rehearse
+from perchctl.check.row import Finding, Row, failed, passed, skipped, skipped_rows
+from perchctl.check.session import CheckScope, MocapOrError, open_room, start_if_simulated
+from perchctl.corridor import Point
+from perchctl.errors import ConnectionFailed, PerchError
+from perchctl.flight import FlyOptions, WallClock
+from perchctl.link import ProbeLink
+from perchctl.profile import Profile
+from perchctl.target import overhead_text
+from perchctl.vehicle import DISARM_IT, FLYING, Telemetry
+from perchctl.vision import CameraModel, make_pipeline
+
+BODY_AT_HOME_M = 0.25
+"""A body within this distance of a home stands there: half the least distance between a home and
+another vehicle's corridor. Larger: neighbours that have changed places may pass. Smaller: homes
+measured by tape fail."""
+DARK_SHARE = 0.5
+"""Share of dark or blank pictures from which on a camera sees nothing. Larger: a hand that does not
+cover the whole lens does not count. Smaller: a camera with a bad signal counts as covered."""
+_DARK = ("dark", "uniform")
+
+Ask = Callable[[str], bool]
+"""Asks somebody a question; True for yes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stand:
+    """Where one vehicle of several stands on the floor. All places and the heading are in the axes
+    of its own state estimate.
+
+    Attributes:
+        home_text: its home in words, in the axes of the room.
+        homes: of the other vehicles.
+        views: where the target of each other vehicle would appear to be if its camera were taken
+            for this vehicle's.
+        lookalikes: vehicles whose cameras would show a target where this vehicle's own must be.
+    """
+
+    name: str
+    home_m: Point
+    home_text: str
+    heading_rad: float = 0.0
+    homes: Mapping[str, Point] = field(default_factory=dict)
+    views: Mapping[str, Point] = field(default_factory=dict)
+    lookalikes: tuple[str, ...] = ()
+
+
+def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask) -> Iterator[Row]:
+    """Yield a vehicle's rows as they are known: address, vehicle, body (with motion capture),
+    camera and target. A row that fails has proven nothing. The errors of `perchctl.check.check`.
+
+    A simulated vehicle has its simulator and camera to itself: nobody is asked.
+    """
+    calibrated = profile_camera(options.profile.camera)
+    with contextlib.ExitStack() as stack:
+        uri, spec, profile = start_if_simulated(options, calibrated, scope, stack)
+        mocap = open_room(profile, scope, stack)
+        link = ProbeLink(uri, profile.link, time.monotonic)
+        stack.callback(link.close)
+        scope.announce(f"connecting to {options.uri}")
+        answers = True
+        try:
+            link.connect()
+        except ConnectionFailed as error:
+            answers = False
+            yield vehicle.unanswered_row(error, options.uri)
+            yield from skipped_rows(["vehicle"], "the vehicle does not answer")
+        else:
+            yield Row("address", *passed(f"{options.uri} answers"))
+            yield Row("vehicle", *_vehicle_finding(link, options, stand, scope, ask))
+        if mocap is not None:
+            yield Row("body", *_body_finding(mocap, profile, stand, scope))
+        if not answers:
+            yield from skipped_rows(["camera", "target"], "the vehicle does not answer")
+            return
+        shown = without_password(options.source)
+        scope.announce(f"opening the camera {shown}")
+        try:
+            source = open_camera(spec, time.monotonic, profile.camera, size_px=calibrated.size_px)
+        except PerchError as error:
+            yield camera.failed_camera_rows(error, options.source, profile)[0]
+            yield from skipped_rows(["target"], "no picture arrives")
+            return
+        stack.callback(source.close)
+        size = camera.size_finding(source.size_px, calibrated.size_px)
+        if size.verdict != "pass":
+            yield Row("camera", *size)
+            yield from skipped_rows(["target"], "pictures of another size cannot be checked")
+            return
+        yield Row("camera", *passed(f"{shown} delivers pictures"))
+        view = View(link, source, calibrated, profile, stand, scope)
+        yield Row("target", *_target_finding(view, None if options.simulated else ask))
+
+
+def _vehicle_finding(
+    link: ProbeLink, options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask
+) -> Finding:
+    if options.simulated:
+        return skipped("simulated: it has its address to itself")
+    seen = vehicle.query_vehicle(link, options.uri, scope.listen_s)
+    if seen.telemetry is None:
+        return failed("no telemetry arrives", "restart the vehicle, and run perchctl check")
+    if seen.is_armed or seen.telemetry.supervisor & FLYING:
+        return failed("it is armed or flying, and its propellers may turn", DISARM_IT)
+    try:
+        with link.blinking():
+            is_there = ask(
+                f"{stand.name}: all LEDs of one vehicle blink. Is it the only one, and does it "
+                f"stand at {stand.home_text}?"
+            )
+    except PerchError as error:
+        return failed(f"its LEDs do not blink: {error.found}", "update its firmware")
+    if is_there:
+        return passed(f"it blinks at {stand.home_text}, as you confirmed")
+    return failed(
+        f"you have not seen it blink at {stand.home_text}",
+        "put each vehicle at its own home, or correct uri; if two blink, give one another address",
+    )
+
+
+# --- The motion capture's body ---
+
+
+def _body_finding(
+    mocap: MocapOrError, profile: Profile, stand: Stand, scope: CheckScope
+) -> Finding:
+    config = profile.positioning
+    if mocap is None or isinstance(mocap, PerchError):
+        return failed("" if mocap is None else mocap.found, "run perchctl check with this vehicle")
+    scope.announce(f"listening to {config.label} for {scope.capture_s:g} s")
+    seen = capture.collect_samples(list, mocap, time.monotonic, time.sleep, scope.capture_s)
+    poses = seen.body_poses(config)
+    if not poses:
+        return failed(
+            f"{config.label} does not see the body {config.body!r}",
+            "correct body, or move the vehicle into the view of the motion capture",
+        )
+    x_m, y_m = np.median([pose.position_m[:2] for pose in poses], axis=0)
+    away_m = math.dist((x_m, y_m), stand.home_m)
+    found = f"{config.body!r} is {away_m:.2f} m from its home"
+    if away_m <= BODY_AT_HOME_M:
+        return passed(found)
+    there = _nearest((x_m, y_m), stand.homes, BODY_AT_HOME_M)
+    if there is not None:
+        found += f", at the home of {there}"
+    return failed(found, "put each vehicle at its own home, or correct body and home_m")
+
+
+# --- The camera, by the target that it sees ---
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the camera sees while the vehicle counts as standing at its home."""
+
+    link: ProbeLink
+    source: FrameSource
+    calibrated: CameraModel
+    profile: Profile
+    stand: Stand
+    scope: CheckScope
+
+    def rehearse(self, profile: Profile | None = None) -> Rehearsal:
+        """A few seconds of pictures; `profile`: to look for another target."""
+        flown = profile or self.profile
+        pipeline = make_pipeline(flown, self.calibrated)
+        seconds = self.scope.rehearse_s
+        return rehearse(self._telemetry, self.source, pipeline, flown, WallClock(), seconds)
+
+    def _telemetry(self) -> list[Telemetry]:
+        """Roll and pitch are the vehicle's; before a flight, its position and yaw need not be."""
+        place_m = (*self.stand.home_m, self.profile.safety.ground_z_m)
+        return [
+            replace(
+                sample,
+                position_m=place_m,
+                velocity_mps=(0.0, 0.0, 0.0),
+                yaw_rad=self.stand.heading_rad,
+            )
+            for sample in self.link.telemetry()
+        ]
+
+
+def _target_finding(view: View, ask: Ask | None) -> Finding:
+    """Judge where the target is; `ask`: None if the camera can be no other vehicle's."""
+    view.scope.announce(f"looking for the target for {view.scope.rehearse_s:g} s")
+    target, stand = view.profile.target, view.stand
+    expected_m = target.expected_xy_m
+    assert expected_m is not None, "each vehicle of a fleet has a target at a place"
+    own = view.rehearse()
+    place_m = _target_place(own)
+    if place_m is not None:
+        found = f"its camera sees its target {math.dist(place_m, expected_m):.2f} m from its place"
+        if ask is None or not stand.lookalikes:
+            return passed(found)
+        return _covered_finding(
+            view, own, ask, f"the camera of {stand.lookalikes[0]} would show its target there too"
+        )
+    anywhere = target.model_copy(update={"expected_xy_m": None})
+    other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))
+    if other_m is not None:
+        found = f"its camera sees a target {math.dist(other_m, expected_m):.2f} m from its own"
+        there = _nearest(other_m, stand.views, target.expected_within_m)
+        if there is not None:
+            found += f", as the camera of {there} would"
+        return failed(found, "correct source, target_m, home_m or heading_deg")
+    if ask is not None:
+        return _covered_finding(view, own, ask, "its target is not in view")
+    where = overhead_text(target, view.calibrated, view.profile.camera.mount)
+    return failed("its target is not in view", f"put home_m nearer to the target: {where}")
+
+
+def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:
+    """Whether the camera goes blind as somebody covers the lens of the vehicle at this home."""
+    name = view.stand.name
+    if _is_dark(before) or not before.pictures:
+        return failed(f"{why}, and its pictures are dark", "add light, or see perchctl check")
+    if not ask(
+        f"{name}: {why}. Cover the lens of the vehicle at {view.stand.home_text} with your hand. "
+        f"Is it covered?"
+    ):
+        return failed(f"{why}, and you have not covered the lens", "give each target its own ids")
+    covered = view.rehearse()
+    if _is_dark(covered) or (before.target_pictures and not covered.target_pictures):
+        return passed("its camera went blind as you covered the lens")
+    return failed(
+        "its camera went on to see as you covered the lens",
+        "it may be another vehicle's: correct source; if it is not, cover the whole lens",
+    )
+
+
+def _target_place(rehearsal: Rehearsal) -> Point | None:
+    """Where the target was measured; None if it was not."""
+    places = [place_m[:2] for _, place_m in rehearsal.target_places]
+    if not places:
+        return None
+    x_m, y_m = np.median(places, axis=0)
+    return float(x_m), float(y_m)
+
+
+def _is_dark(rehearsal: Rehearsal) -> bool:
+    dark = sum(n for problem, n in rehearsal.problems.items() if problem.kind in _DARK)
+    return dark > DARK_SHARE * rehearsal.pictures
+
+
+def _nearest(place_m: Point, places: Mapping[str, Point], within_m: float) -> str | None:
+    """The name of the place that is nearest and within `within_m`."""
+    near = {name: math.dist(place_m, other_m) for name, other_m in places.items()}
+    name = min(near, key=near.__getitem__, default=None)
+    return name if name is not None and near[name] <= within_m else None
