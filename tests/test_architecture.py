@@ -86,7 +86,7 @@ MOST_NAMES = {
     "campaign": 22,
     "check": 10,
     "commands": 2,
-    "display": 8,
+    "display": 9,
     "faults": 13,
     "fleet": 29,
     "flight": 19,

@@ -412,7 +412,7 @@ def test_named_keys_are_the_schema_s(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "where", ["README.md", "docs/safety.md", "docs/first-perch.md", "perchctl/display/page.html"]
+    "where", ["README.md", "docs/safety.md", "docs/first-perch.md", "perchctl/display/common.js"]
 )
 def test_the_operator_s_stop_is_described_in_the_same_words(where: str) -> None:
     """Nobody is to work out, beside a vehicle that flies, whether two sentences mean the same."""

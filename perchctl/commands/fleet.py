@@ -24,6 +24,7 @@ from perchctl.commands.command_line import (
     ForceOption,
     Group,
     JsonOption,
+    ViewOption,
     command,
     new_app,
 )
@@ -161,7 +162,7 @@ def _identity_text(found: dict[str, list[Row]], *, finished: bool) -> str:
     app,
     "perchctl fleet fly",
     "perchctl fleet fly atrium.yaml --dry-run",
-    "perchctl fleet fly atrium.yaml --log-dir logs",
+    "perchctl fleet fly atrium.yaml --view",
     ending=EXIT_TABLE,
     short_help="Fly all vehicles of a fleet, in the order of its plan.",
 )
@@ -187,6 +188,7 @@ def fly(
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")
     ] = False,
+    view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Fly all vehicles of a fleet, each in a process of its own, in the order of the plan.
@@ -202,7 +204,9 @@ def fly(
         if not as_json:
             print_lines(fleets.draw_text(loaded))
         raise InvalidValue(f"{loaded.path}: {error}") from None
-    settings = FleetSettings(seed=seed, log_dir=log_dir, record=record, yes=yes, as_json=as_json)
+    settings = FleetSettings(
+        seed=seed, log_dir=log_dir, record=record, yes=yes, as_json=as_json, view=view
+    )
     if not dry_run:
         return fly_fleet(plan, settings)
     refused: PerchError | None = None

@@ -294,14 +294,10 @@ def flight_page(
     if not view:
         yield None
         return
-    profile, title = options.profile, f"perchctl fly {options.uri}"
-    camera = profile_camera(profile.camera)
+    title = f"perchctl fly {options.uri}"
+    camera = profile_camera(options.profile.camera)
     with live_page(camera, title, view, say, switch.land, switch.cut) as page:
-        yield (
-            None
-            if page is None
-            else FlightPage(page, profile.target.large.side_m, profile.vehicle.gear_body_m[2])
-        )
+        yield None if page is None else FlightPage.of(page, options.profile)
 
 
 # --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened

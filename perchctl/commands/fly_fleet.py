@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import string
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 # By its package, whose names load as they are used.
 from perchctl import fleet as fleets
@@ -24,8 +26,8 @@ from perchctl.commands.output import (
     say,
     stdin_number,
 )
-from perchctl.display import FleetPanel, FleetRow
-from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.display import FleetPage, FleetPanel, FleetRow
+from perchctl.errors import EXIT_CODES, Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.extensions import error_at
 from perchctl.files import write_files
 from perchctl.flight import (
@@ -49,13 +51,15 @@ NUMBER_KEYS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class FleetSettings:
-    """The options of the command line. `log_dir`, `record`: None if they are not given."""
+    """The options of the command line. `log_dir`, `record`: None if they are not given; `view`:
+    serve a live page."""
 
     seed: int
     log_dir: Path | None
     record: bool | None
     yes: bool
     as_json: bool
+    view: bool = False
 
 
 def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
@@ -70,8 +74,12 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
         raise UsageError(
             f"about to arm {len(options)} vehicles, and there is nobody to ask: add --yes"
         )
+    if settings.view:
+        options = {name: replace(each, serve_pictures=True) for name, each in options.items()}
     with fleets.open_radios(plan) as radios:
-        session = FleetSession(plan, radios.route(options), radios, folder, started, started_s)
+        session = FleetSession(
+            plan, radios.route(options), radios, folder, started, started_s, settings.view
+        )
         try:
             outcome = session.fly(asks)
         finally:
@@ -107,6 +115,7 @@ class FleetSession:
         folder: Path,
         started: datetime,
         started_s: float,
+        view: bool = False,
     ) -> None:
         self._plan, self._options, self._folder = plan, options, folder
         self._radios = radios
@@ -114,6 +123,9 @@ class FleetSession:
         self._switch = OperatorSwitch()
         self._children: dict[str, fleets.VehicleProcess] = {}
         self._panel: FleetPanel | None = None
+        self._has_page = view
+        self._page: FleetPage | None = None
+        self._shown_round = 0
         self._told: dict[str, str] = {}
         self._radio_problems: dict[str, str] = {}
         self._problems: list[str] = []
@@ -131,15 +143,20 @@ class FleetSession:
             stack.enter_context(operator_signals(self._switch, say))
             try:
                 coordinator = stack.enter_context(self._coordinated())
+                self._open_page(coordinator, stack)
                 self._wait_until_ready(coordinator)
                 if asks:
                     self._ask(coordinator)
                 # The keys stop the vehicles until all have ended, also after an error.
                 self._fly(coordinator, stack)
+                outcome = self._outcome(coordinator)
+                self._end_page(_outcome_card(outcome, self._folder))
             except BaseException as error:
                 self._end(error)
+                why = str(error) or type(error).__name__
+                self._end_page({"outcome": "FAILED", "good": False, "reason": why, "rows": []})
                 raise
-        return self._outcome(coordinator)
+        return outcome
 
     @contextlib.contextmanager
     def _coordinated(self) -> Iterator[fleets.Coordinator]:
@@ -159,6 +176,43 @@ class FleetSession:
             stack.callback(thread.join, 1.0)
             stack.callback(over.set)
             yield coordinator
+
+    def _open_page(self, coordinator: fleets.Coordinator, stack: contextlib.ExitStack) -> None:
+        """Serve the live page until the stack closes. A page that fails ends no flight."""
+        if not self._has_page:
+            return
+
+        def land_one(number: int) -> None:
+            self._answers.append(self._land_one(coordinator, number, "its button"))
+
+        try:
+            name, switch = self._plan.fleet.name, self._switch
+            page = FleetPage(
+                f"perchctl fleet fly {name}", len(self._options), switch.land, switch.cut, land_one
+            )
+        except Exception as error:
+            say(f"the live page failed: {error_at(error)}")
+            return
+        stack.callback(page.close)
+        self._page = page
+        say(f"live page (with buttons to land and to cut the motors): {page.url}")
+
+    def _update_page(self, update: Callable[[FleetPage], None]) -> None:
+        """Change what the page shows. After an error it is left as it is: its buttons still work,
+        and it tells how old it is."""
+        if self._page is None:
+            return
+        try:
+            update(self._page)
+        except Exception as error:
+            self._page = None
+            say(f"the live page failed: {error_at(error)}")
+
+    def _end_page(self, card: dict[str, Any]) -> None:
+        page = self._page
+        self._update_page(lambda page: page.end(card))
+        if page is not None and page.problem is not None:
+            self._tell(f"the live page failed: {page.problem}")
 
     def _wait_until_ready(self, coordinator: fleets.Coordinator) -> None:
         while not coordinator.are_ready:
@@ -220,13 +274,17 @@ class FleetSession:
         the keys' thread, which must not be held up."""
         if not 1 <= number <= self._keys:
             return f"no vehicle has the key {number}: press 1 to {self._keys} to land one"
+        return self._land_one(coordinator, number, f"key {number}")
+
+    def _land_one(self, coordinator: fleets.Coordinator, number: int, how: str) -> str:
+        """Land the vehicle with this number at once, from any thread; return the answer."""
         view = coordinator.views[number - 1]
         coordinator.land(view.name)
         if view.result is not None:
             return f"{view.name}: it has ended already"
         if view.stage.is_before_takeoff:
-            return f"{view.name}: by key {number}, it does not take off"
-        return f"{view.name}: by key {number}, it lands"
+            return f"{view.name}: by {how}, it does not take off"
+        return f"{view.name}: by {how}, it lands"
 
     def _is_given_up(self) -> bool:
         """True once vehicles had their time to end after the coordinator's failure."""
@@ -243,6 +301,7 @@ class FleetSession:
             self._look_at_radios,
             self._look_at_distances,
             self._show_rows,
+            self._show_page,
             self._keep_record,
         )
         for part in parts:
@@ -301,6 +360,14 @@ class FleetSession:
             views = enumerate(coordinator.views, 1)
             self._panel.show([_row(number, view) for number, view in views])
 
+    def _show_page(self, coordinator: fleets.Coordinator) -> None:
+        """Show what the coordinator has heard since; while it hangs, the page tells how old that
+        is."""
+        if self._page is not None and coordinator.rounds != self._shown_round:
+            self._shown_round = coordinator.rounds
+            rows = [_row(number, view) for number, view in enumerate(coordinator.views, 1)]
+            self._update_page(lambda page: page.show(rows, live=coordinator.started))
+
     def _keep_record(self, coordinator: fleets.Coordinator) -> None:
         """Write the record again if another vehicle has ended."""
         ended = sum(view.result is not None for view in coordinator.views)
@@ -315,6 +382,8 @@ class FleetSession:
             self._tell(problem)
 
     def _tell(self, line: str) -> None:
+        at = f"[{time.monotonic() - self._started_s:7.2f} s] {line}"
+        self._update_page(lambda page: page.event(at))
         if self._panel is not None and self._panel.failure is not None:
             say(self._panel.failure)
             self._panel.close()
@@ -322,7 +391,7 @@ class FleetSession:
         if self._panel is None:
             say(line)
         else:
-            self._panel.event(f"[{time.monotonic() - self._started_s:7.2f} s] {line}")
+            self._panel.event(at)
 
     def _write_record(self, coordinator: fleets.Coordinator) -> None:
         """Write what is known so far. A full disk is no reason to land, nor is any other error."""
@@ -386,9 +455,17 @@ def _stage_and_reason(view: fleets.VehicleView) -> tuple[str, str]:
 def _row(number: int, view: fleets.VehicleView) -> FleetRow:
     phase, reason = _stage_and_reason(view)
     status = view.status
-    if status is None:
-        return FleetRow(number=number, name=view.name, phase=phase, reason=reason)
     silent = view.result is None and view.is_silent
+    ended, hangs = view.result is not None, view.result is not None and view.result.hangs
+    if status is None:
+        return FleetRow(
+            number=number,
+            name=view.name,
+            phase=phase,
+            reason=reason,
+            has_ended=ended,
+            is_silent=silent,
+        )
     return FleetRow(
         number=number,
         name=view.name,
@@ -398,4 +475,25 @@ def _row(number: int, view: fleets.VehicleView) -> FleetRow:
         error_m=status.error_m,
         battery_v=status.battery_v,
         link_s=status.telemetry_age_s,
+        has_ended=ended,
+        hangs=hangs,
+        is_silent=silent,
+        picture_port=None if ended else status.picture_port,
     )
+
+
+def _outcome_card(outcome: fleets.FleetOutcome, folder: Path) -> dict[str, Any]:
+    """What the page shows at the end."""
+    count, code = len(outcome.options), outcome.exit_code
+    reason = "all vehicles hang" if code == 0 else f"exit code {code}: {EXIT_CODES[code]}"
+    place = str(folder.resolve())
+    return {
+        "outcome": f"{outcome.hanging} OF {count} HANG",
+        "good": code == 0,
+        "reason": reason,
+        "rows": [
+            *(["problem", problem] for problem in outcome.problems),
+            ["folder", place],
+            ["report", f"perchctl log report {shlex.quote(place)}"],
+        ],
+    }

@@ -1,3 +1,4 @@
+from .fleet_page import FleetPage as FleetPage
 from .fleet_panel import FleetPanel as FleetPanel
 from .fleet_panel import FleetRow as FleetRow
 from .live import LivePage as LivePage

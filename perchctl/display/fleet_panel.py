@@ -25,7 +25,14 @@ _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRow:
-    """What the panel shows of one vehicle. Unknown numbers are None."""
+    """What panel and page show of one vehicle. Unknown numbers are None.
+
+    Attributes:
+        link_s: age of the newest telemetry.
+        has_ended: its flight is over; `hangs`: and it hangs with its motors off.
+        is_silent: its process has sent nothing for too long.
+        picture_port: of this computer, where its process serves its pictures.
+    """
 
     number: int
     name: str
@@ -34,7 +41,20 @@ class FleetRow:
     height_m: float | None = None
     error_m: float | None = None
     battery_v: float | None = None
-    link_s: float | None = None  # age of the newest telemetry
+    link_s: float | None = None
+    has_ended: bool = False
+    hangs: bool = False
+    is_silent: bool = False
+    picture_port: int | None = None
+
+    def texts(self) -> tuple[str, str, str, str]:
+        """Height, error, battery and link; empty if unknown."""
+        return (
+            "" if self.height_m is None else f"{self.height_m:.2f} m",
+            "" if self.error_m is None else f"{100.0 * self.error_m:.1f} cm",
+            "" if self.battery_v is None else f"{self.battery_v:.2f} V",
+            "" if self.link_s is None else age_text(self.link_s),
+        )
 
 
 class FleetPanel(TerminalDisplay):
@@ -84,10 +104,7 @@ def fleet_table(rows: Sequence[FleetRow], below: str = "", above: str = "") -> P
             Text(str(row.number), style="bold"),
             Text(row.name),
             Text(row.phase, style=phase_style(row.phase)),
-            Text("" if row.height_m is None else f"{row.height_m:.2f} m"),
-            Text("" if row.error_m is None else f"{100.0 * row.error_m:.1f} cm"),
-            Text("" if row.battery_v is None else f"{row.battery_v:.2f} V"),
-            Text("" if row.link_s is None else age_text(row.link_s)),
+            *map(Text, row.texts()),
             Text(row.reason),
         )
     return frame_table(table, below, above)

@@ -11,6 +11,7 @@ from typing import Any
 from perchctl.display.live import LivePage, Sketch, make_sketch
 from perchctl.display.panel import status_rows
 from perchctl.mission import Event, Phase, Tick
+from perchctl.profile import Profile
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
@@ -37,6 +38,11 @@ class FlightPage:
         self._rescue = ""
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.set_state(lambda: waiting, live=False)
+
+    @classmethod
+    def of(cls, page: LivePage, profile: Profile) -> FlightPage:
+        """The watcher of a flight with this profile."""
+        return cls(page, profile.target.large.side_m, profile.vehicle.gear_body_m[2])
 
     def frame(self, frame: Frame) -> None:
         self._frame = frame

@@ -76,6 +76,7 @@ class Coordinator:
         reasons: why vehicles were ordered to land, other than by the operator.
         near_pairs: pairs that were ordered to land, as they came too near each other.
         unwatched: vehicles in the air whose distance to another one is not known now.
+        rounds: how many rounds there were; it stands still while the thread hangs.
         failure: the error that a round has raised, since when all are ordered to land; else None.
     """
 
@@ -90,10 +91,12 @@ class Coordinator:
         self.reasons: dict[str, str] = {}
         self.near_pairs: tuple[NearPair, ...] = ()
         self.unwatched: tuple[str, ...] = ()
+        self.rounds = 0
         self.failure: str | None = None
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
-        self._landed: frozenset[str] = frozenset()
+        # Its order is that of `land`. One step each: the keys and the page call it at a time.
+        self._landed: dict[str, None] = {}
         self._were_near: frozenset[str] = frozenset()
         self._garbled: frozenset[str] = frozenset()
         self._results: dict[str, Result] = {}
@@ -130,7 +133,7 @@ class Coordinator:
         if name not in self._children:
             known = ", ".join(self._children)
             raise InvalidValue(f"the fleet has no vehicle {name!r}; it has {known}")
-        self._landed = self._landed | {name}
+        self._landed[name] = None
 
     # --- one round ---
 
@@ -145,12 +148,13 @@ class Coordinator:
             self.started = True
         self._watch_distances()
         self._watch_messages()
-        landed = self._landed | self._were_near | self._garbled
+        landed = {*tuple(self._landed), *self._were_near, *self._garbled}
         decision = decide(self._plan, self._views, started=self.started, word=word, landed=landed)
         for name, why in decision.reasons.items():
             self.reasons.setdefault(name, why)
         for name, order in decision.orders.items():
             self._send(name, order, now_s)
+        self.rounds += 1
 
     def run(self, until: threading.Event) -> None:
         """Repeat `step` until `until` is set; after a round that raised, `step_stopping`."""
@@ -179,6 +183,7 @@ class Coordinator:
                 view = replace(before, silent_s=before.silent_s + ROUND_S)
             views.append(view)
         self._views = tuple(views)
+        self.rounds += 1
 
     def _watch_distances(self) -> None:
         """Land both of two that are too near each other; they do not go on once they are apart."""

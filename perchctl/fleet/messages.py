@@ -84,6 +84,7 @@ class Status:
         place_m: where it is, in the axes of its estimate; None while the estimate cannot be
             trusted.
         log: the file of its log, once the flight has begun: should it end without a `Result`.
+        picture_port: of this computer, where its process serves its pictures; None without a page.
     """
 
     stage: Stage = Stage.STARTING
@@ -96,6 +97,7 @@ class Status:
     loop_age_s: float | None = None
     place_m: Point | None = None
     log: str | None = None
+    picture_port: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,6 +160,7 @@ def find_fault(message: object) -> str | None:
         case Status():
             numbers = (message.telemetry_age_s, message.loop_age_s)
             is_good = isinstance(message.stage, Stage) and all(map(_is_number, numbers))
+            is_good = is_good and isinstance(message.picture_port, int | None)
         case Result():
             is_good = type(message.exit_code) is int
             is_good = is_good and isinstance(message.outcome, VehicleOutcome)

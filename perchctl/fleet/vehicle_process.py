@@ -17,6 +17,7 @@ import threading
 import time
 from dataclasses import replace
 
+from perchctl.calibration import profile_camera
 from perchctl.children import Channel
 from perchctl.corridor import Point
 from perchctl.errors import Interrupted, PerchError, SafetyAbort
@@ -69,9 +70,11 @@ def fly_vehicle(
             options.log_dir, options.profile, options.uri, options.source, seed, options.record
         )
         reporter.log = str(log.path)
+        if options.serve_pictures:
+            reporter.serve_pictures(options)
         report, miss_m = fly_session(
             options,
-            (log, reporter),
+            (log, reporter, *reporter.watchers),
             switch,
             remarks=log.remarks,
             may_take_off=reporter.may_take_off,
@@ -200,6 +203,7 @@ class StatusReporter(Watcher):
 
     Attributes:
         log: the file of the flight's log, once it is open.
+        watchers: who also watches the flight: those who serve its pictures.
         failure: the result of a flight that has raised.
     """
 
@@ -208,7 +212,9 @@ class StatusReporter(Watcher):
 
     def __init__(self, line: ParentLine, switch: ParentSwitch) -> None:
         self.log: str | None = None
+        self.watchers: tuple[Watcher, ...] = ()
         self.failure: Result | None = None
+        self._picture_port: int | None = None
         self._line, self._switch = line, switch
         self._first: tuple[float, float, float] | None = None  # loop, wall and computing time, s
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -217,11 +223,23 @@ class StatusReporter(Watcher):
         self._rest: str | None = None  # of a vehicle that was rescued
         self._tick: Tick | None = None
 
+    def serve_pictures(self, options: FlyOptions) -> None:
+        """Serve the flight's pictures to the fleet's page, without buttons. What fails is printed,
+        and is no reason not to fly."""
+        try:
+            from perchctl.display import FlightPage, LivePage  # a flight without a page needs none
+
+            page = LivePage(profile_camera(options.profile.camera), f"perchctl fly {options.uri}")
+            self.watchers = (FlightPage.of(page, options.profile),)
+            self._picture_port = page.port
+        except Exception as error:
+            _say(f"the pictures cannot be served: {error_at(error)}")
+
     def may_take_off(self, waiting: str) -> bool:
         """`FlightParts.may_take_off`: the parent's permission."""
         self._line.note_turn()
         stage = Stage.CHECKING if waiting else Stage.READY
-        self._line.tell(Status(stage=stage, reason=waiting))
+        self._line.tell(Status(stage=stage, reason=waiting, picture_port=self._picture_port))
         return self._switch.may_take_off
 
     def tick(self, tick: Tick) -> None:
@@ -243,7 +261,7 @@ class StatusReporter(Watcher):
                 phase=tick.state.phase,
                 reason=f"its status is unknown: {error_at(error)}",
             )
-        self._line.tell(replace(status, log=self.log))
+        self._line.tell(replace(status, log=self.log, picture_port=self._picture_port))
 
     def event(self, event: Event) -> None:
         if event.rest is not None:

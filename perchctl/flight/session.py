@@ -57,6 +57,8 @@ class FlyOptions:
     """Where a simulated target hangs, from where the vehicle stands; None: drawn from the seed."""
     link_uri: str | None = None
     """What the link opens instead of `uri`: the vehicle behind a radio hub."""
+    serve_pictures: bool = False
+    """A vehicle's process in a fleet serves its pictures to the fleet's page."""
 
     @property
     def simulated(self) -> bool:

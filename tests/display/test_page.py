@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import TOKEN_HEADER, draw_sketch
+from perchctl.display.live import draw_sketch
+from perchctl.display.serve import TOKEN_HEADER
 from tests.helpers.live_page import CORNERS, ask, press
 from tests.helpers.recording import camera
 

@@ -15,7 +15,7 @@ import pytest
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
 from perchctl.display import FlightPage, FlightPanel, LivePage, Sketch
-from perchctl.display.live import LAST_READ_S
+from perchctl.display.serve import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.mission import (

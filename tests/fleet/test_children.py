@@ -82,7 +82,8 @@ BAD: Any = "landed"
         (Status(stage=BAD), "Status with parts of a wrong type"),
         (Status(loop_age_s=BAD), "Status with parts of a wrong type"),
         (Status(place_m=BAD), "Status with parts of a wrong type"),
-        (Status(place_m=(1.0, 2.0)), None),
+        (Status(picture_port=BAD), "Status with parts of a wrong type"),
+        (Status(place_m=(1.0, 2.0), picture_port=40000), None),
         (Result(exit_code=0, outcome=BAD, reason=""), "Result with parts of a wrong type"),
         (
             Result(exit_code=BAD, outcome=VehicleOutcome.LANDED, reason=""),

@@ -21,7 +21,7 @@ from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
 from perchctl.commands import fly_fleet
 from perchctl.commands.fly_fleet import FleetSession
-from perchctl.display import FleetPanel
+from perchctl.display import FleetPage, FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
 from perchctl.errors import PerchError
 from perchctl.fleet import (
@@ -44,6 +44,7 @@ from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
 from tests.helpers.commands import run, run_apart
 from tests.helpers.dongle import uris
+from tests.helpers.live_page import press
 
 TWO = """\
 name: two
@@ -297,6 +298,97 @@ def test_a_number_key_is_answered_by_what_it_does(session: FleetSession) -> None
     assert session._land_by_key(fleet, 1) == "north: by key 1, it lands"
     assert session._land_by_key(fleet, 2) == "east: it has ended already"
     assert landed == ["north", "east"]
+
+
+# --- The live page ---
+
+
+@pytest.fixture
+def viewed(session: FleetSession) -> FleetSession:
+    """The session with a live page."""
+    session._has_page = True
+    return session
+
+
+def once_started(session: FleetSession, act: Callable[[FleetPage], None]) -> None:
+    """Act once the first vehicle is in the air, as somebody at the page would."""
+    acted: list[None] = []
+
+    def look(coordinator: Coordinator) -> None:
+        if any(view.is_in_air for view in coordinator.views) and not acted:
+            acted.append(None)
+            assert session._page is not None
+            act(session._page)
+
+    session._show_rows = look  # type: ignore[method-assign]
+
+
+def test_stop_all_on_the_page_lands_all(
+    viewed: FleetSession, capsys: pytest.CaptureFixture[str]
+) -> None:
+    once_started(viewed, lambda page: press(page.url, page.token, "land"))  # type: ignore[arg-type]
+    outcome = viewed.fly(asks=False)
+    assert [each.outcome for each in outcome.results.values()] == [VehicleOutcome.LANDED] * 4
+    assert "live page (with buttons to land and to cut the motors): http://127.0.0.1:" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_tiles_button_lands_its_vehicle_alone(
+    viewed: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    once_started(viewed, lambda page: press(page.url, page.token, "land/4"))  # type: ignore[arg-type]
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    outcome = viewed.fly(asks=False)
+    ends = {name: each.outcome.value for name, each in outcome.results.items()}
+    assert ends.pop("west") == "landed"
+    assert {*ends.values()} == {"perched"}
+    assert "west: by its button, it does not take off" in capsys.readouterr().err
+
+
+def test_the_page_shows_the_flight_and_how_it_ended(
+    viewed: FleetSession, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ends: list[dict[str, Any]] = []
+    monkeypatch.setattr(FleetPage, "close", lambda page: ends.append(page.state()))
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    viewed.fly(asks=False)
+    (state,) = ends
+    assert [vehicle["phase"] for vehicle in state["vehicles"]] == ["hangs"] * 4
+    assert any(line.endswith("north: ALIGN") for line in state["events"])
+    card = state["card"]
+    assert (card["outcome"], card["good"]) == ("4 OF 4 HANG", True)
+    assert card["rows"][-1] == ["report", f"perchctl log report {tmp_path}"]
+
+
+@pytest.mark.parametrize("part", ["__init__", "show", "event", "end"])
+def test_a_page_that_fails_ends_no_flight(
+    viewed: FleetSession,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    part: str,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(FleetPage, part, fail)
+    monkeypatch.setattr(FakeProcess, "END", PERCHED)
+    outcome = viewed.fly(asks=False)
+    assert [each.outcome for each in outcome.results.values()] == [VehicleOutcome.PERCHED] * 4
+    assert "nobody foresaw this" in capsys.readouterr().err
+
+
+def test_the_page_shows_nothing_new_while_the_coordinator_hangs(viewed: FleetSession) -> None:
+    shown: list[object] = []
+    page: Any = SimpleNamespace(show=lambda rows, live: shown.append(rows))
+    viewed._page = page
+    hung: Any = SimpleNamespace(views=(), started=True, rounds=7)
+    viewed._show_page(hung)
+    viewed._show_page(hung)
+    assert len(shown) == 1
+    hung.rounds += 1
+    viewed._show_page(hung)
+    assert len(shown) == 2
 
 
 def test_a_coordinator_that_fails_on_the_ground_is_an_error_and_nothing_is_armed(

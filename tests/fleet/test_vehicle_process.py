@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from perchctl.children import Channel
+from perchctl.display import FlightPage, LivePage
 from perchctl.errors import Interrupted, SafetyAbort
 from perchctl.fleet import flight_options, load_fleet, make_plan, vehicle_process
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
@@ -19,7 +20,7 @@ from perchctl.fleet.vehicle_process import ParentLine, StatusReporter
 from perchctl.flight import FlyOptions
 from perchctl.mission import Event, Operator, Phase, RestState, Tick
 from perchctl.values import replace
-from tests.helpers.live_page import tick
+from tests.helpers.live_page import press, tick
 from tests.helpers.waiting import until
 
 
@@ -78,6 +79,32 @@ def test_a_status_that_cannot_be_made_is_an_unknown_one(monkeypatch: pytest.Monk
     (status,) = line.told
     assert (status.stage, status.phase, status.place_m) == (Stage.FLYING, Phase.ALIGN, None)
     assert status.reason.startswith("its status is unknown: RuntimeError: nobody foresaw this")
+
+
+def test_the_parent_hears_where_the_pictures_are(options: FlyOptions) -> None:
+    line: Any = FakeLine()
+    reporter = StatusReporter(line, ParentSwitch())
+    reporter.serve_pictures(options)
+    (watcher,) = reporter.watchers
+    assert isinstance(watcher, FlightPage)
+    try:
+        reporter.may_take_off("")
+        reporter.tick(tick())
+        assert [status.picture_port for status in line.told] == [watcher.page.port] * 2
+        assert press(watcher.page.url, watcher.page.token) == 403, "the parent is the operator"
+    finally:
+        watcher.page.close()
+
+
+def test_pictures_that_cannot_be_served_are_no_reason_not_to_fly(
+    reporter: StatusReporter, options: FlyOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("no port is free")
+
+    monkeypatch.setattr(LivePage, "__init__", fail)
+    reporter.serve_pictures(options)
+    assert reporter.watchers == ()
 
 
 def result_at(reporter: StatusReporter, last: Tick) -> Result:

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from perchctl.display.live import TOKEN_HEADER
+from perchctl.display.serve import TOKEN_HEADER
 from perchctl.mission import Observation, Phase, Tick
 from perchctl.mission.state import BatteryOutlook
 from perchctl.vehicle import PositionSetpoint

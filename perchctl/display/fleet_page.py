@@ -1,0 +1,119 @@
+"""The live page of a fleet: a tile for each vehicle with its picture, and buttons to stop.
+
+Each vehicle's own process serves its pictures (`FlightPage`). The page's threads fetch one when a
+browser asks for it, so that no picture ever goes through the line on which the orders go.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from perchctl.display.fleet_panel import FleetRow
+from perchctl.display.page import STEPS
+from perchctl.display.serve import Page
+from perchctl.mission import Phase
+
+EVENTS_SHOWN = 200
+"""Lines of events. More: each answer to a browser is larger. Fewer: what began a long flight is
+missing from a page that is opened later."""
+PICTURE_TIMEOUT_S = 0.5
+"""For a vehicle's process to give a picture. Longer, and one that hangs holds up the other tiles;
+shorter, and pictures of a busy computer are missing."""
+LARGEST_PICTURE_BYTES = 2_000_000
+"""Of a JPEG. Larger, and what is no picture fills the memory; smaller, and large cameras have no
+picture."""
+
+
+class FleetPage(Page):
+    """Serves the page until closed. Only `end` and `close` wait.
+
+    Args:
+        count: how many vehicles the fleet has.
+        on_land: called by STOP ALL, from a thread of the page.
+        on_cut: called by STOP ALL pressed again, likewise.
+        on_land_one: called by a tile's Land with the vehicle's number, from 1 on, likewise.
+    """
+
+    HTML = "fleet.html"
+
+    def __init__(
+        self,
+        title: str,
+        count: int,
+        on_land: Callable[[], None],
+        on_cut: Callable[[], None],
+        on_land_one: Callable[[int], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._rows: tuple[FleetRow, ...] = ()
+        self._reached: dict[str, int] = {}
+        self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
+        orders: dict[str, Callable[[], object]] = {"land": on_land, "cut": on_cut}
+        for number in range(1, count + 1):
+            orders[f"land/{number}"] = partial(on_land_one, number)
+        super().__init__(title, orders, clock)
+        self.set_state(self._tiles, live=False)
+
+    def show(self, rows: Sequence[FleetRow], *, live: bool = True) -> None:
+        """Show these vehicles. With `live`, the page warns when this is no longer called."""
+        for row in rows:
+            if row.hangs or row.phase == Phase.PERCHED.value:
+                self._reached[row.name] = len(STEPS)
+            elif row.phase in STEPS:
+                self._reached[row.name] = STEPS.index(row.phase)
+        self._rows = tuple(rows)
+        self.set_state(self._tiles, live=live and not all(row.has_ended for row in rows))
+
+    def event(self, line: str) -> None:
+        """Add a line to the events; whoever opens the page later sees it too."""
+        self._events.append(line)
+
+    def picture(self, name: str) -> bytes | None:
+        """The newest picture of the vehicle with this number; None if there is none now."""
+        port = next((r.picture_port for r in self._rows if str(r.number) == name), None)
+        return None if port is None else _fetch_picture(port)
+
+    def _tiles(self) -> dict[str, Any]:
+        rows = self._rows
+        return {
+            "steps": STEPS,
+            "vehicles": [self._tile(row) for row in rows],
+            "events": list(self._events),
+            "over": bool(rows) and all(row.has_ended for row in rows),
+        }
+
+    def _tile(self, row: FleetRow) -> dict[str, Any]:
+        return {
+            "number": row.number,
+            "name": row.name,
+            "phase": row.phase,
+            "reason": row.reason,
+            "values": row.texts(),
+            "reached": self._reached.get(row.name, -1),
+            "over": row.has_ended,
+            "hangs": row.hangs,
+            "bad": row.is_silent or (row.has_ended and not row.hangs),
+            "silent": row.is_silent,
+            "picture": row.picture_port is not None,
+            "landed": f"land/{row.number}" in self._ordered,
+        }
+
+
+def _fetch_picture(port: int) -> bytes | None:
+    """The newest picture that the page on this port of this computer has; None without one."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PICTURE_TIMEOUT_S)
+    with contextlib.closing(connection):
+        try:
+            connection.request("GET", "/picture")
+            answer = connection.getresponse()
+            data = answer.read(LARGEST_PICTURE_BYTES + 1)
+        except (OSError, http.client.HTTPException):
+            return None
+    is_picture = answer.status == 200 and answer.getheader("Content-Type") == "image/jpeg"
+    return data if is_picture and len(data) <= LARGEST_PICTURE_BYTES else None
