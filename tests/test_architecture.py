@@ -25,7 +25,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
     "mujoco": ("perchctl.sim",),
-    "matplotlib": ("*.plot", "perchctl.analysis.film"),
+    "matplotlib": ("*.plot", "perchctl.analysis.film", "perchctl.analysis.fleet_film"),
     "jinja2": ("perchctl.report_page",),
     "motioncapture": ("perchctl.positioning",),
     "mcap": ("perchctl.record.recorder", "perchctl.record.recorded"),
@@ -80,7 +80,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 11,
+    "analysis": 13,
     "calibration": 18,
     "camera": 17,
     "campaign": 22,

@@ -1,6 +1,8 @@
 from .compare import FlightComparison as FlightComparison
 from .compare import profile_differences as profile_differences
 from .film import write_film as write_film
+from .fleet_film import FilmedVehicle as FilmedVehicle
+from .fleet_film import write_fleet_film as write_fleet_film
 from .flight import FlightAnalysis as FlightAnalysis
 from .flight import read_log as read_log
 from .plot import plot_flight as plot_flight

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -56,31 +56,68 @@ def write_film(
     """
     if not flight.log.records:
         raise InvalidValue(f"{flight.log.path}: the log has no ticks, so there is nothing to film")
-    period = Fraction(max(2, round(100 / rate_hz)), 100)
+    period = film_period(rate_hz)
     times_s = np.arange(0.0, flight.log.end_s + LAST_PICTURE_S, float(period))
-    drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px)
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_video
-    try:
-        with atomic_write(path) as part:
-            write(drawn, part, period)
-    except OSError as error:
-        raise write_error(path, error) from None
+    write_pictures(_film_pictures(flight, pictures or iter(()), times_s, width_px), path, period)
     return len(times_s)
 
 
 def _film_pictures(
     flight: FlightAnalysis, recorded: Recorded, times_s: Array, width_px: int
 ) -> Iterator[Rgb]:
-    stage = _Stage(flight, width_px)
-    coming, image, newest = next(recorded, None), None, flight.log.records[0]
+    stage, shown = _Stage(flight, width_px), ShownPicture(flight, recorded)
     for t_s in times_s:
         index = flight.log.tick_index_at(float(t_s))
-        record = flight.log.records[index]
+        shown.advance(index)
+        yield stage.drawn(index, shown)
+
+
+class ShownPicture:
+    """The recorded picture that the flight had last processed, and its record in the log.
+
+    Attributes:
+        image: grey (height, width); None before the first.
+        record: the log's record of the newest picture.
+    """
+
+    def __init__(self, flight: FlightAnalysis, recorded: Recorded) -> None:
+        self.image: Rgb | None = None
+        self.record: dict[str, Any] = flight.log.records[0]
+        self._flight, self._recorded = flight, recorded
+        self._coming = next(recorded, None)
+
+    def advance(self, index: int) -> None:
+        """Go to the tick with this index, which never becomes smaller."""
+        record = self._flight.log.records[index]
         if record.get("frame") is not None:
-            newest = record
-            while coming is not None and coming[0] <= record["frame"]:
-                image, coming = coming[2], next(recorded, None)
-        yield stage.drawn(index, image, newest)
+            self.record = record
+            while self._coming is not None and self._coming[0] <= record["frame"]:
+                self.image, self._coming = self._coming[2], next(self._recorded, None)
+
+
+class CameraView:
+    """A picture with the markers' outlines, in axes of its own; `add` takes each moving artist."""
+
+    def __init__(self, ax: Axes, flight: FlightAnalysis, add: Callable[[Any], Any]) -> None:
+        ax.set_axis_off()
+        camera = flight.log.header.get("camera") or {}
+        width, height = camera.get("size_px") or (640, 480)
+        self._image = add(ax.imshow(np.zeros((height, width)), cmap="gray", vmin=0.0, vmax=255.0))
+        ax.set_xlim(-0.5, width - 0.5)
+        ax.set_ylim(height - 0.5, -0.5)
+        self._outlines = {
+            key: add(ax.plot([], [], solid_capstyle="butt", color=colour, linewidth=1.6)[0])
+            for key, colour in (("large_px", SKY), ("small_px", ORANGE))
+        }
+
+    def show(self, shown: ShownPicture) -> None:
+        """Show this picture from now on."""
+        if shown.image is None:
+            return
+        self._image.set_data(shown.image)
+        for key, line in self._outlines.items():
+            corners = np.reshape(shown.record.get(key) or [], (-1, 2))
+            line.set_data(*np.vstack([corners, corners[:1]]).T)
 
 
 class _Stage:
@@ -88,39 +125,29 @@ class _Stage:
 
     def __init__(self, flight: FlightAnalysis, width_px: int) -> None:
         self._flight = flight
-        dpi = width_px // SIZE_STEP_PX * SIZE_STEP_PX / WIDTH_IN
-        self._figure: Figure = new_figure(WIDTH_IN, HEIGHT_IN, dpi)
+        self._figure = film_figure(width_px)
         grid = self._figure.add_gridspec(2, 2, height_ratios=(2.6, 1.0), width_ratios=(2.0, 1.0))
         self._moving: list[Any] = []
-        self._set_picture(self._figure.add_subplot(grid[0, 0]))
+        self._camera = CameraView(self._figure.add_subplot(grid[0, 0]), flight, self._add)
         self._set_side_view(self._figure.add_subplot(grid[0, 1]))
         self._set_traces(self._figure.add_subplot(grid[1, :]))
         self._figure.suptitle(" ", fontsize=13)
         self._title = self._add(
             self._figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=13)
         )
-        self._canvas = cast(Any, self._figure.canvas)
-        self._canvas.draw()
-        self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._still = draw_still(self._figure)
 
-    def drawn(self, index: int, image: Rgb | None, newest: dict[str, Any]) -> Rgb:
-        """A tick's picture, (height, width, 3); `newest`: the record of the newest frame."""
+    def drawn(self, index: int, shown: ShownPicture) -> Rgb:
+        """A tick's picture, (height, width, 3)."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
-        if image is not None:
-            self._image.set_data(image)
-            for key, line in self._outlines.items():
-                corners = np.reshape(newest.get(key) or [], (-1, 2))
-                line.set_data(*np.vstack([corners, corners[:1]]).T)
+        self._camera.show(shown)
         x_m, z_m = self._place_m[index]
         self._trail.set_data(*self._place_m[: index + 1].T)
         self._arms.set_data([x_m - ARM_M, x_m + ARM_M], [z_m, z_m])
         self._gear.set_data([x_m, x_m], [z_m, z_m + self._gear_m])
         self._cursor.set_xdata([t_s, t_s])
         self._title.set_text(f"{t_s:.1f} s   {record.get('phase') or ''}")
-        self._canvas.restore_region(self._still)
-        for artist in self._moving:
-            (artist.axes or self._figure).draw_artist(artist)
-        return np.asarray(self._canvas.buffer_rgba())[:, :, :3].copy()
+        return draw_moving(self._figure, self._still, self._moving)
 
     def _add(self, artist: Any) -> Any:
         artist.set_animated(True)
@@ -129,20 +156,6 @@ class _Stage:
 
     def _line(self, ax: Axes, **more: Any) -> Any:
         return self._add(ax.plot([], [], solid_capstyle="butt", **more)[0])
-
-    def _set_picture(self, ax: Axes) -> None:
-        ax.set_axis_off()
-        camera = self._flight.log.header.get("camera") or {}
-        width, height = camera.get("size_px") or (640, 480)
-        self._image = self._add(
-            ax.imshow(np.zeros((height, width)), cmap="gray", vmin=0.0, vmax=255.0)
-        )
-        ax.set_xlim(-0.5, width - 0.5)
-        ax.set_ylim(height - 0.5, -0.5)
-        self._outlines = {
-            key: self._line(ax, color=colour, linewidth=1.6)
-            for key, colour in (("large_px", SKY), ("small_px", ORANGE))
-        }
 
     def _set_side_view(self, ax: Axes) -> None:
         self._place_m, target_z_m = side_path_and_target_height(self._flight)
@@ -208,7 +221,43 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     return place_m, target_z_m
 
 
-# --- The file ---
+# --- Figure and file ---
+
+
+def film_period(rate_hz: float) -> Fraction:
+    """Time between two pictures, s, rounded to 0.01 s, in which a GIF counts."""
+    return Fraction(max(2, round(100 / rate_hz)), 100)
+
+
+def film_figure(width_px: int) -> Figure:
+    """An empty figure of a film's shape."""
+    return new_figure(WIDTH_IN, HEIGHT_IN, width_px // SIZE_STEP_PX * SIZE_STEP_PX / WIDTH_IN)
+
+
+def draw_still(figure: Figure) -> Any:
+    """Draw what does not move, for `draw_moving`."""
+    canvas = cast(Any, figure.canvas)
+    canvas.draw()
+    return canvas.copy_from_bbox(figure.bbox)
+
+
+def draw_moving(figure: Figure, still: Any, moving: Sequence[Any]) -> Rgb:
+    """Draw these artists over what does not move; return the picture, (height, width, 3)."""
+    canvas = cast(Any, figure.canvas)
+    canvas.restore_region(still)
+    for artist in moving:
+        (artist.axes or figure).draw_artist(artist)
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+
+
+def write_pictures(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
+    """Write a film (.mp4 or .gif). Errors: InvalidValue for a file that cannot be written."""
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_video
+    try:
+        with atomic_write(path) as part:
+            write(pictures, part, period)
+    except OSError as error:
+        raise write_error(path, error) from None
 
 
 def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:

@@ -279,6 +279,7 @@ def report(
     "perchctl log film",
     "perchctl log film flight.jsonl -o flight.mp4",
     "perchctl log film flight.jsonl -o flight.gif --rate 6 --width 640",
+    "perchctl log film perchctl-logs/fleet_20261130_120000_atrium",
 )
 def film(
     file: LogArgument = None,
@@ -298,8 +299,21 @@ def film(
 ) -> None:
     """Make a film of a flight: camera picture, side view to scale, error and thrust.
 
-    The camera picture needs a recording next to the log (fly --record).
+    The camera picture needs a recording next to the log (fly --record). The folder of a fleet's
+    flight (with a fleet.json) gives one film of all its vehicles: room from above, heights and
+    camera pictures.
     """
+    fleet = fleets.read_fleet_folder(file) if file is not None and file.is_dir() else None
+    if fleet is not None:
+        if not fleet.logs:
+            raise NotFound("no vehicle of this fleet has left a log: there is nothing to film")
+        first = next(iter(fleet.logs.values()))
+        place = _place(first, output or first.with_name("fleet.mp4"), FILMS, force)
+        from perchctl.analysis import write_fleet_film
+
+        write_fleet_film(fleet.filmed(), place, rate_hz, width_px)
+        print(f"film:      {place}")
+        return
     path = _log_file(file)
     place = _place(path, output, FILMS, force)
     is_recorded = path_beside(path, ".mcap").is_file()

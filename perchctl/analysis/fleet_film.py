@@ -1,0 +1,228 @@
+"""A film of a fleet: the room from above, all heights, and each vehicle's camera picture.
+
+Each vehicle's log has a clock of its own. What puts them together is the fleet's clock, on which
+each flight has its begin and its pace: simulated time may run slower than the clock on the wall.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+from perchctl.analysis.film import (
+    LAST_PICTURE_S,
+    CameraView,
+    Recorded,
+    Rgb,
+    ShownPicture,
+    draw_moving,
+    draw_still,
+    film_figure,
+    film_period,
+    write_pictures,
+)
+from perchctl.analysis.flight import FlightAnalysis
+from perchctl.corridor import Point
+from perchctl.errors import InvalidValue
+from perchctl.geometry import Array
+from perchctl.plot import BLACK, BLUE, GREEN, GRID, ORANGE, PURPLE, SKY, VERMILLION
+
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+ROOM_MARGIN_M = 0.2
+"""Around all corridors, in the view from above."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FilmedVehicle:
+    """One vehicle of a fleet's flight.
+
+    Attributes:
+        pictures: the recorded ones, oldest first; None without a recording.
+        begin_s: its first tick, on the fleet's clock.
+        pace: time of its flight per time of the fleet's clock.
+        home_m, target_m, radius_m: of its corridor, in the room's axes.
+        heading_rad: where its nose points at home.
+        in_room: its state estimate has the room's axes; otherwise it begins at zero at home.
+    """
+
+    name: str
+    flight: FlightAnalysis
+    pictures: Recorded | None
+    begin_s: float
+    pace: float
+    home_m: Point
+    target_m: Point
+    radius_m: float
+    heading_rad: float = 0.0
+    in_room: bool = False
+
+    @property
+    def end_s(self) -> float:
+        """Its last tick, on the fleet's clock."""
+        return self.begin_s + self.flight.log.end_s / self.pace
+
+    def index_at(self, t_s: float) -> int:
+        """The tick at this time of the fleet's clock; the first one before its flight."""
+        return self.flight.log.tick_index_at((t_s - self.begin_s) * self.pace)
+
+    def path_m(self) -> Array:
+        """Its place in each tick in the room's axes, (n, 2)."""
+        log = self.flight.log
+        place_m = np.column_stack([log.column("x_m"), log.column("y_m")])
+        if self.in_room:
+            return place_m
+        c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        return np.asarray(place_m @ np.array([[c, s], [-s, c]]) + np.asarray(self.home_m))
+
+    def heights_m(self) -> Array:
+        """Its height above where it stood, in each tick."""
+        z_m = self.flight.log.column("z_m")
+        known_m = z_m[np.isfinite(z_m)]
+        return np.asarray(z_m - known_m[0] if known_m.size else z_m)
+
+
+def write_fleet_film(
+    vehicles: Sequence[FilmedVehicle], path: Path, rate_hz: float = 15.0, width_px: int = 960
+) -> int:
+    """Write the flight of a fleet as a film (.mp4 or .gif) at its own pace, and return its number
+    of pictures. `rate_hz`, `width_px` and errors are those of `perchctl.analysis.write_film`.
+    """
+    for vehicle in vehicles:
+        if not vehicle.flight.log.records:
+            log = vehicle.flight.log.path
+            raise InvalidValue(f"{log}: the log has no ticks, so there is nothing to film")
+    period = film_period(rate_hz)
+    begin_s = min(vehicle.begin_s for vehicle in vehicles)
+    end_s = max(vehicle.end_s for vehicle in vehicles)
+    times_s = np.arange(begin_s, end_s + LAST_PICTURE_S, float(period))
+    write_pictures(_fleet_pictures(vehicles, times_s, width_px), path, period)
+    return len(times_s)
+
+
+def _fleet_pictures(
+    vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int
+) -> Iterator[Rgb]:
+    stage = _FleetStage(vehicles, times_s, width_px)
+    for t_s in times_s:
+        yield stage.drawn(float(t_s))
+
+
+class _FleetStage:
+    """The figure: what stays is drawn once, what moves is drawn for each picture."""
+
+    def __init__(self, vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int) -> None:
+        self._begin_s = float(times_s[0])
+        self._moving: list[Any] = []
+        self._figure = film_figure(width_px)
+        grid = self._figure.add_gridspec(2, 2, height_ratios=(2.6, 1.0), width_ratios=(1.0, 1.35))
+        room, heights = (self._figure.add_subplot(grid[row, 0]) for row in (0, 1))
+        columns = math.ceil(math.sqrt(len(vehicles)))
+        cameras = grid[:, 1].subgridspec(math.ceil(len(vehicles) / columns), columns)
+        self._set_room(room, vehicles)
+        self._set_heights(heights, vehicles, float(times_s[-1]))
+        self._shown = [
+            _ShownVehicle(
+                vehicle,
+                COLOURS[number % len(COLOURS)],
+                self._figure.add_subplot(cameras[divmod(number, columns)]),
+                room,
+                self._add,
+            )
+            for number, vehicle in enumerate(vehicles)
+        ]
+        self._figure.suptitle(" ", fontsize=13)
+        self._title = self._add(
+            self._figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=13)
+        )
+        self._still = draw_still(self._figure)
+
+    def drawn(self, t_s: float) -> Rgb:
+        """The picture of this time of the fleet's clock, (height, width, 3)."""
+        for each in self._shown:
+            each.show(t_s)
+        hanging = sum(each.hangs for each in self._shown)
+        since_s = t_s - self._begin_s
+        self._title.set_text(f"{since_s:.1f} s   {hanging} of {len(self._shown)} hang")
+        self._cursor.set_xdata([since_s, since_s])
+        return draw_moving(self._figure, self._still, self._moving)
+
+    def _add(self, artist: Any) -> Any:
+        artist.set_animated(True)
+        self._moving.append(artist)
+        return artist
+
+    def _set_room(self, ax: Axes, vehicles: Sequence[FilmedVehicle]) -> None:
+        ax.set_aspect("equal", adjustable="box")
+        for number, vehicle in enumerate(vehicles):
+            colour = COLOURS[number % len(COLOURS)]
+            for end_m in (vehicle.home_m, vehicle.target_m):
+                ax.add_patch(Circle(end_m, vehicle.radius_m, color=colour, alpha=0.12, lw=0.0))
+            ax.plot(*vehicle.home_m, marker="o", color=colour, fillstyle="none")
+            ax.plot(*vehicle.target_m, marker="s", color=colour)
+        low, high = (
+            [
+                pick(
+                    end[axis] + sign * (v.radius_m + ROOM_MARGIN_M)
+                    for v in vehicles
+                    for end in (v.home_m, v.target_m)
+                )
+                for axis in (0, 1)
+            ]
+            for pick, sign in ((min, -1.0), (max, 1.0))
+        )
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(low[1], high[1])
+        ax.set_xlabel("x [m]")
+        ax.set_ylabel("y [m]")
+
+    def _set_heights(self, ax: Axes, vehicles: Sequence[FilmedVehicle], end_s: float) -> None:
+        for number, vehicle in enumerate(vehicles):
+            t_s = vehicle.begin_s + vehicle.flight.log.t_s / vehicle.pace - self._begin_s
+            ax.plot(t_s, vehicle.heights_m(), color=COLOURS[number % len(COLOURS)], linewidth=1.2)
+        ax.set_xlim(0.0, max(end_s - self._begin_s, 0.1))
+        ax.set_ylim(bottom=0.0)
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel("height [m]")
+        ax.grid(True, color=GRID, linewidth=0.6)
+        self._cursor = self._add(ax.axvline(0.0, color=BLACK, linewidth=1.0))
+
+
+class _ShownVehicle:
+    """What moves of one vehicle: its camera's picture, its words, and its place in the room."""
+
+    def __init__(
+        self, vehicle: FilmedVehicle, colour: str, camera: Axes, room: Axes, add: Any
+    ) -> None:
+        self.hangs = False
+        self._vehicle = vehicle
+        self._picture = ShownPicture(vehicle.flight, vehicle.pictures or iter(()))
+        self._view = CameraView(camera, vehicle.flight, add)
+        camera.set_title(" ", fontsize=9)
+        self._words = add(
+            camera.text(
+                0.0, 1.02, "", transform=camera.transAxes, color=colour, fontsize=9, va="bottom"
+            )
+        )
+        self._path_m = vehicle.path_m()
+        self._trail = add(room.plot([], [], color=colour, linewidth=1.0)[0])
+        self._place = add(room.plot([], [], color=colour, marker="P", markersize=9.0)[0])
+
+    def show(self, t_s: float) -> None:
+        """Show this time of the fleet's clock."""
+        index = self._vehicle.index_at(t_s)
+        phase = "waits"
+        if t_s >= self._vehicle.begin_s:
+            self._picture.advance(index)
+            phase = self._vehicle.flight.log.records[index].get("phase") or ""
+        self.hangs = phase == "PERCHED"
+        self._view.show(self._picture)
+        self._words.set_text(f"{self._vehicle.name}: {phase}")
+        self._trail.set_data(*self._path_m[: index + 1].T)
+        self._place.set_data(*self._path_m[index : index + 1].T)
