@@ -334,6 +334,23 @@ def test_stop_all_on_the_page_lands_all(
     )
 
 
+def test_stop_all_also_counts_while_the_operator_is_being_asked(
+    viewed: FleetSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late yes on the terminal does not undo it."""
+
+    def say_yes(_: str) -> bool:
+        assert viewed._page is not None
+        assert press(viewed._page.url, viewed._page.token, "land") == 200
+        return True
+
+    monkeypatch.setattr(fly_fleet, "ask_to_confirm", say_yes)
+    with pytest.raises(PerchError, match="no vehicle was armed"):
+        viewed.fly(asks=True)
+    processes: Any = viewed._children.values()
+    assert not any(order.may_take_off for each in processes for order in each.orders)
+
+
 def test_a_tiles_button_lands_its_vehicle_alone(
     viewed: FleetSession, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
