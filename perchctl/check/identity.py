@@ -56,7 +56,7 @@ class Stand:
     of its own state estimate.
 
     Attributes:
-        home_text: its home in words, in the axes of the room.
+        home_text: its home for people, in the axes of the room.
         homes: of the other vehicles.
         views: where the target of each other vehicle would appear to be if its camera were taken
             for this vehicle's.
@@ -133,14 +133,14 @@ def _vehicle_finding(
         with link.blinking():
             is_there = ask(
                 f"{stand.name}: all LEDs of one vehicle blink. Is it the only one, and does it "
-                f"stand at {stand.home_text}?"
+                f"stand at its home, {stand.home_text}?"
             )
     except PerchError as error:
         return failed(f"its LEDs do not blink: {error.found}", "update its firmware")
     if is_there:
-        return passed(f"it blinks at {stand.home_text}, as you confirmed")
+        return passed(f"it blinks at its home, {stand.home_text}, as you confirmed")
     return failed(
-        f"you have not seen it blink at {stand.home_text}",
+        f"you have not seen it blink at its home, {stand.home_text}",
         "put each vehicle at its own home, or correct uri; if two blink, give one another address",
     )
 

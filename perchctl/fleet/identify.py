@@ -47,7 +47,7 @@ def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
     return Stand(
         name=vehicle.name,
         home_m=flown.to_estimate(vehicle.home_m),
-        home_text=f"its home {x_m:.2f} {y_m:.2f} m, its nose at {vehicle.heading_deg:g} deg",
+        home_text=f"{x_m:.2f} {y_m:.2f} m",
         heading_rad=math.radians(vehicle.heading_deg) if flown.frame == "room" else 0.0,
         homes={other.name: flown.to_estimate(other.home_m) for other in others},
         views={

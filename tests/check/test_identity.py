@@ -24,7 +24,7 @@ from tests.helpers.waiting import until
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 SCOPE: dict[str, Any] = {"listen_s": 0.1, "rehearse_s": 1.5, "capture_s": 0.1}
-STAND = Stand(name="north", home_m=(0.0, 0.0), home_text="its home 0.00 1.20 m")
+STAND = Stand(name="north", home_m=(0.0, 0.0), home_text="0.00 1.20 m")
 
 
 def expecting(x_m: float, y_m: float, **more: Any) -> Any:
@@ -77,7 +77,7 @@ def test_a_vehicle_that_nobody_has_seen_blink_at_its_home_fails(
 ) -> None:
     rows = rows_of(relay.uri, sim, ask=lambda _: False)
     assert rows["vehicle"].verdict is Verdict.FAIL
-    assert rows["vehicle"].found == "you have not seen it blink at its home 0.00 1.20 m"
+    assert rows["vehicle"].found == "you have not seen it blink at its home, 0.00 1.20 m"
     assert rows["target"].verdict is Verdict.PASS
 
 
