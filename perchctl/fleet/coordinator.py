@@ -41,6 +41,10 @@ HUNG_S = 10.0
 """A process that has sent nothing for so long is ended. Its vehicle is down by then, since the
 firmware stops the motors 2 s after the last packet. Longer, and the fleet waits for nothing;
 shorter, and a computer that pauses loses its flights."""
+START_HUNG_S = 60.0
+"""The same for a process that has sent nothing at all yet, s: on a busy computer its libraries take
+half a minute to load, and nothing is armed before all are ready. Longer: the operator waits for a
+process that hangs at its start. Shorter: a busy computer cannot start a fleet."""
 LOOP_HUNG_S = 60.0
 """A process whose flight loop has not turned for so long is ended. Longer than any landing by its
 watchdog and the closing of link and log take. Longer, and the fleet waits for nothing."""
@@ -226,7 +230,7 @@ class Coordinator:
         """The result of a process that has ended without one, or hangs and is ended now."""
         problem = child.end_of_process()
         loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
-        if problem is None and silent_s > HUNG_S:
+        if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):
             problem = f"its process has not answered for {silent_s:.0f} s and was ended"
         elif problem is None and loop_age_s > LOOP_HUNG_S:
             problem = f"its flight loop has hung for {loop_age_s:.0f} s and was ended"

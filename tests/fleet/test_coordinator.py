@@ -12,7 +12,7 @@ import pytest
 from perchctl.corridor import Point
 from perchctl.errors import InvalidValue
 from perchctl.fleet import make_plan
-from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, Coordinator
+from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, START_HUNG_S, Coordinator
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator, Phase
@@ -467,6 +467,17 @@ def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:
     assert result is not None
     assert (result.exit_code, result.has_flown, result.hangs) == (52, True, False)
     assert "look where the vehicle is" in result.reason
+
+
+def test_one_that_still_starts_is_given_the_time_that_a_busy_computer_takes() -> None:
+    rig = Rig()
+    rig.pass_s(START_HUNG_S - 1.0)
+    assert not rig["v0"].killed
+    rig.pass_s(2.0)
+    assert rig["v0"].killed
+    result = rig.fleet.views[0].result
+    assert result is not None
+    assert not result.has_flown
 
 
 def test_a_loop_that_hangs_for_longer_than_any_landing_is_ended() -> None:
