@@ -6,12 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from perchctl.analysis.flight import FlightAnalysis
@@ -20,6 +17,10 @@ from perchctl.errors import InvalidValue
 from perchctl.files import atomic_write, write_error
 from perchctl.geometry import Array
 from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, PURPLE, SKY, VERMILLION, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 ARM_M = 0.046
 """From the vehicle's centre to a motor."""
@@ -277,6 +278,7 @@ def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
 
 def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
     """Write a GIF in one palette, so that what stands still costs nothing."""
+    from matplotlib.colors import to_rgb
     from PIL import Image
 
     greys = np.repeat(np.linspace(0.0, 255.0, 64)[:, None], 3, axis=1)

@@ -10,11 +10,12 @@ do not change the gain, only the claimed covariance.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
-from filterpy.kalman import predict
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.profile import KalmanConfig
@@ -110,9 +111,20 @@ class Measurement:
     bias: Array | None = None
 
 
+@cache
+def _load_predict() -> Callable[..., tuple[Array, Array]]:
+    """Load filterpy's prediction. It loads much of scipy, which takes a second on a small computer:
+    too long for a command's first word, and for a frame in flight."""
+    from filterpy.kalman import predict
+
+    loaded: Callable[..., tuple[Array, Array]] = predict
+    return loaded
+
+
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     """Return the filter's constants. The initial standard deviation of the velocity is 5 cm/s in
     the world frame, and 30 cm/s in the level frame, or 1 m/s with measured noise."""
+    _load_predict()  # now, so that no frame waits for it
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -228,7 +240,7 @@ def step_track(
         x[RATES] *= setup.alpha  # equation 3
         return _predict_from_state(track, x, dt_s, t_s, track.unseen + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise(dt_s, track.x[POSITION], setup)
-    x, P = predict(track.x, track.P, F=F, Q=Q)
+    x, P = _load_predict()(track.x, track.P, F=F, Q=Q)
     R = setup.R if measured.R is None else measured.R
     if setup.restart_nis < math.inf:
         off, S = _innovation(x, measured.z), P[MEASURED, MEASURED] + R
@@ -295,6 +307,6 @@ def _predict_from_state(
     """Return the track predicted from the state `x` to `t_s`, without a measurement."""
     x = _limit_drift_speed(x, setup)
     F = transition_matrix(dt_s)
-    x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
+    x, P = _load_predict()(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=unseen, bias=F @ track.bias)

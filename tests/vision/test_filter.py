@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -288,3 +290,14 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
     assert (
         np.abs((moved - z) - expected).max() <= 0.1 * turned * (np.linalg.norm(e_m) + 0.05) + 1e-12
     )
+
+
+def test_filterpy_is_loaded_with_the_setup_so_that_no_frame_waits_for_it() -> None:
+    code = (
+        "import sys; from perchctl.profile import KalmanConfig\n"
+        "from perchctl.vision.filter import make_filter\n"
+        "before = 'filterpy' in sys.modules; make_filter(KalmanConfig())\n"
+        "print(before, 'filterpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True"]
