@@ -10,6 +10,8 @@ import re
 import sys
 import textwrap
 import warnings
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -40,6 +42,98 @@ def test_help_loads_nothing_heavy() -> None:
     done = run_apart("--help", before=before)
     assert "simulate" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+UNTIL_HEAVY = """
+import contextlib, importlib.abc, io, json, sys
+
+class HeavyImport(BaseException):
+    pass
+
+class Guard(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name in {heavy!r}:
+            raise HeavyImport(name)
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+sys.meta_path.insert(0, Guard())
+from perchctl.commands import app
+
+for line in {lines!r}:
+    with contextlib.redirect_stdout(Terminal()) as said, contextlib.redirect_stderr(said):
+        try:
+            app(line.split())
+        except BaseException as error:
+            end = type(error).__name__
+    print(json.dumps([line, end, said.getvalue()]))
+sys.exit()
+"""
+"""Runs each command until it loads a heavy library; prints how it ended, and what it printed."""
+
+FIRST_WORDS = {
+    "make-target sheet": "reading profile sim",
+    "make-target board chessboard:9x6:25mm": "reading board chessboard:9x6:25mm",
+    "make-target design": "reading profile sim",
+    "make-target measured -p mine.yaml --measured-large 149.6": "reading profile mine.yaml",
+    "calibrate camera images:.": "looking for the board",
+    "calibrate mount -p mine.yaml": "reading profile mine.yaml",
+    "calibrate mask images:.": "looking for what the vehicle covers",
+    "calibrate check mine.yaml images:.": "reading mine.yaml",
+    "calibrate convert mine.yaml": "reading mine.yaml",
+    "profile show": "reading profile sim",
+    "profile new": "reading the shipped profiles",
+    "profile schema": "listing the keys of a profile",
+    "fit-weights fit data.csv": "reading data.csv",
+    "fit-weights collect data.csv": "reading profile sim",
+    "track images:.": "reading profile sim",
+    "check": "reading profile sim",
+    "check --cameras": "listing the cameras",
+    "check --scan": "scanning all channels and rates",
+    "fly": "reading profile sim",
+    "fleet check": "reading the example fleet",
+    "fleet fly mine.yaml": "reading fleet mine.yaml",
+    "fleet simulate": "reading the example fleet",
+    "fleet simulate --faults list": "listing the faults",
+    "fleet convert lab.yaml": "reading lab.yaml",
+    "simulate run": "reading profile sim",
+    "simulate compare sim paper": "reading profiles sim and paper",
+    "simulate sweep link.uri=a,b": "reading profile sim",
+    "simulate --faults list": "listing the faults",
+    "log show": "looking for the newest log",
+    "log plot a.jsonl": "reading a.jsonl",
+    "log compare a.jsonl b.jsonl": "reading a.jsonl and b.jsonl",
+    "log export a.jsonl": "reading a.jsonl",
+    "log replay a.jsonl": "reading a.jsonl",
+    "log report a.jsonl": "reading a.jsonl",
+    "log film a.jsonl": "reading a.jsonl",
+}
+
+
+def subcommands() -> Iterator[str]:
+    """Each command with its subcommands, as one types it."""
+    for name in COMMANDS:
+        module = import_module(f"perchctl.commands.{name.replace('-', '_')}")
+        inner = getattr(typer.main.get_command(module.app), "commands", None)
+        yield from [name] if inner is None else [f"{name} {each}" for each in inner]
+
+
+def test_the_first_word_and_each_help_need_no_heavy_library() -> None:
+    """To load one takes a second and more on a small computer; typer itself loads pydantic."""
+    assert [name for name in subcommands() if not any(f"{line} ".startswith(f"{name} ")
+            for line in FIRST_WORDS)] == []  # fmt: skip
+    lines = [*FIRST_WORDS, *(f"{name} --help" for name in subcommands())]
+    heavy = {*HEAVY, "rich.console"} - {"pydantic"}
+    done = run_apart(before=UNTIL_HEAVY.format(heavy=heavy, lines=lines))
+    said = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line for line, _, _ in said] == lines
+    for line, error, output in said:
+        if line in FIRST_WORDS:
+            assert (error, output) == ("HeavyImport", f"perchctl: {FIRST_WORDS[line]}\n"), line
+        else:
+            assert (error, "Examples:" in output) == ("SystemExit", True), line
 
 
 def test_perchctl_alone_lists_the_commands_in_the_order_of_use() -> None:

@@ -9,30 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-import cv2
-import numpy as np
 import typer
 
-from perchctl.calibration import (
-    FoundViews,
-    calibrate_camera,
-    calibration_report,
-    calibration_text,
-    capture_views,
-    check_calibration,
-    find_views,
-    learn_gear_mask,
-    load_calibration,
-    load_notes,
-)
-from perchctl.camera import (
-    FrameSource,
-    check_size,
-    image_files,
-    open_camera,
-    parse_source,
-    without_password,
-)
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import display as displays
+from perchctl import target as targets
+from perchctl import vision as visions
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
     ForceOption,
@@ -44,13 +28,9 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.output import print_result, say
-from perchctl.commands.progress import done_of_total_bar, guidance_display
-from perchctl.display import live_page
+from perchctl.commands.output import print_result, say, say_on_terminal
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
-from perchctl.target import Board
-from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "a calibration"
@@ -112,10 +92,11 @@ def camera(
     rejected if its error exceeds 5 times the spread of its view. The report lists rejected views
     and corners, and pictures without a board.
     """
+    say_on_terminal("looking for the board")
     pictures = _source(source, view)
     if output is not None:
         _check_camera_output(output, force)
-    layout = Board.parse(board)
+    layout = targets.Board.parse(board)
 
     def checked_file(size_px: tuple[int, int]) -> Path:
         """Return where the calibration goes; raises before a person has worked for nothing."""
@@ -130,7 +111,7 @@ def camera(
     seen = found.layout_of(layout)
     if seen.legacy != layout.legacy:
         say(f"the board has the layout used {'before' if seen.legacy else 'since'} OpenCV 4.6")
-    result = calibrate_camera(found, seen.notation())
+    result = calibrations.calibrate_camera(found, seen.notation())
     if found.frames is not None:
         say(found.frames.text)
     report, date = file.with_suffix(REPORT_SUFFIX), _now()
@@ -139,7 +120,7 @@ def camera(
         say(line)
 
     say(f"wrote {file}")
-    write_files({report: calibration_report(result, file.name, date).encode()})
+    write_files({report: calibrations.calibration_report(result, file.name, date).encode()})
     say(f"wrote {report}: open it in a browser")
     record = result.record() | {"file": str(file), "report": str(report)}
     print_result(record if as_json else file)
@@ -168,16 +149,19 @@ def mask(
     size: SizeOption = None,
 ) -> None:
     """Find the parts of the picture that the vehicle covers while you turn it in your hand."""
+    say_on_terminal("looking for what the vehicle covers")
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask")
     with contextlib.ExitStack() as stack:
-        frames = open_camera(pictures, time.monotonic, size_px=size)
+        frames = cameras.open_camera(pictures, time.monotonic, size_px=size)
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().as_handler())
         if frames.live:
             say("turn the vehicle around in your hand for 20 s (Ctrl-C stops and writes the mask)")
-        covered = learn_gear_mask(frames, stop.requested.is_set)
-    write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
+        covered = calibrations.learn_gear_mask(frames, stop.requested.is_set)
+    import cv2
+
+    write_files({output: cv2.imencode(".png", 255 * covered.astype("uint8"))[1].tobytes()})
     share = 100.0 * covered.mean()
     say(
         f"wrote {output}: the vehicle covers {share:.1f} % of the picture; name this "
@@ -199,16 +183,17 @@ def check(
     as_json: JsonOption = False,
 ) -> int:
     """Check a calibration against new pictures of a board (exit code 1 if it fails)."""
+    say_on_terminal(f"reading {calibration}")
     pictures = _source(source)
-    model = load_calibration(calibration)
-    notes = load_notes(calibration)
-    layout = Board.parse(board or notes.board or DEFAULT_BOARD)
+    model = calibrations.load_calibration(calibration)
+    notes = calibrations.load_notes(calibration)
+    layout = targets.Board.parse(board or notes.board or DEFAULT_BOARD)
     if board is None:
         origin = "the calibration's" if notes.board else "the default"
         say(f"the board is {layout.notation()} ({origin})")
     found = _find_views(pictures, model.size_px, layout)
-    check_size(found.views[0].size_px, model, without_password(pictures))
-    result = check_calibration(model, found, notes.picture_hashes)
+    cameras.check_size(found.views[0].size_px, model, cameras.without_password(pictures))
+    result = calibrations.check_calibration(model, found, notes.picture_hashes)
     for item in found.without_board:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:
@@ -232,11 +217,12 @@ def convert(
     force: ForceOption = False,
 ) -> None:
     """Convert a calibration from OpenCV, Kalibr or ROS to perchctl's format."""
-    model = load_calibration(calibration)
+    say_on_terminal(f"reading {calibration}")
+    model = calibrations.load_calibration(calibration)
     file = _file(output, model.size_px)
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
-    write_files({file: calibration_text(model, file.stem, notes).encode()})
+    write_files({file: calibrations.calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
     print_result(file)
 
@@ -263,7 +249,7 @@ def _now() -> str:
 
 def _source(text: str, view: bool = False) -> str:
     """Return the source for `open_camera`. Raises NotFound, InvalidValue, UsageError."""
-    source = parse_source(text)
+    source = cameras.parse_source(text)
     if view and not source.live:
         raise UsageError(f"{source} is not a live camera, so --view does not apply: leave it out")
     return source.spec
@@ -275,26 +261,28 @@ def _source(text: str, view: bool = False) -> str:
 def _find_views(
     spec: str,
     size_px: tuple[int, int] | None,
-    board: Board,
+    board: targets.Board,
     view: bool = False,
     check: Callable[[tuple[int, int]], object] = lambda size_px: None,
-) -> FoundViews:
+) -> calibrations.FoundViews:
     """Return the views, at least one, and the pictures without a board.
 
     Args:
         view: with the live page of a live camera.
         check: called with a live camera's picture size before the person begins.
     """
-    source = parse_source(spec)
+    source = cameras.parse_source(spec)
     if source.scheme != "images":
-        frames = open_camera(spec, time.monotonic, size_px=size_px)
+        frames = cameras.open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
             if frames.size_px is not None:
                 check(frames.size_px)
             return capture_live_views(frames, board, view)
+    from perchctl.commands.progress import done_of_total_bar
+
     with done_of_total_bar("looking for the board") as progress:
-        pictures = image_files(str(Path(source.place).expanduser()))
-        found = find_views(pictures, board, progress)
+        pictures = cameras.image_files(str(Path(source.place).expanduser()))
+        found = calibrations.find_views(pictures, board, progress)
     if not found.views:
         first = found.without_board[0]
         seen = f"they show {found.other_board}"
@@ -309,23 +297,29 @@ def _find_views(
     return found
 
 
-def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundViews:
+def capture_live_views(
+    source: cameras.FrameSource, board: targets.Board, view: bool
+) -> calibrations.FoundViews:
     """Take views from a video or live camera until they cover everything, or Ctrl-C.
 
     Raises InvalidValue if no view was taken; else as `capture_views`.
     """
+    import numpy as np
+
+    from perchctl.commands.progress import guidance_display
+
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(Stopper().as_handler())
         # The page draws the picture and its corners, but no axes: any camera serves.
-        any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
-        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
+        any_camera = visions.CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
+        page = stack.enter_context(displays.live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guidance_display(page))
         if source.live:
             say(
                 "show the board near and far, tilted, and in every corner of the picture "
                 "(Ctrl-C stops and calibrates)"
             )
-        found = capture_views(source, board, show, stopped=stop.requested.is_set)
+        found = calibrations.capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(
             f"no view of the board {board.notation()} was taken from {source.describe()}: "
@@ -334,7 +328,7 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
     return found
 
 
-def _no_view_text(found: FoundViews) -> str:
+def _no_view_text(found: calibrations.FoundViews) -> str:
     """Why a video or camera gave no view, and what to do."""
     if found.other_board:
         return f"it shows {found.other_board}"

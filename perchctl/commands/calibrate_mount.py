@@ -12,19 +12,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-from perchctl.calibration import (
-    AttitudeSample,
-    MountingRecording,
-    PoseReader,
-    profile_camera,
-    record_mounting,
-    solve_mounting,
-)
-from perchctl.camera import check_size, open_camera, parse_source
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import display as displays
+from perchctl import link as links
+from perchctl import profile as profiles
+from perchctl import vision as visions
 from perchctl.commands.command_line import (
     JsonOption,
     ProfileOption,
@@ -33,9 +31,15 @@ from perchctl.commands.command_line import (
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import NO, add_problem, ask, print_lines, print_result, say
-from perchctl.commands.progress import guidance_display
-from perchctl.display import live_page
+from perchctl.commands.output import (
+    NO,
+    add_problem,
+    ask,
+    print_lines,
+    print_result,
+    say,
+    say_on_terminal,
+)
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
@@ -45,19 +49,12 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.files import check_writable
-from perchctl.link import AttitudeLink, check_uri
-from perchctl.profile import (
-    Profile,
-    find_profile,
-    load_profile,
-    writable_profile,
-    write_profile_values,
-)
-from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
 Part = Literal["carry", "pivot"]
-Sensors = tuple[Callable[[], list[AttitudeSample]], Callable[[float], str | None]]
+Sensors: TypeAlias = (
+    "tuple[Callable[[], list[calibrations.AttitudeSample]], Callable[[float], str | None]]"
+)
 """What a recording reads of the vehicle: its new samples, and what is wrong with it by a time."""
 HOW: dict[Part, str] = {
     "carry": "carry: hold the vehicle under the target (or the target in front of its "
@@ -99,19 +96,20 @@ def mount(
     Turn the vehicle in your hand with the target in view (carry), then tilt it around the tip of
     its gear (pivot). The motors are off, and perchctl never arms the vehicle.
     """
-    vehicle = load_profile(profile)
-    into = writable_profile(profile) if write else None
-    camera = profile_camera(vehicle.camera)
-    recordings: Sequence[MountingRecording]
+    say_on_terminal(f"reading profile {profile}")
+    vehicle = profiles.load_profile(profile)
+    into = profiles.writable_profile(profile) if write else None
+    camera = calibrations.profile_camera(vehicle.camera)
+    recordings: Sequence[calibrations.MountingRecording]
     if logs:
         recordings = _read_parts(logs, part)
     else:
         parts: tuple[Part, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
-        log = _free_place(find_profile(profile).stem)
+        log = _free_place(profiles.find_profile(profile).stem)
         recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, view)
         logs = [log] if log.exists() else []
-    measured = solve_mounting(vehicle, recordings)
+    measured = calibrations.solve_mounting(vehicle, recordings)
     for line in measured.lines():
         print_lines(line)
     problem: PerchError | None = None
@@ -121,7 +119,7 @@ def mount(
     if into is not None:
         try:
             _check_unchanged(profile, vehicle)
-            before = write_profile_values(into, measured.new_profile_values())
+            before = profiles.write_profile_values(into, measured.new_profile_values())
             written = into
             say(f"wrote these numbers to {written}; the old version is in {before}")
         except (InvalidValue, NotFound) as error:  # the numbers stand
@@ -142,7 +140,7 @@ def mount(
 
 
 def _live_sources(
-    source: str | None, uri: str | None, profile: Profile, parts: tuple[Part, ...]
+    source: str | None, uri: str | None, profile: profiles.Profile, parts: tuple[Part, ...]
 ) -> tuple[str, str | None]:
     """Return the camera, and the vehicle if the carry needs it."""
     given = profile.camera.source if source is None else source
@@ -150,7 +148,7 @@ def _live_sources(
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
-    name = parse_source(given)
+    name = cameras.parse_source(given)
     if "carry" not in parts:
         return name.spec, None
     if not name.live:
@@ -159,7 +157,7 @@ def _live_sources(
             "a live camera; --part pivot needs no vehicle"
         )
     link_uri = profile.link.uri if uri is None else uri
-    if check_uri(link_uri) == "sim":
+    if links.check_uri(link_uri) == "sim":
         raise UsageError(f"vehicle {link_uri} {_SIMULATED} with -u; --part pivot needs none")
     return name.spec, link_uri
 
@@ -175,9 +173,9 @@ def _free_place(name: str) -> Path:
 # --- recordings of files ---
 
 
-def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
+def _read_parts(logs: Sequence[Path], part: str | None) -> list[calibrations.MountingRecording]:
     """Return the last recording of `part`, or of each part. Errors: NotFound, InvalidValue."""
-    held = [recording for path in logs for recording in MountingRecording.read(path)]
+    held = [recording for path in logs for recording in calibrations.MountingRecording.read(path)]
     found = {each.part: each for each in held if part in (None, each.part)}
     if not found:
         parts = " and ".join(dict.fromkeys(recording.part for recording in held))
@@ -188,12 +186,12 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
     return list(found.values())
 
 
-def _check_unchanged(name: str, then: Profile) -> None:
+def _check_unchanged(name: str, then: profiles.Profile) -> None:
     """Raise InvalidValue if the profile no longer says what the numbers rest on; NotFound."""
-    now = load_profile(name)
+    now = profiles.load_profile(name)
     if (now.camera, now.vehicle) != (then.camera, then.vehicle):
         raise InvalidValue(
-            f"{find_profile(name)} has changed since it was read, so nothing was written: "
+            f"{profiles.find_profile(name)} has changed since it was read, so nothing was written: "
             "these numbers depend on its old values; evaluate the recording again with "
             "--from"
         )
@@ -203,14 +201,14 @@ def _check_unchanged(name: str, then: Profile) -> None:
 
 
 def _record_live(
-    profile: Profile,
-    camera: CameraModel,
+    profile: profiles.Profile,
+    camera: visions.CameraModel,
     source: str,
     uri: str | None,
     parts: Sequence[Part],
     log: Path,
     view: bool,
-) -> list[MountingRecording]:
+) -> list[calibrations.MountingRecording]:
     """Record the parts live, also into a file. What was recorded is kept, however it ends.
 
     Args:
@@ -220,18 +218,22 @@ def _record_live(
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
         Those of `open_camera`, `AttitudeLink.connect` and `record_mounting`.
     """
-    recordings: list[MountingRecording] = []
+    from perchctl.commands.progress import guidance_display
+
+    recordings: list[calibrations.MountingRecording] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
-        frames = open_camera(
+        frames = cameras.open_camera(
             source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
         )
         stack.callback(frames.close)
-        check_size(frames.size_px, camera, frames.describe())
+        cameras.check_size(frames.size_px, camera, frames.describe())
         sensors: Sensors = (list, lambda now_s: None)
         if uri is not None:
             sensors = stack.enter_context(_vehicle(uri, profile))
-        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", view, say))
+        page = stack.enter_context(
+            displays.live_page(camera, "perchctl calibrate mount", view, say)
+        )
         stack.callback(_keep, recordings, log)
         for part in parts:
             say(HOW[part])
@@ -239,14 +241,14 @@ def _record_live(
                 with contextlib.suppress(EOFError):  # Ctrl-D goes on as Enter does
                     if ask("press Enter when it is in place:").strip().lower() in NO:
                         raise UsageError("not confirmed: nothing was measured")
-            recording = MountingRecording(part)
+            recording = calibrations.MountingRecording(part)
             recordings.append(recording)
-            reader = PoseReader(profile, camera, frames.live)
+            reader = calibrations.PoseReader(profile, camera, frames.live)
             if frames.live:
                 frames.poll(time.monotonic())  # from before
             with Stopper().as_handler() as stop, guidance_display(page) as show:
                 stopped = stop.requested.is_set
-                record_mounting(
+                calibrations.record_mounting(
                     recording,
                     frames,
                     reader,
@@ -261,10 +263,10 @@ def _record_live(
 
 
 @contextlib.contextmanager
-def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
+def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors
     turn or may turn."""
-    link = AttitudeLink(uri, profile.link, time.monotonic)
+    link = links.AttitudeLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, only to read from it")
     link.connect()
 
@@ -281,14 +283,14 @@ def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
         yield link.samples, problem
 
 
-def _keep(recordings: Sequence[MountingRecording], log: Path) -> None:
+def _keep(recordings: Sequence[calibrations.MountingRecording], log: Path) -> None:
     """Write the recording. Never raises, as its numbers are wanted all the same."""
     held = [recording for recording in recordings if recording.attitudes or recording.poses]
     if not held:
         return
     try:
         with ignore_signals():
-            MountingRecording.write(log, held)
+            calibrations.MountingRecording.write(log, held)
     except InvalidValue as error:
         say(f"the recording was not kept: {error}")
         return

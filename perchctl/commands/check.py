@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
-from perchctl.camera import find_cameras
-from perchctl.check import CheckScope, Row, Verdict, scan_rows
-from perchctl.check import check as check_rows
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import camera as cameras
+from perchctl import check as checks
 from perchctl.commands.command_line import (
     JsonOption,
     ProfileOption,
@@ -23,7 +23,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.fly import resolve_options
 from perchctl.commands.interrupt import ignore_signals, interruptible
-from perchctl.commands.output import say
+from perchctl.commands.output import say, say_on_terminal
 from perchctl.errors import (
     ConnectionFailed,
     Interrupted,
@@ -34,7 +34,12 @@ from perchctl.errors import (
 
 CHECK_COLUMNS = 80
 NAME_WIDTH = 17
-SHOWN = {Verdict.PASS: "pass", Verdict.WARN: "warn", Verdict.FAIL: "FAIL", Verdict.SKIPPED: "skip"}
+SHOWN = {
+    checks.Verdict.PASS: "pass",
+    checks.Verdict.WARN: "warn",
+    checks.Verdict.FAIL: "FAIL",
+    checks.Verdict.SKIPPED: "skip",
+}
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
 """Of a failing row; `SafetyAbort`'s of all others."""
 
@@ -79,18 +84,20 @@ def check(
     20 if the camera gives no picture, and 52 if any other check fails.
     """
     if cameras:
+        say_on_terminal("listing the cameras")
         return print_rows(camera_rows(), as_json)
     if scan:
         say("scanning all channels and rates")
-        return print_rows(scan_rows(uri), as_json)
+        return print_rows(checks.scan_rows(uri), as_json)
+    say_on_terminal(f"reading profile {profile}")
     options = resolve_options(profile, uri, source)
-    scope = CheckScope(with_lift=lift, announce=say)
-    return print_rows(check_rows(options, scope), as_json)
+    scope = checks.CheckScope(with_lift=lift, announce=say)
+    return print_rows(checks.check(options, scope), as_json)
 
 
-def print_rows(rows: Iterable[Row], as_json: bool) -> int:
+def print_rows(rows: Iterable[checks.Row], as_json: bool) -> int:
     """Print the rows, also those before a Ctrl-C or an error; return the exit code."""
-    found: list[Row] = []
+    found: list[checks.Row] = []
     interrupted = False
     try:
         with interruptible():
@@ -113,28 +120,28 @@ def print_rows(rows: Iterable[Row], as_json: bool) -> int:
     return exit_code(found)
 
 
-def exit_code(rows: Sequence[Row]) -> int:
+def exit_code(rows: Sequence[checks.Row]) -> int:
     """Return the exit code of the first failing row; 0 if nothing fails."""
     for row in rows:
-        if row.verdict is Verdict.FAIL:
+        if row.verdict is checks.Verdict.FAIL:
             return EXIT_CODE_OF.get(row.name, SafetyAbort.exit_code)
     return 0
 
 
-def format_rows(rows: Sequence[Row], finished: bool = True) -> str:
+def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. An
     unfinished check gets no positive summary."""
     lines = [line for row in rows for line in _lines(row)]
-    counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
+    counts = {v: sum(row.verdict is v for row in rows) for v in checks.Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
-    failing = [row.name for row in rows if row.verdict is Verdict.FAIL]
+    failing = [row.name for row in rows if row.verdict is checks.Verdict.FAIL]
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
         ends.append("not finished, the other checks were not made")
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 
-def _lines(row: Row) -> list[str]:
+def _lines(row: checks.Row) -> list[str]:
     head = f"{SHOWN[row.verdict]}  {row.name:<{NAME_WIDTH}}"
     margin = " " * len(head)
     lines = _wrapped(row.found, head, margin) or [head.rstrip()]
@@ -152,13 +159,13 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 # --- `perchctl check --cameras`: what this computer's cameras are called ---
 
 
-def camera_rows() -> Iterator[Row]:
+def camera_rows() -> Iterator[checks.Row]:
     """Yield a row for each camera; nothing is set, no picture taken. Errors: NotFound if none."""
-    for camera in find_cameras():
+    for camera in cameras.find_cameras():
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
         if camera.problem:
             advice = "get permission to open it, for example by joining the group video"
-            yield Row(source, Verdict.WARN, f"{found}: {camera.problem}", advice)
+            yield checks.Row(source, checks.Verdict.WARN, f"{found}: {camera.problem}", advice)
         else:
-            yield Row(source, Verdict.PASS, found)
+            yield checks.Row(source, checks.Verdict.PASS, found)

@@ -8,11 +8,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import typer
 
-from perchctl.calibration import profile_camera
-from perchctl.camera import open_camera
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import positioning as positionings
+from perchctl import profile as profiles
+from perchctl import vision as visions
+from perchctl import weights
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -22,23 +26,9 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import add_problem, ask, print_result, say
-from perchctl.commands.progress import count_bar
+from perchctl.commands.output import add_problem, ask, print_result, say, say_on_terminal
 from perchctl.errors import PerchError, UsageError
 from perchctl.files import check_output, same_file
-from perchctl.positioning import open_capture
-from perchctl.profile import Profile, load_profile
-from perchctl.vision import CameraModel
-from perchctl.weights import (
-    Experiment,
-    MocapPoses,
-    SessionFile,
-    TypedPoses,
-    fit_weights,
-    report_text,
-    weights_record,
-    write_weights,
-)
 
 app = new_app(Group)
 
@@ -80,15 +70,16 @@ def fit(
         if same_file(output, data):
             raise UsageError(f"{output} is the data file itself; write the result to another file")
         check_output(output, (".yaml", ".yml"), force)
-    result = fit_weights(data, method, test)
+    say_on_terminal(f"reading {data}")
+    result = weights.fit_weights(data, method, test)
     if not as_json:
-        print(report_text(result), flush=True)
+        print(weights.report_text(result), flush=True)
     problem: PerchError | None = None
     if output is None:
         say("no file written: name one with -o")
     elif any(result.is_proven_better) or anyway:
         date = datetime.now(UTC).isoformat(timespec="seconds")
-        write_weights(output, result, date, anyway=anyway)
+        weights.write_weights(output, result, date, anyway=anyway)
         say(
             f"weights: {output}; to fly with them, set merge.method: weights and merge.weights_file"
         )
@@ -101,7 +92,9 @@ def fit(
         say(str(problem))
     if as_json:
         written = None if problem or output is None else str(output)
-        print_result(add_problem(weights_record(result) | {"weights_file": written}, problem))
+        print_result(
+            add_problem(weights.weights_record(result) | {"weights_file": written}, problem)
+        )
     return 0 if problem is None else problem.exit_code
 
 
@@ -140,19 +133,20 @@ def collect(
     motion capture measures that pose. With --truth sim, the simulator places the camera at seeded
     positions. To continue a stopped session, run the same command again.
     """
-    config = load_profile(profile, with_weights=False)
-    camera = profile_camera(config.camera)
+    say_on_terminal(f"reading profile {profile}")
+    config = profiles.load_profile(profile, with_weights=False)
+    camera = calibrations.profile_camera(config.camera)
     if truth == "sim":
         _collect_simulated(session, config, camera, positions, frames, seed)
     else:
-        poses = TypedPoses() if truth == "typed" else _open_capture(config, target_body)
+        poses = weights.TypedPoses() if truth == "typed" else _open_capture(config, target_body)
         with closing(poses):
             _collect_with_person(session, config, camera, positions, frames, poses, source)
     say(f"{session} is complete: perchctl fit-weights {session} -o weights.yaml fits the weights")
 
 
-def _open_session(path: Path, frames: int) -> SessionFile:
-    session = SessionFile(path, frames)
+def _open_session(path: Path, frames: int) -> weights.SessionFile:
+    session = weights.SessionFile(path, frames)
     if session.note:
         say(session.note)
     if session.done:
@@ -161,8 +155,14 @@ def _open_session(path: Path, frames: int) -> SessionFile:
 
 
 def _collect_simulated(
-    path: Path, profile: Profile, camera: CameraModel, positions: int, frames: int, seed: int
+    path: Path,
+    profile: profiles.Profile,
+    camera: visions.CameraModel,
+    positions: int,
+    frames: int,
+    seed: int,
 ) -> None:
+    from perchctl.commands.progress import count_bar
     from perchctl.weights import SimulatedStand
 
     session = _open_session(path, frames)
@@ -172,11 +172,11 @@ def _collect_simulated(
 
 def _collect_with_person(
     path: Path,
-    profile: Profile,
-    camera: CameraModel,
+    profile: profiles.Profile,
+    camera: visions.CameraModel,
     positions: int,
     frames: int,
-    poses: TypedPoses | MocapPoses,
+    poses: weights.TypedPoses | weights.MocapPoses,
     source: str | None,
 ) -> None:
     spec = profile.camera.source if source is None else source
@@ -185,9 +185,11 @@ def _collect_with_person(
             "the simulator knows the ground truth: add --truth sim, or name a real camera "
             "with --source (camera:N, http://..., aideck://HOST)"
         )
-    opened = open_camera(spec, time.monotonic, profile.camera, size_px=camera.size_px)
+    from perchctl.commands.progress import count_bar
+
+    opened = cameras.open_camera(spec, time.monotonic, profile.camera, size_px=camera.size_px)
     with closing(opened) as frame_source:
-        experiment = Experiment(
+        experiment = weights.Experiment(
             _open_session(path, frames),
             frame_source,
             profile,
@@ -202,12 +204,16 @@ def _collect_with_person(
         experiment.run(positions, frames)
 
 
-def _open_capture(profile: Profile, target_body: str) -> MocapPoses:
+def _open_capture(profile: profiles.Profile, target_body: str) -> weights.MocapPoses:
     """Return the profile's motion capture, connected. Errors: UsageError, those of connecting."""
     if not profile.positioning.source.is_mocap:
         raise UsageError(
             "--truth mocap needs a profile with its motion capture, as in "
             "positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: cf}"
         )
+    import numpy as np
+
     gear = np.asarray(profile.vehicle.gear_body_m, dtype=np.float64)
-    return MocapPoses(open_capture(profile.positioning), profile.positioning, target_body, gear)
+    return weights.MocapPoses(
+        positionings.open_capture(profile.positioning), profile.positioning, target_body, gear
+    )

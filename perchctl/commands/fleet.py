@@ -13,10 +13,11 @@ from typing import Annotated, Any
 
 import typer
 
-# By their packages, whose names load as they are used: the help needs no simulator.
+# By their packages, whose names load as they are used: the first word needs none of them.
 from perchctl import campaign as campaigns
+from perchctl import check as checks
 from perchctl import fleet as fleets
-from perchctl.check import CheckScope, Row
+from perchctl import flight as flights
 from perchctl.commands.check import exit_code as rows_exit_code
 from perchctl.commands.check import format_rows
 from perchctl.commands.command_line import (
@@ -36,6 +37,7 @@ from perchctl.commands.output import (
     print_lines,
     print_result,
     say,
+    say_on_terminal,
 )
 from perchctl.commands.simulate import (
     ClusterOption,
@@ -47,7 +49,6 @@ from perchctl.commands.simulate import (
 )
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
-from perchctl.flight import FlyOptions
 
 PLAN_COLUMNS = 80
 PICTURE = "how the room is drawn"
@@ -96,6 +97,7 @@ def check(
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
+    _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     refusal: InvalidValue | None = None
     plan: fleets.FleetPlan | None = None
@@ -129,8 +131,8 @@ def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
         )
     if not as_json:
         print_result(plan_text(plan))
-    found: dict[str, list[Row]] = {vehicle.name: [] for vehicle in plan.fleet.vehicles}
-    rows = fleets.identify_fleet(plan, CheckScope(announce=say), ask_to_confirm)
+    found: dict[str, list[checks.Row]] = {vehicle.name: [] for vehicle in plan.fleet.vehicles}
+    rows = fleets.identify_fleet(plan, checks.CheckScope(announce=say), ask_to_confirm)
     try:
         with interruptible():
             for name, row in rows:
@@ -152,7 +154,7 @@ def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
     return code
 
 
-def _identity_text(found: dict[str, list[Row]], *, finished: bool) -> str:
+def _identity_text(found: dict[str, list[checks.Row]], *, finished: bool) -> str:
     return "\n".join(
         f"\n{name}\n{format_rows(rows, finished=finished)}" for name, rows in found.items() if rows
     )
@@ -169,8 +171,9 @@ def _identity_text(found: dict[str, list[Row]], *, finished: bool) -> str:
 def fly(
     file: FleetArgument = None,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Seed of the simulated fleet.")
-    ] = FlyOptions.seed,
+        int | None,
+        typer.Option("--seed", min=0, help="Seed of the simulated fleet. Default: 11."),
+    ] = None,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight's own folder.")
     ] = None,
@@ -197,6 +200,7 @@ def fly(
     stay. Press it again to cut the motors. The space bar cuts the motors at once. The key with a
     vehicle's number lands that one. The exit code is 0 only if all vehicles hang.
     """
+    _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     try:
         plan = fleets.make_plan(loaded)
@@ -205,7 +209,12 @@ def fly(
             print_lines(fleets.draw_text(loaded))
         raise InvalidValue(f"{loaded.path}: {error}") from None
     settings = FleetSettings(
-        seed=seed, log_dir=log_dir, record=record, yes=yes, as_json=as_json, view=view
+        seed=flights.FlyOptions.seed if seed is None else seed,
+        log_dir=log_dir,
+        record=record,
+        yes=yes,
+        as_json=as_json,
+        view=view,
     )
     if not dry_run:
         return fly_fleet(plan, settings)
@@ -219,6 +228,10 @@ def fly(
         return 0
     say(f"fly would refuse this: {refused}")
     return refused.exit_code
+
+
+def _say_reading(file: str | None) -> None:
+    say_on_terminal("reading the example fleet" if file is None else f"reading fleet {file}")
 
 
 def plan_text(plan: fleets.FleetPlan) -> str:
@@ -300,8 +313,9 @@ def simulate(
         return _list_fleet_faults(as_json)
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
-    names = () if faults is None else fleets.select_fleet_faults(faults)
+    _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
+    names = () if faults is None else fleets.select_fleet_faults(faults)
     try:
         plan = fleets.make_plan(loaded)
     except InvalidValue as error:
@@ -340,6 +354,7 @@ def simulate(
 
 
 def _list_fleet_faults(as_json: bool) -> int:
+    say_on_terminal("listing the faults")
     faults = fleets.fleet_faults()
     table = "\n".join(campaigns.align_columns(list(faults.items())))
     print_result({"faults": faults} if as_json else table)
@@ -371,6 +386,7 @@ def convert(
     Targets and cameras are not in these lists: you add them to the fleet file.
     """
     check_output(output, (".yaml", ".yml"), force, "what a fleet file is")
+    say_on_terminal(f"reading {file}")
     found = fleets.convert_fleet(file)
     write_files({output: found.text().encode()})
     if found.skipped:

@@ -14,9 +14,16 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from perchctl.calibration import profile_camera
-from perchctl.camera import profile_record, without_password
-from perchctl.check import Verdict, comparison_rows, profile_rows, warnings_before_flight
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import check as checks
+from perchctl import display as displays
+from perchctl import flight as flights
+from perchctl import mission as missions
+from perchctl import profile as profiles
+from perchctl import record as records
+from perchctl import target as targets
 from perchctl.commands.command_line import (
     EXIT_TABLE,
     JsonOption,
@@ -35,43 +42,16 @@ from perchctl.commands.output import (
     print_lines,
     print_result,
     say,
+    say_on_terminal,
     stdin_number,
 )
 from perchctl.commands.profile import front_left_edges
-from perchctl.display import (
-    FlightPage,
-    FlightPanel,
-    live_page,
-)
 from perchctl.errors import (
     EXIT_CODES,
     InvalidValue,
     PerchError,
     UsageError,
 )
-from perchctl.flight import (
-    KEY_HELP,
-    STOP_HELP,
-    FlyOptions,
-    OperatorSwitch,
-    check_options,
-    cut_key,
-    fly_session,
-    operator_signals,
-)
-from perchctl.mission import FlightReport, Phase, Watcher
-from perchctl.profile import (
-    PositioningConfig,
-    Profile,
-    find_calibration,
-    find_mask,
-    find_profile,
-    load_profile,
-)
-from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
-from perchctl.target import mm_text, overhead_text
-
-POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
 
 app = new_app()
 
@@ -116,6 +96,7 @@ def fly(
     Without options, perchctl flies the simulated vehicle. Press Ctrl-C to land. Press it again to
     cut the motors. The space bar cuts the motors at once.
     """
+    say_on_terminal(f"reading profile {profile}")
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
         refused = plan_problem(options)
@@ -124,7 +105,7 @@ def fly(
             return 0
         say(f"fly would refuse this: {refused}")
         return refused.exit_code
-    for warning in warnings_before_flight(options):
+    for warning in checks.warnings_before_flight(options):
         say(f"check: {warning}")
     options.require_lift_check()
     asks = not (yes or options.simulated)
@@ -144,34 +125,40 @@ def resolve_options(
     seed: int | None = None,
     log_dir: Path | None = None,
     record: bool | None = None,
-) -> FlyOptions:
+) -> flights.FlyOptions:
     """Merge the command line's options (None: not given) with the profile. Errors: NotFound,
     InvalidValue, UsageError."""
-    profile = with_positioning(load_profile(profile_name), positioning)
-    options = FlyOptions(
+    profile = with_positioning(profiles.load_profile(profile_name), positioning)
+    options = flights.FlyOptions(
         profile=profile,
-        profile_path=find_profile(profile_name),
+        profile_path=profiles.find_profile(profile_name),
         # An empty URI or source is an unset shell variable: not the profile's, but an error.
         uri=profile.link.uri if uri is None else uri,
         source=profile.camera.source if source is None else source,
-        seed=FlyOptions.seed if seed is None else seed,
+        seed=flights.FlyOptions.seed if seed is None else seed,
         log_dir=log_dir or Path(profile.log.directory),
     )
     options = replace(options, record=not options.simulated if record is None else record)
-    check_options(options)
+    flights.check_options(options)
     return options
 
 
-def with_positioning(profile: Profile, method: str | None) -> Profile:
+def with_positioning(profile: profiles.Profile, method: str | None) -> profiles.Profile:
     """Return the profile with the `--positioning` method; unchanged for None. Errors:
     InvalidValue."""
     if method is None:
         return profile
-    if method not in POSITIONINGS:
+    if method not in positioning_methods():
         raise InvalidValue(
-            f"--positioning {method!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
+            f"--positioning {method!r} is unknown; allowed are {', '.join(positioning_methods())}"
         )
     return profile.with_({"positioning.by": method})
+
+
+def positioning_methods() -> tuple[str, ...]:
+    """Return the methods that `--positioning` accepts."""
+    methods: tuple[str, ...] = get_args(profiles.PositioningConfig.model_fields["by"].annotation)
+    return methods
 
 
 def ask_before_arming(uri: str) -> None:
@@ -180,11 +167,13 @@ def ask_before_arming(uri: str) -> None:
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool = False) -> int:
+def fly_and_report(
+    options: flights.FlyOptions, as_json: bool, view: bool, confirm: bool = False
+) -> int:
     """Fly, log, plot and report how the flight ended; return the exit code. `view`: open the live
     page; `confirm`: ask on the terminal before arming."""
     simulated_seed = options.seed if options.simulated else None
-    log = LogWatcher.open_real_time(
+    log = records.LogWatcher.open_real_time(
         options.log_dir,
         options.profile,
         options.uri,
@@ -192,9 +181,9 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
         simulated_seed,
         options.record,
     )
-    panel = FlightPanel(sys.stderr)
+    panel = displays.FlightPanel(sys.stderr)
     say(f"connecting to {options.uri}")
-    switch, page = OperatorSwitch(), None
+    switch, page = flights.OperatorSwitch(), None
     detached: tuple[str, ...] = ()
     # Once it has landed nothing is left to stop, but much to tell.
     with ignore_signals(), contextlib.ExitStack() as stack:
@@ -215,7 +204,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
                 say(panel.failure)
             for sentence in detached:
                 say(sentence)
-        summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
+        summary = log.close(report, miss_m if report.phase is missions.Phase.PERCHED else None)
         assert summary is not None
         written = print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
@@ -229,17 +218,17 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
     return code
 
 
-def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
+def draw_flight_plot(log_path: Path, profile: profiles.Profile) -> Path | None:
     """Plot the flight beside its log if the profile asks for it, and return the plot's path. A plot
     that fails or is interrupted is only a warning."""
     if not profile.log.plot:
         return None
-    picture = path_beside(log_path, ".png")
+    picture = records.path_beside(log_path, ".png")
     try:
         with interruptible():
             from perchctl.analysis import plot_flight
 
-            plot_flight(read_log(log_path), picture)
+            plot_flight(records.read_log(log_path), picture)
     except (Exception, KeyboardInterrupt) as error:
         say(f"the plot could not be drawn: {str(error) or 'Ctrl-C'}")
         return None
@@ -247,7 +236,7 @@ def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
 
 
 def flight_record(
-    summary: FlightSummary, code: int, log: Path, plot: Path | None
+    summary: records.FlightSummary, code: int, log: Path, plot: Path | None
 ) -> dict[str, Any]:
     """Return the JSON object of `--json`; its `error` is None if flight and log are good."""
     return summary.as_record() | {
@@ -261,43 +250,43 @@ def flight_record(
 
 
 def _session(
-    options: FlyOptions,
-    log: LogWatcher,
-    panel: FlightPanel,
-    switch: OperatorSwitch,
-    page: FlightPage | None,
+    options: flights.FlyOptions,
+    log: records.LogWatcher,
+    panel: displays.FlightPanel,
+    switch: flights.OperatorSwitch,
+    page: displays.FlightPage | None,
     asks: bool,
-) -> tuple[FlightReport, float | None]:
-    watchers: tuple[Watcher, ...] = (log, panel)
+) -> tuple[missions.FlightReport, float | None]:
+    watchers: tuple[missions.Watcher, ...] = (log, panel)
     if page is not None:
         watchers = (*watchers, page)
-    with operator_signals(switch, say), contextlib.ExitStack() as stack:
+    with flights.operator_signals(switch, say), contextlib.ExitStack() as stack:
 
         def before_arming() -> None:
             if asks:
                 ask_before_arming(options.uri)
-            has_key = stack.enter_context(cut_key(switch, stdin_number()))
-            panel.help = STOP_HELP, KEY_HELP if has_key else ""
+            has_key = stack.enter_context(flights.cut_key(switch, stdin_number()))
+            panel.help = flights.STOP_HELP, flights.KEY_HELP if has_key else ""
             print_lines("\n".join(filter(None, panel.help)))
 
-        return fly_session(
+        return flights.fly_session(
             options, watchers, switch, remarks=log.remarks, before_arming=before_arming
         )
 
 
 @contextlib.contextmanager
 def flight_page(
-    options: FlyOptions, view: bool, switch: OperatorSwitch
-) -> Iterator[FlightPage | None]:
+    options: flights.FlyOptions, view: bool, switch: flights.OperatorSwitch
+) -> Iterator[displays.FlightPage | None]:
     """Yield the live page, with its buttons for landing and for cutting the motors; None without
     `view`."""
     if not view:
         yield None
         return
     title = f"perchctl fly {options.uri}"
-    camera = profile_camera(options.profile.camera)
-    with live_page(camera, title, view, say, switch.land, switch.cut) as page:
-        yield None if page is None else FlightPage.of(page, options.profile)
+    camera = calibrations.profile_camera(options.profile.camera)
+    with displays.live_page(camera, title, view, say, switch.land, switch.cut) as page:
+        yield None if page is None else displays.FlightPage.of(page, options.profile)
 
 
 # --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened
@@ -306,22 +295,22 @@ def flight_page(
 _COLUMN, _WIDTH = 13, 80
 
 
-def plan_problem(options: FlyOptions) -> PerchError | None:
+def plan_problem(options: flights.FlyOptions) -> PerchError | None:
     """Return the error with which `fly` would refuse these options, before it opens anything."""
     try:
-        warnings_before_flight(options)
+        checks.warnings_before_flight(options)
         options.require_lift_check()
     except PerchError as error:
         return error
     return None
 
 
-def plan_record(options: FlyOptions) -> dict[str, Any]:
+def plan_record(options: flights.FlyOptions) -> dict[str, Any]:
     """Return what would be flown, fully resolved; nothing is connected."""
-    calibration = find_calibration(options.profile.camera.calibration)
+    calibration = profiles.find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
-    rows = profile_rows(options.profile, source=options.source)
-    compared = comparison_rows(
+    rows = checks.profile_rows(options.profile, source=options.source)
+    compared = checks.comparison_rows(
         options.profile.positioning,
         options.uri,
         datetime.now().astimezone(),
@@ -329,19 +318,19 @@ def plan_record(options: FlyOptions) -> dict[str, Any]:
     )
     return {
         "uri": options.uri,
-        "source": without_password(options.source),
+        "source": cameras.without_password(options.source),
         "seed": options.seed if options.simulated else None,
         "profile_file": str(options.profile_path),
         "calibration_file": str(calibration),
-        "mask_file": None if mask is None else str(find_mask(mask)),
+        "mask_file": None if mask is None else str(profiles.find_mask(mask)),
         "log_directory": str(options.log_dir),
         "record": options.record,
-        "profile": profile_record(options.profile),
+        "profile": cameras.profile_record(options.profile),
         "check": [dataclasses.asdict(row) for row in (*rows, *compared)],
     }
 
 
-def plan_text(options: FlyOptions) -> str:
+def plan_text(options: flights.FlyOptions) -> str:
     """Return the plan as text of 80 columns: vehicle, camera, target, path, and implausible values
     of the profile."""
     resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
@@ -390,7 +379,7 @@ def plan_text(options: FlyOptions) -> str:
     rows += [
         (row["verdict"], f"{row['name']}: {row['found']}; {row['advice']}")
         for row in resolved["check"]
-        if row["verdict"] in (Verdict.WARN, Verdict.FAIL)
+        if row["verdict"] in (checks.Verdict.WARN, checks.Verdict.FAIL)
     ]
     return "\n".join(
         textwrap.fill(
@@ -404,10 +393,12 @@ def plan_text(options: FlyOptions) -> str:
     )
 
 
-def _positioning(options: FlyOptions) -> str:
+def _positioning(options: flights.FlyOptions) -> str:
     profile, config = options.profile, options.profile.positioning
     if config.source.is_target:
-        view = overhead_text(profile.target, profile_camera(profile.camera), profile.camera.mount)
+        view = targets.overhead_text(
+            profile.target, calibrations.profile_camera(profile.camera), profile.camera.mount
+        )
         return f"the target, seen by the camera from the ground: {view}"
     if not config.source.is_mocap:
         return "the vehicle's own deck"
@@ -418,4 +409,4 @@ def _positioning(options: FlyOptions) -> str:
 
 
 def _mm(place_m: tuple[float, float, float]) -> str:
-    return f"{' '.join(mm_text(part) for part in place_m)} mm"
+    return f"{' '.join(targets.mm_text(part) for part in place_m)} mm"

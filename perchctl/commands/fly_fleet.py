@@ -16,8 +16,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-# By its package, whose names load as they are used.
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import display as displays
 from perchctl import fleet as fleets
+from perchctl import flight as flights
 from perchctl.commands.interrupt import ignore_signals
 from perchctl.commands.output import (
     ask_to_confirm,
@@ -26,18 +28,9 @@ from perchctl.commands.output import (
     say,
     stdin_number,
 )
-from perchctl.display import FleetPage, FleetPanel, FleetRow
 from perchctl.errors import EXIT_CODES, Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.extensions import error_at
 from perchctl.files import write_files
-from perchctl.flight import (
-    KEY_HELP,
-    STOP_HELP,
-    FlyOptions,
-    OperatorSwitch,
-    cut_key,
-    operator_signals,
-)
 
 DISPLAY_PERIOD_S = 0.1
 """Between two looks at the vehicles, for display and record. The orders do not wait for it."""
@@ -110,7 +103,7 @@ class FleetSession:
     def __init__(
         self,
         plan: fleets.FleetPlan,
-        options: Mapping[str, FlyOptions],
+        options: Mapping[str, flights.FlyOptions],
         radios: fleets.Radios,
         folder: Path,
         started: datetime,
@@ -120,11 +113,11 @@ class FleetSession:
         self._plan, self._options, self._folder = plan, options, folder
         self._radios = radios
         self._started, self._started_s = started, started_s
-        self._switch = OperatorSwitch()
+        self._switch = flights.OperatorSwitch()
         self._children: dict[str, fleets.VehicleProcess] = {}
-        self._panel: FleetPanel | None = None
+        self._panel: displays.FleetPanel | None = None
         self._has_page = view
-        self._page: FleetPage | None = None
+        self._page: displays.FleetPage | None = None
         self._shown_round = 0
         self._told: dict[str, str] = {}
         self._radio_problems: dict[str, str] = {}
@@ -140,7 +133,7 @@ class FleetSession:
         first take-off as an error of its kind."""
         with ignore_signals(), contextlib.ExitStack() as stack:
             stack.callback(self._close_panel)
-            stack.enter_context(operator_signals(self._switch, say))
+            stack.enter_context(flights.operator_signals(self._switch, say))
             try:
                 coordinator = stack.enter_context(self._coordinated())
                 self._open_page(coordinator, stack)
@@ -187,7 +180,7 @@ class FleetSession:
 
         try:
             name, switch = self._plan.fleet.name, self._switch
-            page = FleetPage(
+            page = displays.FleetPage(
                 f"perchctl fleet fly {name}", len(self._options), switch.land, switch.cut, land_one
             )
         except Exception as error:
@@ -197,7 +190,7 @@ class FleetSession:
         self._page = page
         say(f"live page (with buttons to land and to cut the motors): {page.url}")
 
-    def _update_page(self, update: Callable[[FleetPage], None]) -> None:
+    def _update_page(self, update: Callable[[displays.FleetPage], None]) -> None:
         """Change what the page shows. After an error it is left as it is: its buttons still work,
         and it tells how old it is."""
         if self._page is None:
@@ -249,11 +242,11 @@ class FleetSession:
                     self._answers.append(self._land_by_key(coordinator, int(digit)))
 
         self._switch.listening = True
-        has_keys = stack.enter_context(cut_key(self._switch, stdin_number(), on_keys))
+        has_keys = stack.enter_context(flights.cut_key(self._switch, stdin_number(), on_keys))
         one = f"Press 1 to {self._keys} to land one."
-        help_lines = STOP_HELP, f"{KEY_HELP} {one}" if has_keys else ""
+        help_lines = flights.STOP_HELP, f"{flights.KEY_HELP} {one}" if has_keys else ""
         print_lines("\n".join(filter(None, help_lines)))
-        self._panel = FleetPanel(sys.stderr, help_lines)
+        self._panel = displays.FleetPanel(sys.stderr, help_lines)
         coordinator.confirm()
         while not (coordinator.has_ended or self._is_given_up()):
             self._look(coordinator)
@@ -452,13 +445,13 @@ def _stage_and_reason(view: fleets.VehicleView) -> tuple[str, str]:
     return (status.phase or status.stage).value, status.reason
 
 
-def _row(number: int, view: fleets.VehicleView) -> FleetRow:
+def _row(number: int, view: fleets.VehicleView) -> displays.FleetRow:
     phase, reason = _stage_and_reason(view)
     status = view.status
     silent = view.result is None and view.is_silent
     ended, hangs = view.result is not None, view.result is not None and view.result.hangs
     if status is None:
-        return FleetRow(
+        return displays.FleetRow(
             number=number,
             name=view.name,
             phase=phase,
@@ -466,7 +459,7 @@ def _row(number: int, view: fleets.VehicleView) -> FleetRow:
             has_ended=ended,
             is_silent=silent,
         )
-    return FleetRow(
+    return displays.FleetRow(
         number=number,
         name=view.name,
         phase=phase,

@@ -9,17 +9,11 @@ from typing import Annotated
 
 import typer
 
-# By its package, whose names load as they are used.
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import analysis
 from perchctl import fleet as fleets
-from perchctl.analysis import (
-    FlightAnalysis,
-    FlightComparison,
-    newest_logs,
-    show_record,
-    show_text,
-    write_report,
-)
-from perchctl.analysis import replay as replay_flight
+from perchctl import profile as profiles
+from perchctl import record as records
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -27,17 +21,9 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_result, say
+from perchctl.commands.output import print_result, say, say_on_terminal
 from perchctl.errors import NotFound, ReplayDiffers
 from perchctl.files import check_output, write_files
-from perchctl.profile import Profile, apply_settings, load_profile
-from perchctl.record import (
-    FlightLog,
-    path_beside,
-    read_log,
-    recorded_pictures,
-    wrap_log_errors,
-)
 
 PLOTS = ((".png", ".pdf", ".svg"), "a plot")
 FILMS = ((".mp4", ".gif"), "a film")
@@ -58,9 +44,11 @@ def _log_file(place: Path | None) -> Path:
     """Return the named log, else the newest of the folder (by default that of `fly`), which is
     then printed. Errors: NotFound."""
     if place is not None and not place.is_dir():
+        say_on_terminal(f"reading {place}")
         return place
-    folder = Path(Profile().log.directory) if place is None else place
-    (newest,) = newest_logs(folder, 1)
+    say_on_terminal("looking for the newest log")
+    folder = Path(profiles.Profile().log.directory) if place is None else place
+    (newest,) = analysis.newest_logs(folder, 1)
     say(f"the newest log: {newest}")
     return newest
 
@@ -68,17 +56,17 @@ def _log_file(place: Path | None) -> Path:
 def _place(log: Path, output: Path | None, kind: tuple[tuple[str, ...], str], force: bool) -> Path:
     """Return where to write: `output`, by default beside the log. Errors: InvalidValue."""
     suffixes, content = kind
-    place = output or path_beside(log, suffixes[0])
+    place = output or records.path_beside(log, suffixes[0])
     check_output(place, suffixes, force, content)
     return place
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[FlightLog]:
+def _opened(path: Path) -> Iterator[records.FlightLog]:
     """Yield the log. In the block, which must only read values, an error is the file's.
     Errors: NotFound, InvalidValue."""
-    log = read_log(path)
-    with wrap_log_errors(path):
+    log = records.read_log(path)
+    with records.wrap_log_errors(path):
         yield log
 
 
@@ -97,8 +85,8 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     not hold.
     """
     with _opened(_log_file(file)) as log:
-        analysis = FlightAnalysis(log)
-        print_result(show_record(analysis) if as_json else show_text(analysis))
+        flight = analysis.FlightAnalysis(log)
+        print_result(analysis.show_record(flight) if as_json else analysis.show_text(flight))
 
 
 @command(
@@ -141,8 +129,11 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """List the differences between two flights, and between their profiles."""
+    say_on_terminal(f"reading {one} and {other}")
     with _opened(one) as log, _opened(other) as other_log:
-        found = FlightComparison((FlightAnalysis(log), FlightAnalysis(other_log)))
+        found = analysis.FlightComparison(
+            (analysis.FlightAnalysis(log), analysis.FlightAnalysis(other_log))
+        )
         record, text = found.record(), found.text()
     print_result(record if as_json else text)
 
@@ -212,10 +203,10 @@ def replay(
     with _opened(path) as log:
         wanted = None
         if profile is not None or settings:
-            base = log.flown_profile if profile is None else load_profile(profile)
-            wanted = apply_settings(base, settings or ())
-    is_recorded = pictures and path_beside(path, ".mcap").is_file()
-    found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
+            base = log.flown_profile if profile is None else profiles.load_profile(profile)
+            wanted = profiles.apply_settings(base, settings or ())
+    is_recorded = pictures and records.path_beside(path, ".mcap").is_file()
+    found = analysis.replay(log, records.recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed_keys:
         say("no key differs from the flown profile: this replays the flight as it was flown")
     if as_json:
@@ -269,7 +260,7 @@ def report(
     if output is None and (names or len(logs) > 1):
         output = logs[0].with_name("fleet.html" if names else "session.html")
     place = _place(logs[0], output, PAGES, force)
-    page = write_report(logs, place, with_film, names)
+    page = analysis.write_report(logs, place, with_film, names)
     say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)
 
@@ -316,11 +307,11 @@ def film(
         return
     path = _log_file(file)
     place = _place(path, output, FILMS, force)
-    is_recorded = path_beside(path, ".mcap").is_file()
+    is_recorded = records.path_beside(path, ".mcap").is_file()
     with _opened(path) as log:
-        flight = FlightAnalysis(log)
+        flight = analysis.FlightAnalysis(log)
     from perchctl.analysis import write_film
 
-    pictures = recorded_pictures(path) if is_recorded else None
+    pictures = records.recorded_pictures(path) if is_recorded else None
     write_film(flight, pictures, place, rate_hz, width_px)
     print(f"film:      {place}")

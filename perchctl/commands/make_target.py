@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-from perchctl.calibration import load_calibration
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import profile as profiles
+from perchctl import target as targets
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -16,11 +19,9 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_result
+from perchctl.commands.output import print_result, say_on_terminal
 from perchctl.errors import UsageError
 from perchctl.files import check_output, write_files
-from perchctl.profile import find_calibration, load_profile, writable_profile, write_profile_values
-from perchctl.target import Board, board_pdf, make_design, measured_target, parse_length, target_pdf
 
 PageOption = Annotated[
     str, typer.Option("--page", help="Page size: a4, letter, a3, or a size such as 220x240mm.")
@@ -71,11 +72,12 @@ def sheet(
     By default (sheet), perchctl writes a true-to-size PDF of the profile's target, front and back.
     It first verifies that the markers can be detected.
     """
-    config = load_profile(profile)
-    magnet_m = parse_length(magnet, "--magnet")
+    say_on_terminal(f"reading profile {profile}")
+    config = profiles.load_profile(profile)
+    magnet_m = targets.parse_length(magnet, "--magnet")
     check_output(output, (".pdf",), force, "a sheet to print")
     origin = f"profile {config.name}"
-    write_files({output: target_pdf(config.target, page, magnet_m, origin, config.date)})
+    write_files({output: targets.target_pdf(config.target, page, magnet_m, origin, config.date)})
     print(f"wrote {output}")
     print("print at 100 %, and check that both rulers measure 100 mm")
 
@@ -101,13 +103,14 @@ def board(
     force: ForceOption = False,
 ) -> None:
     """Write a PDF of a calibration board, named as in calibrate --board."""
-    printed = Board.parse(notation)
+    say_on_terminal(f"reading board {notation}")
+    printed = targets.Board.parse(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(
             f"{notation}: a board is printed at its nominal size; leave out :measured="
         )
     check_output(output, (".pdf",), force, "a sheet to print")
-    write_files({output: board_pdf(printed, page)})
+    write_files({output: targets.board_pdf(printed, page)})
     print(f"wrote {output}")
     print("print at 100 %, check that both rulers measure 100 mm, and glue it to something flat")
 
@@ -126,9 +129,12 @@ def design(
     as_json: JsonOption = False,
 ) -> None:
     """Compute the range in which the camera sees each marker, and any gap between them."""
-    config = load_profile(profile)
-    path = find_calibration(camera or config.camera.calibration)
-    found = make_design(config.target, load_calibration(path), blur, config, ceiling)
+    say_on_terminal(f"reading profile {profile}")
+    config = profiles.load_profile(profile)
+    path = profiles.find_calibration(camera or config.camera.calibration)
+    found = targets.make_design(
+        config.target, calibrations.load_calibration(path), blur, config, ceiling
+    )
     record = found.record() | {"target": config.target.model_dump(mode="json")}
     print_result(record if as_json else found.text(str(path)))
 
@@ -153,20 +159,21 @@ def measured(
     """Write the marker sizes that you measured on the print to the profile."""
     if large is None and small is None:
         raise UsageError("no size is given: add --measured-large, --measured-small or both, in mm")
-    config, path = load_profile(profile), writable_profile(profile)
+    say_on_terminal(f"reading profile {profile}")
+    config, path = profiles.load_profile(profile), profiles.writable_profile(profile)
     sides_m = {
-        name: parse_length(text, f"--measured-{name}", bare_unit="mm")
+        name: targets.parse_length(text, f"--measured-{name}", bare_unit="mm")
         for name, text in (("large", large), ("small", small))
         if text is not None
     }
-    found, notes = measured_target(config.target, sides_m)
+    found, notes = targets.measured_target(config.target, sides_m)
     # A marker is written whole, since no base may have it.
     values = {
         f"target.{name}.{key}": value
         for name in sides_m
         for key, value in getattr(found, name).model_dump().items()
     }
-    before = write_profile_values(path, values | {"target.size_sigma": found.size_sigma})
+    before = profiles.write_profile_values(path, values | {"target.size_sigma": found.size_sigma})
     for note in notes:
         print(note)
     print(f"changed {path}; the old version is in {before}")

@@ -22,6 +22,14 @@ def say(sentence: str) -> None:
     print_lines(f"perchctl: {sentence}")
 
 
+def say_on_terminal(sentence: str) -> None:
+    """Print a sentence for a person who waits: what a command does first, before it loads the
+    libraries that do it, which takes a second and more. In a pipe or a file nobody waits."""
+    with contextlib.suppress(OSError, ValueError):
+        if sys.stderr.isatty():
+            say(sentence)
+
+
 def print_lines(text: str, stdout: bool = False) -> bool:
     """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Returns
     False if a result on stdout is lost, as on a full disk."""

@@ -9,14 +9,17 @@ import math
 import re
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from perchctl.analysis import profile_differences
-from perchctl.calibration import load_calibration
-from perchctl.camera import parse_source, profile_record, without_password
-from perchctl.check import Verdict, profile_rows
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import analysis
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import check as checks
+from perchctl import link as links
+from perchctl import profile as profiles
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -25,23 +28,13 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import NO, ask, print_lines, print_result, say
+from perchctl.commands.output import NO, ask, print_lines, print_result, say, say_on_terminal
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.extensions import is_extension
 from perchctl.files import check_output, write_files
-from perchctl.geometry import Array
-from perchctl.link import check_uri, is_own_uri
-from perchctl.profile import (
-    Mounting,
-    Profile,
-    apply_settings,
-    find_calibration,
-    find_profile,
-    json_schema,
-    load_profile,
-    profile_text,
-    profile_value,
-)
+
+if TYPE_CHECKING:
+    from perchctl.geometry import Array
 
 app = new_app(Group)
 
@@ -59,23 +52,27 @@ def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
     perchctl prints the value, unit, bounds and meaning of each key, and warns about implausible
     values.
     """
-    loaded = load_profile(profile)
+    say_on_terminal(f"reading profile {profile}")
+    loaded = profiles.load_profile(profile)
     if as_json:
         record = {
-            "profile_file": str(find_profile(profile)),
-            "profile": profile_record(loaded),
-            "check": [dataclasses.asdict(row) for row in profile_rows(loaded)],
+            "profile_file": str(profiles.find_profile(profile)),
+            "profile": cameras.profile_record(loaded),
+            "check": [dataclasses.asdict(row) for row in checks.profile_rows(loaded)],
         }
         print_result(record)
         return 0
-    print(profile_text(Profile.model_validate(profile_record(loaded))), end="")
+    print(
+        profiles.profile_text(profiles.Profile.model_validate(cameras.profile_record(loaded))),
+        end="",
+    )
     _say_doubts(loaded)
     return 0
 
 
-def _say_doubts(profile: Profile) -> None:
-    for row in profile_rows(profile):
-        if row.verdict in (Verdict.WARN, Verdict.FAIL):
+def _say_doubts(profile: profiles.Profile) -> None:
+    for row in checks.profile_rows(profile):
+        if row.verdict in (checks.Verdict.WARN, checks.Verdict.FAIL):
             say(f"{row.name}: {row.found}; {row.advice}")
 
 
@@ -189,6 +186,7 @@ def new(
     say at which edge of the picture it appears.
     """
     check_output(output, (".yaml", ".yml"), force, "a profile")
+    say_on_terminal("reading the shipped profiles")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
     profile_and_keys(given, output.stem)  # before anything is asked
     answers = dict(given)
@@ -202,7 +200,7 @@ def new(
         answers = ask_questions(given)
     profile, keys = profile_and_keys(answers, output.stem)
     shown = shlex.quote(str(output))
-    write_files({output: (HEAD.format(name=shown) + profile_text(profile, keys)).encode()})
+    write_files({output: (HEAD.format(name=shown) + profiles.profile_text(profile, keys)).encode()})
     if profile.camera.mirrored:
         say(
             f"camera: with the front at its {answers['front']} and the left side at its "
@@ -210,7 +208,7 @@ def new(
             "which flips each picture before use; if it is not mirrored, answer both "
             "questions again"
         )
-    _say_doubts(load_profile(str(output.absolute())))
+    _say_doubts(profiles.load_profile(str(output.absolute())))
     print(f"wrote {output}\ncheck the plan: perchctl fly -p {shown} --dry-run")
 
 
@@ -220,7 +218,7 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "camera.source" and uri.startswith(SIMULATED):
         return "sim:"
     if name == "camera.calibration" and _is_aideck(source):
-        return load_profile("aideck").camera.calibration
+        return profiles.load_profile("aideck").camera.calibration
     made = sorted(Path("calib").glob("camera_*.yaml"), key=lambda path: path.stat().st_mtime)
     if name == "camera.calibration" and made and not source.startswith("sim:"):
         return str(made[-1])
@@ -318,7 +316,7 @@ def answers_text(answers: Answers) -> str:
 
 def profile_and_keys(
     answers: Answers, name: str, option: str = "--set"
-) -> tuple[Profile, set[str]]:
+) -> tuple[profiles.Profile, set[str]]:
     """Return the profile of these answers, with defaults for the others, and the keys to write to
     its file. Raises NotFound, InvalidValue, UsageError, each with the key and, if the answers come
     from the command line, with the `option`."""
@@ -328,28 +326,36 @@ def profile_and_keys(
     if (calibration := texts.get("camera.calibration")) is not None:
         path = Path(calibration).expanduser()
         texts["camera.calibration"] = str(path.resolve()) if path.is_file() else calibration
-        load_calibration(find_calibration(texts["camera.calibration"]))
-    if (uri := texts.get("link.uri")) is not None and not (is_own_uri(uri) and is_extension(uri)):
-        check_uri(uri)
+        calibrations.load_calibration(profiles.find_calibration(texts["camera.calibration"]))
+    if (uri := texts.get("link.uri")) is not None and not (
+        links.is_own_uri(uri) and is_extension(uri)
+    ):
+        links.check_uri(uri)
     if "camera.source" in texts:
-        parse_source(texts["camera.source"])
+        cameras.parse_source(texts["camera.source"])
     if texts.get("camera.source") == "camera:":
         raise InvalidValue("camera.source: found camera:; write camera:N or camera:NAME")
     source = texts.get("camera.source", "")
     derived = {"name": name, **_mount_keys(answers), **_height_keys(answers)}
     if source:
         uri = texts.get("link.uri", SIMULATED)
-        derived["description"] = f"a vehicle at {uri}, its camera at {without_password(source)}"
+        derived["description"] = (
+            f"a vehicle at {uri}, its camera at {cameras.without_password(source)}"
+        )
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
     # An AI-deck's few and late pictures need more than their calibration.
-    base = load_profile("aideck") if _is_aideck(source) else Profile()
-    shipped = profile_differences(*(p.model_dump(mode="json") for p in (Profile(), base)))
+    base = profiles.load_profile("aideck") if _is_aideck(source) else profiles.Profile()
+    shipped = analysis.profile_differences(
+        *(p.model_dump(mode="json") for p in (profiles.Profile(), base))
+    )
     settings = {key: json.dumps(value) for key, value in derived.items()}
     for key, text in texts.items():
-        is_text = isinstance(profile_value(Profile(), key), str)
+        is_text = isinstance(profiles.profile_value(profiles.Profile(), key), str)
         settings[key] = json.dumps(text) if is_text else text
-    profile = apply_settings(base, [f"{key}={text}" for key, text in settings.items()], option)
+    profile = profiles.apply_settings(
+        base, [f"{key}={text}" for key, text in settings.items()], option
+    )
     return profile, {*settings, *shipped, *SHOWN_KEYS} - {"name"}
 
 
@@ -380,7 +386,7 @@ def _height_keys(answers: Answers) -> dict[str, Any]:
         raise InvalidValue(
             f"ceiling: found {answers['ceiling']!r}; allowed are {low_m:g} to {high_m:g} m"
         )
-    default = Profile().planner
+    default = profiles.Profile().planner
     low_search_m = min(LOW_SEARCH_M, ceiling_m - NEAR_SIGHT_M)
     search_m = round(max(low_search_m, ceiling_m - FAR_SIGHT_M), 2)
     most_m = round(ceiling_m + OVER_THE_CEILING_M, 2)
@@ -406,7 +412,8 @@ def _is_aideck(source: str) -> bool:
 )
 def schema() -> None:
     """Print the JSON schema of profiles, so that your editor can complete and explain keys."""
-    print(json.dumps(json_schema(), indent=2))
+    say_on_terminal("listing the keys of a profile")
+    print(json.dumps(profiles.json_schema(), indent=2))
 
 
 # --- How a camera is turned, in words: which edge of its picture is the vehicle's front ---
@@ -446,7 +453,7 @@ def yaw_deg_and_mirrored(front: str, left: str) -> tuple[float, bool]:
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored
 
 
-def front_left_edges(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
+def front_left_edges(mount: profiles.Mounting, mirrored: bool) -> tuple[str, str] | None:
     """Return the edges of the raw picture at the vehicle's front and left side; None for a camera
     that does not look up, or whose yaw is near an odd multiple of 45 deg."""
     R_cam_body = mount.T_body_cam[:3, :3].T

@@ -23,8 +23,9 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.calibration import GuidedFrame
-from perchctl.display import LivePage, Sketch
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import display as displays
 
 _WHOLE_RUN_S = 1e6
 """Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
@@ -109,8 +110,8 @@ _GUIDE_HZ = 8
 
 @contextlib.contextmanager
 def guidance_display(
-    page: LivePage | None, stream: TextIO | None = None
-) -> Iterator[Callable[[GuidedFrame], None]]:
+    page: displays.LivePage | None, stream: TextIO | None = None
+) -> Iterator[Callable[[calibrations.GuidedFrame], None]]:
     """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as one line
     per change, and on the page if there is one."""
     console = Console(file=stream or sys.stderr)
@@ -122,7 +123,7 @@ def guidance_display(
             )
         last_line = ""
 
-        def show(guided: GuidedFrame) -> None:
+        def show(guided: calibrations.GuidedFrame) -> None:
             nonlocal last_line
             if table is not None:
                 table.update(_table(guided))
@@ -131,13 +132,13 @@ def guidance_display(
                 line = f"perchctl: {guided.status_line}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             if page is not None:
-                page.show(Sketch(guided.image, guided.outlines))
+                page.show(displays.Sketch(guided.image, guided.outlines))
                 page.set_state(lambda: page_state(guided))
 
         yield show
 
 
-def _table(guided: GuidedFrame) -> Table:
+def _table(guided: calibrations.GuidedFrame) -> Table:
     table = Table.grid(padding=(0, 1))
     for name, text, bar in guided.rows:
         if bar is None:
@@ -155,7 +156,7 @@ def _table(guided: GuidedFrame) -> Table:
     return table
 
 
-def page_state(guided: GuidedFrame) -> dict[str, Any]:
+def page_state(guided: calibrations.GuidedFrame) -> dict[str, Any]:
     """Return the state of the live page: rows (some with a bar) and headline."""
     rows = [[name, text, bar and asdict(bar)] for name, text, bar in guided.rows]
     return {"rows": rows, "phase": guided.advice}

@@ -17,10 +17,11 @@ from typing import Annotated, Any
 
 import typer
 
-# By their packages, whose names load as they are used: the help needs no simulator.
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import analysis
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
-from perchctl.analysis import profile_differences
+from perchctl import profile as profiles
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -32,8 +33,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.fly import with_positioning
 from perchctl.commands.interrupt import handle_signals
-from perchctl.commands.output import add_problem, print_result, say
-from perchctl.commands.progress import progress_bar
+from perchctl.commands.output import add_problem, print_result, say, say_on_terminal
 from perchctl.errors import (
     Interrupted,
     LogIncomplete,
@@ -41,7 +41,6 @@ from perchctl.errors import (
     UsageError,
     no_cluster,
 )
-from perchctl.profile import Profile, load_profile
 
 CAMPAIGN_SAME_PRESS_S = 0.5
 """A second Ctrl-C counts from here on; presses closer together are one."""
@@ -124,7 +123,8 @@ def run(
         )
     if resume and out is None:
         raise UsageError("--resume continues a file of results: name it with --out")
-    flown = with_positioning(load_profile(profile), positioning)
+    say_on_terminal(f"reading profile {profile}")
+    flown = with_positioning(profiles.load_profile(profile), positioning)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = range(seed, seed + flights)
@@ -213,8 +213,9 @@ def compare(
 ) -> int:
     """Fly every seed with two profiles, and report which differences are significant."""
     names = (profile_a, profile_b)
-    profiles = [with_positioning(load_profile(name), positioning) for name in names]
-    keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
+    say_on_terminal(f"reading profiles {profile_a} and {profile_b}")
+    pair = [with_positioning(profiles.load_profile(name), positioning) for name in names]
+    keys = analysis.profile_differences(*(p.model_dump(mode="json") for p in pair))
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
     def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
@@ -230,7 +231,7 @@ def compare(
         if not keys:
             print("the profiles do not differ")
 
-    return _fly_by_each(profiles, range(seed, seed + flights), jobs, cluster, report)
+    return _fly_by_each(pair, range(seed, seed + flights), jobs, cluster, report)
 
 
 @command(
@@ -253,7 +254,10 @@ def sweep(
     as_json: JsonOption = False,
 ) -> int:
     """Fly the same seeds with several values of a profile key, and report the best."""
-    asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
+    say_on_terminal(f"reading profile {profile}")
+    asked = campaigns.make_sweep(
+        with_positioning(profiles.load_profile(profile), positioning), values
+    )
 
     def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
         record = asked.record(results)
@@ -263,7 +267,7 @@ def sweep(
 
 
 def _fly_by_each(
-    profiles: Sequence[Profile],
+    flown: Sequence[profiles.Profile],
     seeds: Sequence[int],
     jobs: int | None,
     cluster: str | None,
@@ -271,10 +275,10 @@ def _fly_by_each(
 ) -> int:
     with handle_signals(stop_handler()):
         return run_campaign(
-            lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
+            lambda executor, note: campaigns.fly_variants(flown, seeds, executor, note),
             report,
-            len(profiles) * len(seeds),
-            make_executor(jobs, cluster, profiles, len(profiles) * len(seeds)),
+            len(flown) * len(seeds),
+            make_executor(jobs, cluster, flown, len(flown) * len(seeds)),
         )
 
 
@@ -282,10 +286,10 @@ def _fly_by_each(
 
 
 def make_executor(
-    jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
+    jobs: int | None, cluster: str | None, flown: Sequence[profiles.Profile], flights: int
 ) -> AbstractContextManager[Executor]:
     """Return a campaign's executor: processes here, or a cluster's workers, which must have the
-    files of `profiles`. Errors: UsageError."""
+    files of `flown`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -300,7 +304,7 @@ def make_executor(
             from perchctl.campaign import cluster_pool
     except ImportError as error:
         raise no_cluster(str(error)) from error
-    return cluster_pool(cluster, profiles)
+    return cluster_pool(cluster, flown)
 
 
 def run_campaign(
@@ -321,6 +325,8 @@ def run_campaign(
     writes each new one. `find_error` returns an error of the results as a whole, or None.
     Errors: PerchError if none was flown.
     """
+    from perchctl.commands.progress import progress_bar
+
     results = list(earlier)
     problem: PerchError | None = None
     begun = False
@@ -393,6 +399,7 @@ def log_error(results: Sequence[campaigns.CampaignFlight]) -> PerchError | None:
 
 
 def _list_faults(as_json: bool) -> int:
+    say_on_terminal("listing the faults")
     faults = {fault.name: fault.description for fault in fault_campaigns.FAULTS}
     table = "\n".join(campaigns.align_columns(list(faults.items())))
     print_result({"faults": faults} if as_json else table)

@@ -14,23 +14,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-import cv2
-import numpy as np
 import typer
 
-from perchctl.calibration import load_calibration
-from perchctl.camera import (
-    FrameSource,
-    RecordedSource,
-    WrappedSource,
-    check_size,
-    open_camera,
-    parse_source,
-    without_password,
-)
+# By their packages, whose names load as they are used: the first word needs none of them.
+from perchctl import calibration as calibrations
+from perchctl import camera as cameras
+from perchctl import display as displays
+from perchctl import profile as profiles
+from perchctl import vision as visions
 from perchctl.commands.command_line import (
     JsonOption,
     ProfileOption,
@@ -40,20 +34,12 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.output import say
-from perchctl.commands.progress import count_bar
-from perchctl.display import live_page, make_sketch
+from perchctl.commands.output import say, say_on_terminal
 from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
-from perchctl.geometry import Array, quaternion_from_rotation, rot_z, yaw_of
-from perchctl.places import is_shipped_example
-from perchctl.profile import find_calibration, load_profile
-from perchctl.sighting import TRACK_POLL_S, Sighting, Tracker
-from perchctl.vision import (
-    MARKERS,
-    Frame,
-    MarkerPose,
-    PipelineOutput,
-)
+
+if TYPE_CHECKING:
+    from perchctl.geometry import Array
+    from perchctl.sighting import Sighting
 
 app = new_app()
 
@@ -118,21 +104,26 @@ def track(
 
     If a live source is lost for good, the exit code is 10.
     """
-    flown = load_profile(profile)
-    source = parse_source(source).spec
-    file = find_calibration(str(calibration or flown.camera.calibration))
+    say_on_terminal(f"reading profile {profile}")
+    from perchctl.commands.progress import count_bar
+    from perchctl.places import is_shipped_example
+    from perchctl.sighting import Tracker
+
+    flown = profiles.load_profile(profile)
+    source = cameras.parse_source(source).spec
+    file = profiles.find_calibration(str(calibration or flown.camera.calibration))
     lines = as_json or not view
     start_s = time.monotonic()
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
         sender = None if udp is None else stack.enter_context(DatagramSender(udp))
-        camera = load_calibration(file)
-        opened = open_camera(source, time.monotonic, flown.camera, size_px=camera.size_px)
+        camera = calibrations.load_calibration(file)
+        opened = cameras.open_camera(source, time.monotonic, flown.camera, size_px=camera.size_px)
         stack.callback(opened.close)
-        recording = opened.inner if isinstance(opened, WrappedSource) else opened
+        recording = opened.inner if isinstance(opened, cameras.WrappedSource) else opened
         paths: Sequence[Path] = ()
         count = None
-        if isinstance(recording, RecordedSource):
+        if isinstance(recording, cameras.RecordedSource):
             paths, count = recording.paths, recording.count
         advice = ", the shipped example: name your camera's with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
@@ -140,13 +131,13 @@ def track(
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
         target: TargetInCamera | None = None
         stack.enter_context(stop.as_handler())  # until here Ctrl-C ends at once
-        title = f"perchctl track {without_password(source)}"
-        page = stack.enter_context(live_page(camera, title, view, say))
+        title = f"perchctl track {cameras.without_password(source)}"
+        page = stack.enter_context(displays.live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
         for frame in poll_until_stopped(opened, time.monotonic, stop):
             place = str(paths[frame.index]) if paths else opened.describe()
-            check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
+            cameras.check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
             for picture, output, notes in tracker.process(frame):
                 tracked = TrackResult(name, picture, notes=notes)
@@ -164,7 +155,9 @@ def track(
                     # A live result is worth nothing late.
                     print(record if as_json else text_line(tracked), flush=opened.live)
                 if page is not None:
-                    sketch = make_sketch(tracked.picture, tracked.output, flown.target.large.side_m)
+                    sketch = displays.make_sketch(
+                        tracked.picture, tracked.output, flown.target.large.side_m
+                    )
                     page.show(sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
@@ -180,10 +173,12 @@ def track(
 
 
 def poll_until_stopped(
-    source: FrameSource, now: Callable[[], float], stop: Stopper
-) -> Iterator[Frame]:
+    source: cameras.FrameSource, now: Callable[[], float], stop: Stopper
+) -> Iterator[visions.Frame]:
     """Yield every frame of a recording, or the newest frames of a live source, until the end, a
     permanent failure or Ctrl-C. A live source without frames is reported once per outage."""
+    from perchctl.sighting import TRACK_POLL_S
+
     is_silent = False
     while not stop.requested.is_set():
         now_s = now()
@@ -232,8 +227,8 @@ class TrackResult:
     """
 
     name: str | int
-    picture: Frame
-    output: PipelineOutput | None = None
+    picture: visions.Frame
+    output: visions.PipelineOutput | None = None
     target: TargetInCamera | None = None
     notes: Sequence[str] = ()
     sighting: Sighting | None = None
@@ -245,16 +240,21 @@ class TrackResult:
 
 
 def target_in_camera(
-    output: PipelineOutput, previous: TargetInCamera | None
+    output: visions.PipelineOutput, previous: TargetInCamera | None
 ) -> TargetInCamera | None:
     """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
     frames coincide; None without a target. `previous`: the last pose, whose tilt is kept while the
     filter predicts."""
+    import cv2
+    import numpy as np
+
+    from perchctl.geometry import rot_z, yaw_of
+
     target, poses = output.target, output.poses
     if target is None:
         return None
     stage = target.stage.value
-    known: MarkerPose | TargetInCamera | None = poses.get(
+    known: visions.MarkerPose | TargetInCamera | None = poses.get(
         "joint" if stage == "both" else stage, previous
     )
     if stage == "both" and "joint" not in poses:
@@ -288,7 +288,10 @@ def track_record(
         "t_s": _finite(t_s),
         "unix_s": None if epoch_s is None else _finite(epoch_s + t_s),
         "stage": tracked.stage,
-        **{name: None if output is None else _marker_record(output, name) for name in MARKERS},
+        **{
+            name: None if output is None else _marker_record(output, name)
+            for name in visions.MARKERS
+        },
         "target": None
         if target is None
         else {key: _finite(value) for key, value in vars(target).items()},
@@ -298,7 +301,7 @@ def track_record(
 
 
 def _marker_record(
-    output: PipelineOutput, name: Literal["large", "small"]
+    output: visions.PipelineOutput, name: Literal["large", "small"]
 ) -> dict[str, Any] | None:
     marker = output.detections.get(name)
     if marker is None:
@@ -313,6 +316,8 @@ def _marker_record(
 def _pose_record(seen: Sighting | None, frame_id: str) -> dict[str, Any] | None:
     if seen is None or seen.T_cam_target is None or seen.covariance is None:
         return None
+    from perchctl.geometry import quaternion_from_rotation
+
     w, x, y, z = quaternion_from_rotation(seen.T_cam_target[:3, :3])
     return {
         "frame_id": frame_id,
@@ -324,6 +329,8 @@ def _pose_record(seen: Sighting | None, frame_id: str) -> dict[str, Any] | None:
 
 
 def _finite(value: Any) -> Any:
+    import numpy as np
+
     if np.ndim(value):
         return [_finite(part) for part in value]
     return float(value) if math.isfinite(value) else None
@@ -415,7 +422,7 @@ class TrackSummary:
         self.frames += 1
         if tracked.output is not None:
             seen = tracked.output.detections
-            self._found.update(name for name in MARKERS if seen.get(name) is not None)
+            self._found.update(name for name in visions.MARKERS if seen.get(name) is not None)
         for note in tracked.notes:
             kind = re.split("[:,]", note, maxsplit=1)[0]  # without what differs between frames
             if not self._noted[kind]:

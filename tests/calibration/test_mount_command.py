@@ -14,10 +14,10 @@ from typer.testing import Result
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl import calibration
 from perchctl.calibration import MountingRecording
 from perchctl.calibration.mounting.carry import RotationSolution
 from perchctl.calibration.mounting.report import MountingReport
-from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
 from tests.helpers.calibrating import calibrate, refused
@@ -183,13 +183,13 @@ def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
     printed all the same, also where the profile (None) is gone."""
     mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
     mine.write_text("extends: crazyflie\n", encoding="utf-8")
-    solved = calibrate_mount.solve_mounting
+    solved = calibration.solve_mounting
 
     def long_work(*given: Any) -> Any:
         mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
         return solved(*given)
 
-    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
+    monkeypatch.setattr(calibration, "solve_mounting", long_work)
     result = mount("-p", "mine.yaml", "--from", str(logs["pivot"]), "--write")
     assert result.exit_code == (20 if changed is None else 30), result.stderr
     assert result.stdout.startswith("vehicle.gear_body_m: [")

@@ -71,7 +71,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibrate_mount, "guidance_display", press_after(30))
+    monkeypatch.setattr("perchctl.commands.progress.guidance_display", press_after(30))
     at_its_end = SimpleNamespace(isatty=lambda: True)  # a terminal's input
     monkeypatch.setattr(calibrate_mount, "sys", SimpleNamespace(stdin=at_its_end))
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")

@@ -16,7 +16,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import CheckScope, Row, Verdict, camera, check, session
 from perchctl.check.capture import BODY_ROWS, COMPARED
 from perchctl.commands import app
-from perchctl.commands import check as command
 from perchctl.commands.check import exit_code, format_rows, print_rows
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, options
@@ -34,7 +33,7 @@ def invoke(*words: str) -> Any:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "CheckScope", lambda **_: CheckScope(**QUICK))
+    monkeypatch.setattr("perchctl.check.CheckScope", lambda **_: CheckScope(**QUICK))
 
 
 def test_json_is_a_list_of_rows(quick: None) -> None:

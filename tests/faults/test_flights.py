@@ -20,7 +20,7 @@ import cv2
 from typer.testing import CliRunner
 
 from perchctl.commands import app
-from perchctl.commands.fly import POSITIONINGS, with_positioning
+from perchctl.commands.fly import positioning_methods, with_positioning
 from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
@@ -42,7 +42,7 @@ CELLS = [(fault.name, phase) for fault in FAULTS for phase in fault.phases]
 GUARD = {
     (fault.name, fault.phases[(i + turn) % len(fault.phases)], by)
     for i, fault in enumerate(FAULTS)
-    for turn, by in enumerate(POSITIONINGS)
+    for turn, by in enumerate(positioning_methods())
 }
 """Each fault once with each positioning, the phases by turns."""
 
@@ -103,7 +103,7 @@ def flown(
         pytest.param(
             n, p, by, id=f"{n}-{p.value}-{by}", marks=[pytest.mark.guard] * ((n, p, by) in GUARD)
         )
-        for by in POSITIONINGS
+        for by in positioning_methods()
         for n, p in CELLS
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.fly import POSITIONINGS, with_positioning
+from perchctl.commands.fly import positioning_methods, with_positioning
 from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_in_folder
 from perchctl.faults.oracle import Flag
@@ -153,7 +153,10 @@ PLANTS = (
         ("downlink-silent", "attitude-block-dead"),
     ),
 )  # fmt: skip
-GUARD = {(plant.name, POSITIONINGS[i % len(POSITIONINGS)]) for i, plant in enumerate(PLANTS)}
+GUARD = {
+    (plant.name, positioning_methods()[i % len(positioning_methods())])
+    for i, plant in enumerate(PLANTS)
+}
 """Each once, the positionings by turns."""
 
 
@@ -165,7 +168,7 @@ GUARD = {(plant.name, POSITIONINGS[i % len(POSITIONINGS)]) for i, plant in enume
             plant, by, id=f"{plant.name}-{by}",
             marks=[pytest.mark.guard] * ((plant.name, by) in GUARD),
         )
-        for by in POSITIONINGS
+        for by in positioning_methods()
         for plant in PLANTS
     ],
 )  # fmt: skip

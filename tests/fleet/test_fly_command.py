@@ -19,7 +19,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
-from perchctl.commands import fly_fleet
 from perchctl.commands.fly_fleet import FleetSession
 from perchctl.display import FleetPage, FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
@@ -274,7 +273,7 @@ def test_each_number_key_is_answered(
         yield True
 
     pressed: list[bytes] = []
-    monkeypatch.setattr(fly_fleet, "cut_key", keys)
+    monkeypatch.setattr("perchctl.flight.cut_key", keys)
     monkeypatch.setattr(FakeProcess, "END", PERCHED)
     outcome = session.fly(asks=False)
     ends = [each.outcome.value for each in outcome.results.values()]
