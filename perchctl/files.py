@@ -26,12 +26,15 @@ _BEGINNINGS = (
     (b"\xff\xd8\xff", "a picture"),
     (b"%PDF", "a PDF"),
     (b"\x89MCAP0", "a recording"),
+    (b'{"kind":"header","format":"perchctl-flight-log"', "a flight log"),
 )
 _KEYS = (  # of a YAML file, at the beginning of a line
     (r"image_width|camera_matrix|distortion_model|cam0", "a camera calibration"),
+    (r"vehicles", "a fleet file"),
     (r"extends|vehicle|planner|safety|positioning", "a profile"),
 )
 _READ_BYTES = 4096
+_UNKNOWN = "another kind of file"
 
 
 def file_kind(path: Path) -> str:
@@ -51,7 +54,14 @@ def file_kind(path: Path) -> str:
         for keys, kind in _KEYS:
             if re.search(rf"^(?:{keys})\s*:", text, re.MULTILINE):
                 return kind
-    return "another kind of file"
+    return _UNKNOWN
+
+
+def kind_note(path: Path, *expected: str) -> str:
+    """Return what a file is, for the end of a message: `` (it is a flight log)``; an empty text if
+    that is unknown, or one of the `expected` kinds. Never raises."""
+    kind = file_kind(path)
+    return "" if kind in (*expected, _UNKNOWN) else f" (it is {kind})"
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:

@@ -308,6 +308,38 @@ def test_one_rule_for_what_is_there_already(line: str) -> None:
     assert [path.name for path in Path().iterdir()] == [name]
 
 
+# --- A file of another kind ----------------------------------------------------------------
+
+LOG = '{"kind":"header","format":"perchctl-flight-log","version":3}\n{}\n'
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("fly -p a.jsonl", "a.jsonl is no profile (it is a flight log)"),
+        ("fly -p ./a.jsonl", "(it is a flight log)"),
+        (f"profile -p {ROOT}/fleets/four.yaml", "is a fleet file, not a profile"),
+        (f"fly -p {CALIBRATION}", "is a camera calibration, not a profile"),
+        (f"fleet check {ROOT}/profiles/sim.yaml", "(it is a profile)"),
+        ("make-target design a.jsonl", "(it is a flight log)"),
+        ("track a.jsonl", "neither a picture nor a video (it is a flight log)"),
+        ("fit-weights a.jsonl", "(it is a flight log)"),
+        (f"log show {ROOT}/profiles/sim.yaml", "(it is a profile)"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(line: str, words: str) -> None:
+    Path("a.jsonl").write_text(LOG)
+    said = run(*line.split())
+    assert said.code == InvalidValue.exit_code
+    assert words in said.complaint
+
+
+def test_swapped_arguments_are_put_right() -> None:
+    said = run("calibrate", "check", "images:board", CALIBRATION)
+    assert said.code == UsageError.exit_code
+    assert f"perchctl calibrate check {CALIBRATION} images:board" in said.complaint
+
+
 # --- A full disk, and Ctrl-C while it loads -------------------------------------------------
 
 

@@ -115,6 +115,8 @@ def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(
         (b"%PDF-1.7", "a PDF"),
         (b"image_width: 640\ncamera_matrix: {}\n", "a camera calibration"),
         (b"# mine\nextends: sim\n", "a profile"),
+        (b"name: four\nvehicles:\n", "a fleet file"),
+        (b'{"kind":"header","format":"perchctl-flight-log","version":3}\n', "a flight log"),
         (b"", "another kind of file"),
     ],
 )

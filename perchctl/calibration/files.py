@@ -12,7 +12,7 @@ import numpy as np
 
 from perchctl.calibration.forms import Lens, parse_calibration
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.files import file_kind
+from perchctl.files import file_kind, kind_note
 from perchctl.geometry import Array
 from perchctl.profile import CameraConfig, find_calibration
 from perchctl.vision import CameraModel
@@ -61,7 +61,7 @@ def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
         lens, values = parse_calibration(_text(path))
         return _checked(lens), values
     except InvalidValue as error:
-        what = " (it is a profile)" if file_kind(path) == "a profile" else ""
+        what = "" if "this is" in str(error) else kind_note(path, "a camera calibration")
         raise InvalidValue(f"{path}: {error}{what}") from None
 
 

@@ -24,6 +24,7 @@ from perchctl.camera.source import (
 )
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.extensions import is_extension, make_extension
+from perchctl.files import kind_note
 from perchctl.profile import CameraConfig
 
 REAL = (
@@ -95,6 +96,8 @@ def parse_source(text: str) -> SourceName:
     if path.is_dir() or any(c in text for c in "*?["):
         return SourceName("images", text)
     if path.is_file():
+        if note := kind_note(path, "a picture", "a video"):
+            raise InvalidValue(f"{shown} is neither a picture nor a video{note}")
         return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
     if is_extension(text):
         return SourceName(scheme, place)

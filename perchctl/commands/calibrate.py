@@ -30,7 +30,7 @@ from perchctl.commands.command_line import (
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say, say_on_terminal
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, write_files
+from perchctl.files import check_output, file_kind, write_files
 
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "a calibration"
@@ -184,6 +184,11 @@ def check(
 ) -> int:
     """Check a calibration against new pictures of a board (exit code 1 if it fails)."""
     say_on_terminal(f"reading {calibration}")
+    if not calibration.is_file() and file_kind(Path(source)) == "a camera calibration":
+        raise UsageError(
+            f"{source} is a camera calibration: name it first, and then the pictures, as in "
+            f"perchctl calibrate check {source} {calibration}"
+        )
     pictures = _source(source)
     model = calibrations.load_calibration(calibration)
     notes = calibrations.load_notes(calibration)

@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError
 from perchctl.camera import parse_source
 from perchctl.corridor import Point
 from perchctl.errors import InvalidValue, NotFound, PerchError
+from perchctl.files import kind_note
 from perchctl.fleet.assignment import assign_nearest
 from perchctl.fleet.fleet import MOST_VEHICLES, Fleet, FleetVehicle, Frame
 from perchctl.fleet.radio import choose_dongles
@@ -100,7 +101,7 @@ def load_fleet(name: str | Path = EXAMPLE_FLEET) -> Fleet:
     if "vehicles" not in values:
         raise InvalidValue(
             f"{path}: has no vehicles, so it is no fleet file: list them under vehicles, each with "
-            f"name, uri, home_m and target_m"
+            f"name, uri, home_m and target_m{kind_note(path)}"
         )
     keys: _File = _validated(path, _File, values)
     defaults = _split(f"{path}: defaults", _Common, keys.defaults)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts, require_type
-from perchctl.files import file_kind
+from perchctl.files import file_kind, kind_note
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import parse_yaml
 from perchctl.profile.base import split_constant_keys
@@ -37,7 +37,8 @@ def is_profile_path(name: str) -> bool:
 
 
 def find_profile(name: str) -> Path:
-    """The file of a profile given by path or name; NotFound names the choices."""
+    """The file of a profile given by path or name. Errors: NotFound, which names the choices;
+    InvalidValue for another kind of file."""
     if is_profile_path(name):
         path = Path(name).expanduser()
         if path.is_file():
@@ -46,6 +47,8 @@ def find_profile(name: str) -> Path:
         raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
     found = data_file("profiles", name)
     if found is None:
+        if note := kind_note(Path(name), "a profile"):
+            raise InvalidValue(f"{name} is no profile{note}; profiles are .yaml files")
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found
 
@@ -62,7 +65,12 @@ def load_profile(name: str | Path | Profile, *, with_weights: bool = True) -> Pr
         return name
     require_type("profile", name, str, Path, Profile)
     path = find_profile(str(name))
-    profile = _checked(path, read_yaml(path))
+    values = read_yaml(path)
+    if "vehicles" in values:
+        raise InvalidValue(
+            f"{path} is a fleet file, not a profile: fly it with perchctl fleet fly {path}"
+        )
+    profile = _checked(path, values)
     return _with_weights(profile) if with_weights else profile
 
 
@@ -270,7 +278,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise InvalidValue(f"{path}: not a text file in UTF-8") from None
+        raise InvalidValue(f"{path}: not a text file in UTF-8{kind_note(path)}") from None
     except OSError as error:
         raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
     return _values_of(text, path)
@@ -280,7 +288,8 @@ def _values_of(text: str, path: Path) -> dict[str, Any]:
     try:
         values = parse_yaml(text)
     except ValueError as error:
-        raise InvalidValue(f"{path}: {error}") from None
+        note = kind_note(path, "a profile", "a fleet file", "a camera calibration")
+        raise InvalidValue(f"{path}: {error}{note}") from None
     if values is None:
         return {}
     if not isinstance(values, dict):

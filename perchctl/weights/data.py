@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.files import kind_note
 from perchctl.geometry import Array
 
 AXES = ("x", "y", "z", "yaw")
@@ -98,7 +99,8 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing:
         raise InvalidValue(
-            f"{path}: line 1: column {missing[0]} is missing, or appears twice; needed are "
+            f"{path}: line 1: column {missing[0]} is missing, or appears twice"
+            f"{kind_note(path)}; needed are "
             f"{HEADER}, separated by commas"
         )
     pick = operator.itemgetter(*(header.index(name) for name in NEEDED))
