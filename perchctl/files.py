@@ -64,21 +64,30 @@ def kind_note(path: Path, *expected: str) -> str:
     return "" if kind in (*expected, _UNKNOWN) else f" (it is {kind})"
 
 
-def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
+def check_output(
+    path: Path,
+    suffixes: Sequence[str],
+    force: bool,
+    content: str = FORMAT,
+    *,
+    makes_folder: bool = False,
+) -> None:
     """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or if
     `check_writable` does. `content` is what the message calls such a file, as in: a plot."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(
             f"the name of {content} must end in {' or '.join(suffixes)}, found {path}"
         )
-    check_writable(path, force)
+    check_writable(path, force, makes_folder=makes_folder)
 
 
-def check_writable(path: Path, force: bool) -> None:
+def check_writable(path: Path, force: bool, *, makes_folder: bool = True) -> None:
     """Check that `path` can be written; to be called before any long work.
 
     Args:
         force: an existing file may be replaced.
+        makes_folder: the folder of the file may be made; False for a path that a person typed, in
+            which a new folder is more often a typing error.
 
     Raises:
         InvalidValue: the path is a folder, a file that must not be replaced, or a place where
@@ -94,6 +103,11 @@ def check_writable(path: Path, force: bool) -> None:
     folder = next(folder for folder in path.absolute().parents if os.path.exists(folder))
     if not os.path.isdir(folder):
         raise InvalidValue(f"{path} cannot be written: {folder} is a file, not a folder")
+    if folder != path.absolute().parent and not makes_folder:
+        raise InvalidValue(
+            f"{path} cannot be written: folder {path.parent} does not exist; make it, or name "
+            "another place"
+        )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InvalidValue(f"{path} cannot be written: no permission to write in {folder}")
 

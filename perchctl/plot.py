@@ -38,7 +38,7 @@ def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write the figure in the format that the name ends in (`FORMATS`), the same bytes for the
     same figure; the file is there whole or not at all. Raises InvalidValue."""
-    check_output(path, FORMATS, force=True, content="a plot")
+    check_output(path, FORMATS, force=True, content="a plot", makes_folder=True)
     write_files({path: figure_bytes(figure, path.suffix.lower())})
 
 

@@ -305,6 +305,7 @@ def test_one_rule_for_what_is_there_already(line: str) -> None:
     assert "already exists" not in run(*words, name, "--force").stderr
     Path(name).write_text("mine")
     assert "is a file, not a folder" in run(*words, f"{name}/inside/{name}").complaint
+    assert "folder prits does not exist" in run(*words, f"prits/{name}").complaint
     assert [path.name for path in Path().iterdir()] == [name]
 
 

@@ -50,6 +50,7 @@ def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
     assert (rows[0][0], rows[1][0], len(rows)) == ("t_s", "0.0", 61)
     assert run("log", "export", OLD).code == 30
     assert run("log", "export", OLD, "--force").code == 0
+    Path("new").mkdir()
     assert "new/x.csv (30 rows" in run("log", "export", "-o", "new/x.csv").stdout
 
 

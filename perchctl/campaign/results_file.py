@@ -79,7 +79,7 @@ def campaign_results(
             f"{out} already exists; add --resume to continue it, --force to replace it, or "
             "name another file"
         )
-    check_writable(out, force=True)
+    check_writable(out, force=True, makes_folder=False)
     header = campaign_header(profile, faults, fleet)
     earlier: dict[int, R] = {}
     good = 0
@@ -87,7 +87,6 @@ def campaign_results(
         try:
             if resume and out.exists():
                 good = _read(out, header, result_type, earlier)
-            out.parent.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(out.open("ab", buffering=0))
             file.truncate(good)
         except OSError as error:

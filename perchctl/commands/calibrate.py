@@ -225,7 +225,7 @@ def convert(
     say_on_terminal(f"reading {calibration}")
     model = calibrations.load_calibration(calibration)
     file = _file(output, model.size_px)
-    check_output(file, SUFFIXES, force, CONTENT)
+    check_output(file, SUFFIXES, force, CONTENT, makes_folder=file.parent == FOLDER)
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: calibrations.calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
@@ -241,8 +241,9 @@ def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
 
 def _check_camera_output(file: Path, force: bool) -> None:
     """Check a calibration file and its report. Raises InvalidValue, as `check_output`."""
-    check_output(file, SUFFIXES, force, CONTENT)
-    check_output(file.with_suffix(REPORT_SUFFIX), (REPORT_SUFFIX,), force, "a report")
+    report, makes_folder = file.with_suffix(REPORT_SUFFIX), file.parent == FOLDER
+    check_output(file, SUFFIXES, force, CONTENT, makes_folder=makes_folder)
+    check_output(report, (REPORT_SUFFIX,), force, "a report", makes_folder=makes_folder)
 
 
 def _now() -> str:

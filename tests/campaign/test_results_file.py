@@ -41,8 +41,8 @@ def written(path: Path, *seeds: int, profile: Profile = SIM, **options: Any) -> 
 
 def test_wherever_the_computer_died_it_goes_on(tmp_path: Path) -> None:
     """Of each length that a file may have been cut to."""
-    written(tmp_path / "made" / "whole.jsonl", 0, 1)
-    whole = (tmp_path / "made" / "whole.jsonl").read_bytes()
+    written(tmp_path / "whole.jsonl", 0, 1)
+    whole = (tmp_path / "whole.jsonl").read_bytes()
     path = tmp_path / "cut.jsonl"
     ends = [i + 1 for i, byte in enumerate(whole) if byte == ord("\n")]
     near = {end + k for end in (0, 20, *ends) for k in (-1, 0, 1, 30)}

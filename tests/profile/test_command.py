@@ -207,6 +207,7 @@ def test_a_calibration_that_lies_there_is_offered_and_found_from_where_the_profi
     own = tmp_path / "calib" / file
     own.parent.mkdir()
     own.write_bytes(find_calibration("example_640x480").read_bytes())
+    (tmp_path / "elsewhere").mkdir()
     mine = made(tmp_path / "elsewhere" / "m.yaml", planner__attempts="3", **given)
     assert Path(mine.camera.calibration).samefile(own)
     assert mine.planner.attempts == 3, "any key can be given"
