@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
@@ -131,7 +132,7 @@ def exit_code(rows: Sequence[checks.Row]) -> int:
 def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. An
     unfinished check gets no positive summary."""
-    lines = [line for row in rows for line in _lines(row)]
+    lines = [line for row in _folded(rows) for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in checks.Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
     failing = [row.name for row in rows if row.verdict is checks.Verdict.FAIL]
@@ -139,6 +140,18 @@ def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     if not finished:
         ends.append("not finished, the other checks were not made")
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
+
+
+def _folded(rows: Sequence[checks.Row]) -> Iterator[checks.Row]:
+    """Yield the rows; those that were skipped one after the other for the same reason, as one."""
+    for (verdict, found, advice), same in itertools.groupby(
+        rows, key=lambda row: (row.verdict, row.found, row.advice)
+    ):
+        group = list(same)
+        if verdict is checks.Verdict.SKIPPED and len(group) > 1:
+            yield checks.Row(f"{len(group)} checks", verdict, found, advice)
+        else:
+            yield from group
 
 
 def _lines(row: checks.Row) -> list[str]:

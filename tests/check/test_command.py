@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,9 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
     text = re.sub(r"\s+", " ", " ".join(lines))
     assert "FAIL battery the battery rests at 3.50 V -> charge it" in text
     assert "skip level the vehicle does not answer" in text
+    skipped = [replace(ROWS[-1], name=name) for name in ("packets", "telemetry", "level")]
+    assert "skip  3 checks         the vehicle does not answer" in format_rows(skipped)
+    assert format_rows(skipped).splitlines()[-1].startswith("3 skip")
     assert lines[-1] == "1 pass, 1 warn, 1 FAIL, 2 skip: not fit to fly: battery"
     assert format_rows(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
     assert "not finished" in format_rows(ROWS[:2], finished=False).splitlines()[-1]
