@@ -152,9 +152,8 @@ def open_camera(
         timeout_s: how long the first frame of a live source may take, instead of the profile's.
 
     Raises:
-        NotFound: no such camera, file or stream. InvalidValue: unknown scheme,
-        unreadable content. TimedOut: no
-        first frame in time.
+        NotFound: no such camera, file or stream, or none that can be reached. InvalidValue: unknown
+        scheme, unreadable content. TimedOut: no first frame in time.
     """
     if latency_s is None:
         latency_s = 0.0 if config is None else config.start_latency_s

@@ -14,7 +14,7 @@ from urllib.error import URLError
 import numpy as np
 
 from perchctl.camera.health import Grey, same_bytes
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, Problem, TimedOut
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, Problem, TimedOut
 from perchctl.extensions import error_at
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame, to_grey
@@ -244,7 +244,8 @@ class LiveSource:
             if failed >= self.max_failures:
                 finding, advice = self._finding_and_advice()
                 found = f"{self._name} delivered no picture in {failed} attempts: {finding}"
-                self._fail(TimedOut(found, advice, separator=": "))
+                kind = TimedOut if self._is_connected else NotFound
+                self._fail(kind(found, advice, separator=": "))
                 return
             self._stop.wait(self.reconnect_wait_s)
 

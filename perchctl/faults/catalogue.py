@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.errors import UsageError
+from perchctl.errors import InvalidValue
 from perchctl.faults import effects as e
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission import Phase
@@ -563,13 +563,15 @@ HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """The faults whose names stand in `names` between commas, or `all`. Errors: UsageError."""
+    """The faults whose names stand in `names` between commas, or `all`. Errors: InvalidValue."""
     if names == "all":
         return FAULTS
     found = []
     for name in (part.strip() for part in names.split(",")):
         if name not in BY_NAME:
-            raise UsageError(f"fault {name!r} is unknown; `--faults list` lists all {len(FAULTS)}")
+            raise InvalidValue(
+                f"fault {name!r} is unknown; `--faults list` lists all {len(FAULTS)}"
+            )
         found.append(BY_NAME[name])
     return tuple(found)
 

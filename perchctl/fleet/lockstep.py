@@ -28,7 +28,7 @@ import numpy as np
 
 from perchctl.campaign import run_measured
 from perchctl.corridor import Point
-from perchctl.errors import ConnectionFailed, UsageError
+from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.faults import (
     COMMON_CAUSES,
     FAULTS,
@@ -77,13 +77,13 @@ def plan_sha256(plan: FleetPlan) -> str:
 
 def select_fleet_faults(names: str) -> tuple[str, ...]:
     """The names of faults and common causes that stand in `names` between commas; ``all``: every
-    fault and every cause. Errors: UsageError."""
+    fault and every cause. Errors: InvalidValue."""
     if names == "all":
         return (*_FAULT_BY_NAME, *_CAUSE_BY_NAME)
     found = [part.strip() for part in names.split(",")]
     unknown = next((name for name in found if name not in {*_FAULT_BY_NAME, *_CAUSE_BY_NAME}), None)
     if unknown is not None:
-        raise UsageError(f"fault {unknown!r} is unknown; `--faults list` shows all there are")
+        raise InvalidValue(f"fault {unknown!r} is unknown; `--faults list` lists all")
     return tuple(found)
 
 

@@ -17,7 +17,7 @@ from perchctl.camera import open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
 from perchctl.camera.network import DELAY_WINDOW_S, RtspSource, TransferDelay
 from perchctl.camera.source import LiveSource
-from perchctl.errors import NotFound, TimedOut
+from perchctl.errors import NotFound
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.rtsp import RtspServer, Step
 from tests.helpers.waiting import until
@@ -137,7 +137,7 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
 def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     server.close()
     url = server.url("me:secret@")
-    with pytest.raises(TimedOut, match=words) as caught:
+    with pytest.raises(NotFound, match=words) as caught:
         open_camera(url.replace("127.0.0.1", host or "127.0.0.1"), Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.errors import UsageError
+from perchctl.errors import InvalidValue
 from perchctl.faults import FAULTS, select_faults
 from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, draw_fault_case
 from perchctl.faults.oracle import emergency_stop_s
@@ -84,7 +84,7 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
 def test_a_selection_by_name() -> None:
     assert select_faults("all") == FAULTS
     assert [fault.name for fault in select_faults("hung, killed")] == ["hung", "killed"]
-    with pytest.raises(UsageError, match=r"'hanged' is unknown.*--faults list"):
+    with pytest.raises(InvalidValue, match=r"'hanged' is unknown.*--faults list"):
         select_faults("killed,hanged")
     assert {draw_case(seed, SCENARIO, select_faults("slow")).fault.name for seed in range(5)} == {
         "slow"

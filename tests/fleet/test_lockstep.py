@@ -417,7 +417,7 @@ def test_faults_are_chosen_by_name() -> None:
     assert select_fleet_faults("kick, stall") == ("kick", "stall")
     assert HEALTHY.fault.name not in select_fleet_faults("all")
     done = run("fleet", "simulate", "--faults", "none")
-    assert done.code == 2
+    assert done.code == 30
     assert done.complaint.startswith("fault 'none' is unknown")
     assert "bodies-swap" in run("fleet", "simulate", "--faults", "list").stdout
 
