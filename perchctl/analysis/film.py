@@ -34,6 +34,8 @@ WIDTH_IN, HEIGHT_IN = 9.6, 5.4
 SIZE_STEP_PX = 32
 """Of the width, so that width and height are even, as H.264 needs them."""
 Rgb = NDArray[np.uint8]
+Progress = Callable[[int, int | None], object]
+"""Called with the number done, and the total."""
 Recorded = Iterator[tuple[int, float, NDArray[np.uint8]]]
 """Recorded pictures: number, time of exposure, grey (height, width)."""
 
@@ -44,6 +46,7 @@ def write_film(
     path: Path,
     rate_hz: float = 15.0,
     width_px: int = 960,
+    progress: Progress = lambda done, total: None,
 ) -> int:
     """Write the flight as a film (.mp4 or .gif) at its own pace, and return its number of pictures.
 
@@ -51,6 +54,7 @@ def write_film(
         pictures: the recorded pictures, oldest first; None without a recording.
         rate_hz: pictures per second of flight; the period is rounded to 0.01 s.
         width_px: width of the film; its height is 9/16 of it.
+        progress: called after each picture of the film with the number done and of all.
 
     Errors: InvalidValue for a log without ticks, a recording that cannot be read, or a file that
     cannot be written.
@@ -59,18 +63,25 @@ def write_film(
         raise InvalidValue(f"{flight.log.path}: the log has no ticks, so there is nothing to film")
     period = film_period(rate_hz)
     times_s = np.arange(0.0, flight.log.end_s + LAST_PICTURE_S, float(period))
-    write_pictures(_film_pictures(flight, pictures or iter(()), times_s, width_px), path, period)
+    drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px, progress)
+    write_pictures(drawn, path, period)
     return len(times_s)
 
 
 def _film_pictures(
-    flight: FlightAnalysis, recorded: Recorded, times_s: Array, width_px: int
+    flight: FlightAnalysis,
+    recorded: Recorded,
+    times_s: Array,
+    width_px: int,
+    progress: Progress,
 ) -> Iterator[Rgb]:
-    stage, shown = _Stage(flight, width_px), ShownPicture(flight, recorded)
-    for t_s in times_s:
+    shown = ShownPicture(flight, recorded)
+    stage = _Stage(flight, width_px, has_pictures=shown.has_more)
+    for number, t_s in enumerate(times_s, start=1):
         index = flight.log.tick_index_at(float(t_s))
         shown.advance(index)
         yield stage.drawn(index, shown)
+        progress(number, len(times_s))
 
 
 class ShownPicture:
@@ -86,6 +97,11 @@ class ShownPicture:
         self.record: dict[str, Any] = flight.log.records[0]
         self._flight, self._recorded = flight, recorded
         self._coming = next(recorded, None)
+
+    @property
+    def has_more(self) -> bool:
+        """True if a picture is still to come."""
+        return self._coming is not None
 
     def advance(self, index: int) -> None:
         """Go to the tick with this index, which never becomes smaller."""
@@ -122,15 +138,18 @@ class CameraView:
 
 
 class _Stage:
-    """The figure: what stays is drawn once, what moves is drawn for each picture."""
+    """The figure: what stays is drawn once, what moves is drawn for each picture. Without recorded
+    pictures, the side view takes their place."""
 
-    def __init__(self, flight: FlightAnalysis, width_px: int) -> None:
+    def __init__(self, flight: FlightAnalysis, width_px: int, *, has_pictures: bool) -> None:
         self._flight = flight
         self._figure = film_figure(width_px)
         grid = self._figure.add_gridspec(2, 2, height_ratios=(2.6, 1.0), width_ratios=(2.0, 1.0))
         self._moving: list[Any] = []
-        self._camera = CameraView(self._figure.add_subplot(grid[0, 0]), flight, self._add)
-        self._set_side_view(self._figure.add_subplot(grid[0, 1]))
+        self._camera: CameraView | None = None
+        if has_pictures:
+            self._camera = CameraView(self._figure.add_subplot(grid[0, 0]), flight, self._add)
+        self._set_side_view(self._figure.add_subplot(grid[0, 1] if has_pictures else grid[0, :]))
         self._set_traces(self._figure.add_subplot(grid[1, :]))
         self._figure.suptitle(" ", fontsize=13)
         self._title = self._add(
@@ -141,7 +160,8 @@ class _Stage:
     def drawn(self, index: int, shown: ShownPicture) -> Rgb:
         """A tick's picture, (height, width, 3)."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
-        self._camera.show(shown)
+        if self._camera is not None:
+            self._camera.show(shown)
         x_m, z_m = self._place_m[index]
         self._trail.set_data(*self._place_m[: index + 1].T)
         self._arms.set_data([x_m - ARM_M, x_m + ARM_M], [z_m, z_m])

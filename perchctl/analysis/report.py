@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from perchctl.analysis.film import write_film
+from perchctl.analysis.film import Progress, write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
@@ -42,9 +42,11 @@ def write_report(
     output: Path,
     with_film: bool = False,
     names: Mapping[Path, str] | None = None,
+    progress: Progress = lambda done, total: None,
 ) -> Report:
     """Write the HTML report of the logs atomically, and return its content. `with_film` embeds a
-    film of each flight. `names`: the vehicles of a fleet, by their logs.
+    film of each flight. `names`: the vehicles of a fleet, by their logs. `progress` is called with
+    the number done and of all: after each flight, or with films after each picture of a film.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
@@ -52,7 +54,7 @@ def write_report(
     report = Report(
         tuple(replace(read_reported_flight(path), name=of.get(path, "")) for path in log_paths)
     )
-    write_files({output: report_html(report.flights, with_film).encode("utf-8")})
+    write_files({output: report_html(report.flights, with_film, progress).encode("utf-8")})
     return report
 
 
@@ -156,7 +158,11 @@ class ReportedFlight:
 # --- the page ---
 
 
-def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
+def report_html(
+    flights: Sequence[ReportedFlight],
+    with_film: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> str:
     """The report of at least one flight as self-contained HTML. Raises InvalidValue for
     invalid values in a log."""
     articles = []
@@ -170,8 +176,11 @@ def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> s
                     number=number,
                     is_session=len(flights) > 1,
                     with_film=with_film,
+                    film_of=partial(film_url_and_problem, progress=progress),
                 )
             )
+        if not with_film:
+            progress(number, len(flights))
     return _render(
         "page.html",
         flights=flights,
@@ -186,12 +195,13 @@ def _render(name: str, **values: Any) -> Markup:
         name,
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: data_url("image/png", flight_png(flight)),
-        film_of=film_url_and_problem,
         **values,
     )
 
 
-def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
+def film_url_and_problem(
+    flight: FlightAnalysis, progress: Progress = lambda done, total: None
+) -> tuple[str, str]:
     """The flight's film as a `data:` URL, and why the film or its camera pictures are
     missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
@@ -202,7 +212,7 @@ def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
         film = Path(folder) / "film.mp4"
         for pictures in (*recorded, None):
             try:
-                write_film(flight, pictures, film)
+                write_film(flight, pictures, film, progress=progress)
             except InvalidValue as error:
                 problem = _without_folder(error, path)
                 continue

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -25,6 +25,7 @@ from perchctl.commands.output import print_result, say, say_on_terminal
 from perchctl.errors import NotFound, ReplayDiffers
 from perchctl.files import check_output, write_files
 
+T = TypeVar("T")
 PLOTS = ((".png", ".pdf", ".svg"), "a plot")
 FILMS = ((".mp4", ".gif"), "a film")
 EXPORTS = ((".csv",), "an export")
@@ -59,6 +60,13 @@ def _place(log: Path, output: Path | None, kind: tuple[tuple[str, ...], str], fo
     place = output or records.path_beside(log, suffixes[0])
     check_output(place, suffixes, force, content)
     return place
+
+
+def _counted(items: Iterable[T], advance: Callable[[], None]) -> Iterator[T]:
+    """Yield the items, and call `advance` after each."""
+    for item in items:
+        yield item
+        advance()
 
 
 @contextlib.contextmanager
@@ -206,7 +214,11 @@ def replay(
             base = log.flown_profile if profile is None else profiles.load_profile(profile)
             wanted = profiles.apply_settings(base, settings or ())
     is_recorded = pictures and records.path_beside(path, ".mcap").is_file()
-    found = analysis.replay(log, records.recorded_pictures(path) if is_recorded else None, wanted)
+    from perchctl.commands.progress import count_bar
+
+    with count_bar("pictures", None, is_recorded) as advance:
+        recorded = _counted(records.recorded_pictures(path), advance) if is_recorded else None
+        found = analysis.replay(log, recorded, wanted)
     if wanted is not None and not found.changed_keys:
         say("no key differs from the flown profile: this replays the flight as it was flown")
     if as_json:
@@ -260,7 +272,10 @@ def report(
     if output is None and (names or len(logs) > 1):
         output = logs[0].with_name("fleet.html" if names else "session.html")
     place = _place(logs[0], output, PAGES, force)
-    page = analysis.write_report(logs, place, with_film, names)
+    from perchctl.commands.progress import done_of_total_bar
+
+    with done_of_total_bar("pictures of a film" if with_film else "flights") as progress:
+        page = analysis.write_report(logs, place, with_film, names, progress)
     say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)
 
@@ -311,7 +326,9 @@ def film(
     with _opened(path) as log:
         flight = analysis.FlightAnalysis(log)
     from perchctl.analysis import write_film
+    from perchctl.commands.progress import done_of_total_bar
 
     pictures = records.recorded_pictures(path) if is_recorded else None
-    write_film(flight, pictures, place, rate_hz, width_px)
+    with done_of_total_bar("pictures") as progress:
+        write_film(flight, pictures, place, rate_hz, width_px, progress)
     print(f"film:      {place}")

@@ -13,7 +13,7 @@ from PIL import Image
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.analysis import FlightAnalysis, write_film
+from perchctl.analysis import FlightAnalysis, write_film, write_report
 from perchctl.analysis.film import LAST_PICTURE_S, side_path_and_target_height
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly_lockstep
@@ -49,7 +49,7 @@ def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
     films = []
     for name, recorded in (("with", recorded_pictures(flown)), ("without", None)):
         path = tmp_path / f"{name}.mp4"
-        count = write_film(flight, recorded, path, rate_hz=2.0, width_px=WIDTH_PX)
+        count = write_film(flight, recorded, path, 2.0, WIDTH_PX)
         films.append(pictures_of(path))
         assert (
             len(films[-1])
@@ -58,12 +58,26 @@ def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
         )
         assert films[-1][0].shape == (WIDTH_PX * 9 // 16, WIDTH_PX, 3)
     middle = len(films[0]) // 2
-    left = np.s_[30:100, 60:160]  # where the camera's picture is
-    seen, black = (film[middle][left].mean() for film in films)
-    assert seen > black + 30.0
+    left = np.s_[30:100, 60:160]  # where the camera's picture is, and else white paper
+    seen, paper = (film[middle][left].mean() for film in films)
+    assert 30.0 < seen < paper - 10.0
+    assert paper > 200.0, "no place is kept for pictures that there are none of"
     # What stands still does not change.
     corner = np.s_[120:, :10]
     assert np.abs(films[0][0][corner].astype(int) - films[0][-1][corner]).max() < 50
+
+
+def test_film_and_report_tell_how_far_they_are(flown: Path, tmp_path: Path) -> None:
+    done: list[tuple[int, int | None]] = []
+    film, flight = tmp_path / "film.mp4", FlightAnalysis(read_log(flown))
+    count = write_film(flight, None, film, 1.0, WIDTH_PX, lambda *now: done.append(now))
+    assert done == [(number, count) for number in range(1, count + 1)]
+    done.clear()
+    write_report([flown, flown], tmp_path / "a.html", progress=lambda *now: done.append(now))
+    assert done == [(1, 2), (2, 2)]
+    done.clear()
+    write_report([flown], tmp_path / "b.html", True, progress=lambda *now: done.append(now))
+    assert done[-1][0] == done[-1][1] == len(done) > 100
 
 
 def test_the_gear_of_a_vehicle_that_hangs_is_at_the_target(flown: Path) -> None:
