@@ -21,7 +21,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
-from perchctl.commands.output import ask_to_confirm
+from perchctl.commands.output import ask, ask_to_confirm
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
 from perchctl.startup import is_command_line
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
@@ -277,6 +277,20 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.Mon
         os.write(keyboard, b"yes\n")
         assert stdin.readline() == "yes\n"  # nothing of before is left
     os.close(keyboard)
+
+
+def test_a_question_on_a_terminal_has_line_editing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of input() itself, which must know its prompt to draw the line again."""
+    prompts: list[str] = []
+    for stream in ("sys.stdin", "sys.stdout"):
+        monkeypatch.setattr(f"{stream}.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda *prompt: prompts.append(*prompt) or "0.1")
+    monkeypatch.delitem(sys.modules, "readline", raising=False)
+    assert ask("How high?\n  [2.4 m]") == "0.1"
+    assert (prompts, capsys.readouterr().err) == (["  [2.4 m] "], "How high?\n")
+    assert "readline" in sys.modules
 
 
 # --- What is written -----------------------------------------------------------------------

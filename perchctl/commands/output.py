@@ -59,7 +59,15 @@ def stdin_number() -> int:
 
 
 def ask(question: str) -> str:
-    """Ask on stderr, and return the line typed. Raises EOFError at the end of the input."""
+    """Ask on stderr, on a terminal with line editing, and return the line typed. Raises EOFError at
+    the end of the input."""
+    if sys.stdin.isatty() and sys.stdout.isatty():
+        with contextlib.suppress(ImportError):
+            import readline  # noqa: F401  its import gives input() the keys of line editing
+        *above, last = question.rstrip().split("\n")
+        if above:
+            print("\n".join(above), file=sys.stderr, flush=True)
+        return input(f"{last} ")  # it draws its own prompt again while one edits
     print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
     return input()
 

@@ -8,6 +8,7 @@ import json
 import math
 import re
 import shlex
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,6 +128,7 @@ MEASURES: dict[str, tuple[str, float]] = {
 EDGES_AND_CEILING = ("front", "left", "ceiling")
 """Questions that are no keys of the profile."""
 BACK = "back"
+_TERMINAL_COLUMNS = 80
 CEILING_M = (1.0, 10.0)
 OVER_THE_CEILING_M = 0.4
 """The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
@@ -193,12 +195,11 @@ def new(
     for name in [name for name in QUESTIONS if name not in given] if defaults else []:
         answers[name] = default_answer(name, answers)
     if not QUESTIONS.keys() <= answers.keys():
-        print_lines(
-            f"A new profile: {output}. Press Enter to accept the value in brackets, or type {BACK} "
-            f"to return."
-        )
+        print_lines(f"A new profile: {output}")
+        print_lines(f"Press Enter to accept the value in brackets, or type {BACK} to return.")
         answers = ask_questions(given)
     profile, keys = profile_and_keys(answers, output.stem)
+    profile = _with_near_calibration(profile, output)
     shown = shlex.quote(str(output))
     write_files({output: (HEAD.format(name=shown) + profiles.profile_text(profile, keys)).encode()})
     if profile.camera.mirrored:
@@ -210,6 +211,15 @@ def new(
         )
     _say_doubts(profiles.load_profile(str(output.absolute())))
     print(f"wrote {output}\ncheck the plan: perchctl fly -p {shown} --dry-run")
+
+
+def _with_near_calibration(profile: profiles.Profile, output: Path) -> profiles.Profile:
+    """Return the profile with the path of a calibration in the folder of `output`, or below it,
+    relative to that folder, so that both can be moved together."""
+    path, folder = Path(profile.camera.calibration), output.absolute().parent.resolve()
+    if not (path.is_absolute() and path.is_relative_to(folder)):
+        return profile
+    return profile.with_({"camera.calibration": str(path.relative_to(folder))})
 
 
 def default_answer(name: str, answers: Answers) -> str:
@@ -243,7 +253,8 @@ def ask_questions(given: Answers) -> Answers:
         else:
             name = names[number - 1]
             default = default_answer(name, answers)
-            question = f"{number} of {len(names)}: {WORDS[name]}\n  [{_shown(name, default)}]"
+            words = _wrapped(f"{number} of {len(names)}: {WORDS[name]}")
+            question = f"{words}\n  [{_shown(name, default)}]"
         try:
             typed = _typed(question)
             if typed.lower() == BACK:
@@ -261,7 +272,22 @@ def ask_questions(given: Answers) -> Answers:
         except (PerchError, UnicodeDecodeError) as error:
             if isinstance(error, UsageError):
                 raise
-            print_lines(f"  {error}")
+            print_lines(_wrapped(str(error), "  "))
+
+
+def _wrapped(text: str, margin: str = "") -> str:
+    """Return the text in lines that a terminal of 80 columns does not break inside a word."""
+    return "\n".join(
+        textwrap.fill(
+            line,
+            _TERMINAL_COLUMNS,
+            initial_indent=margin,
+            subsequent_indent=margin,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for line in text.splitlines()
+    )
 
 
 def _typed(question: str) -> str:

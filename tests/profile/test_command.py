@@ -103,6 +103,16 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
+def test_no_question_is_broken_inside_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("perchctl.commands.profile.ask", lambda text: asked.append(text) or "")
+    assert new(tmp_path / "mine.yaml").exit_code == 0
+    assert len(asked) == len(QUESTIONS) + 1
+    assert max(len(line) for text in asked for line in text.splitlines()) <= 80
+
+
 @pytest.mark.parametrize(("confirmed", "code"), [
     ("\n", 0), ("n\n", 2), ("", 2), ("nope\nn\n", 2),
     *(pytest.param(*each, marks=pytest.mark.long) for each in (
@@ -211,6 +221,8 @@ def test_a_calibration_that_lies_there_is_offered_and_found_from_where_the_profi
     mine = made(tmp_path / "elsewhere" / "m.yaml", planner__attempts="3", **given)
     assert Path(mine.camera.calibration).samefile(own)
     assert mine.planner.attempts == 3, "any key can be given"
+    made(tmp_path / "near.yaml", **given)
+    assert f"calibration: calib/{file}\n" in (tmp_path / "near.yaml").read_text()
 
 
 @pytest.mark.parametrize(("name", "text", "allowed"), [
