@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,13 @@ from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
 GOOD = "perched"
+TRACE_S = 20.0
+"""Span of the page's trace of the error, s; `page.html` has the same."""
+PAST_PERIOD_S = 0.5
+"""Between two points of the trace that a page opened in mid-flight gets, s. Smaller: a finer trace,
+and larger messages."""
+Past = tuple[float, float | None, float | None]
+"""The time of a tick in s, and the target's lateral offset and distance above in m."""
 STEPS = [phase.value for phase in Phase if phase.is_flying and phase is not Phase.RECOVER]
 """The paper's seven phases, in the order in which a flight has them."""
 
@@ -36,6 +45,7 @@ class FlightPage:
         self._frame: Frame | None = None
         self._flying = False
         self._rescue = ""
+        self._past: deque[Past] = deque(maxlen=round(TRACE_S / PAST_PERIOD_S))
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.set_state(lambda: waiting, live=False)
 
@@ -59,10 +69,15 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(make_sketch(frame, tick.output, self._side_m))
-            describe = partial(flight_state, tick, self._drawn)
+            self._remember(tick)
+            describe = partial(flight_state, tick, self._drawn, tuple(self._past))
             self.page.set_state(describe, live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.store_error(error)
+
+    def _remember(self, tick: Tick) -> None:
+        if not self._past or tick.t_s - self._past[-1][0] >= PAST_PERIOD_S:
+            self._past.append((tick.t_s, *_off_and_below_m(tick)))
 
     def event(self, event: Event) -> None:
         if event.rest is not None:
@@ -88,14 +103,20 @@ class FlightPage:
         self.page.end({"outcome": outcome.upper(), "good": good, "reason": reason, "rows": rows})
 
 
-def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
+def _off_and_below_m(tick: Tick) -> tuple[float | None, float | None]:
+    target = tick.target
+    return (None, None) if target is None else (math.hypot(*target.e_m[:2]), float(target.e_m[2]))
+
+
+def flight_state(
+    tick: Tick, drawing_sizes: dict[str, float], past: Sequence[Past] = ()
+) -> dict[str, Any]:
     """The page's state for a tick: phase, battery, the rows of the terminal's panel, whether
     the flight is over, and for the page's drawings the height, the target's offset and distance
-    above in m (None: no target), and `drawing_sizes` (`large_m`, `gear_m`)."""
-    state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
-    off_m, below_m = (
-        (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])
-    )
+    above in m (None: no target), and `drawing_sizes` (`large_m`, `gear_m`). `past`: what a page
+    that is opened now has missed, sent as age in s, offset and distance."""
+    state, volts = tick.state, tick.telemetry.battery_v
+    off_m, below_m = _off_and_below_m(tick)
     ground_m = state.belief.ground_z_m
     return {
         "phase": state.phase.value,
@@ -107,5 +128,6 @@ def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
         "height_m": tick.telemetry.position_m[2] - ground_m,
         "off_m": off_m,
         "below_m": below_m,
+        "past": [(tick.t_s - t_s, *lengths_m) for t_s, *lengths_m in past],
         **drawing_sizes,
     }

@@ -15,6 +15,7 @@ import pytest
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
 from perchctl.display import FlightPage, FlightPanel, LivePage, Sketch
+from perchctl.display.page import PAST_PERIOD_S, TRACE_S
 from perchctl.display.serve import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
@@ -79,6 +80,20 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     state = state_of(page)
     assert (state["below_m"], state["note"]) == (None, "held: camera silent")
     assert flight.problem is None
+
+
+def test_a_page_opened_in_mid_flight_gets_the_trace_so_far(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15, 0.03)
+    for number in range(300):
+        offset = None if number % 2 else (0.3, 0.4, 1.0)
+        flight.tick(tick(START_S + 0.25 * number, e_m=offset, entered_s=START_S))
+    past = state_of(page)["past"]
+    assert len(past) == TRACE_S / PAST_PERIOD_S
+    assert [age_s for age_s, _, _ in past] == pytest.approx(
+        [0.25 + PAST_PERIOD_S * n for n in reversed(range(len(past)))]
+    )
+    assert past[-1][1:] == pytest.approx([0.5, 1.0])
+    assert f"TRACE_S = {TRACE_S:g}," in ask(page.url)[1].decode()
 
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
