@@ -67,6 +67,13 @@ def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) 
     assert run("log", "plot", OLD).stdout == "plot:      perchctl-logs/flight_old.png\n"
     assert run("log", "plot", OLD, "-o", "x.PDF").stdout == "plot:      x.PDF\n"
     assert drawn == [Path("perchctl-logs/flight_old.png"), Path("x.PDF")]
+    Path("perchctl-logs/flight_old.png").touch()  # as `fly` leaves it
+    again = run("log", "plot", OLD)
+    assert (again.code, again.stdout) == (0, "plot:      perchctl-logs/flight_old.png\n")
+    assert "add --force" in again.complaint
+    assert len(drawn) == 2
+    assert run("log", "plot", OLD, "--force").code == 0
+    assert len(drawn) == 3
 
 
 @pytest.mark.long

@@ -115,9 +115,17 @@ def plot(
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Plot a flight: detections, lost frames, height, battery and the last seconds."""
+    """Plot a flight: detections, lost frames, height, battery and the last seconds.
+
+    If fly has already drawn the plot next to the log, perchctl only prints its path.
+    """
     path = _log_file(file)
+    beside = records.path_beside(path, PLOTS[0][0])
     with _opened(path) as log:
+        if output is None and not force and beside.is_file():
+            say("this flight is plotted already; add --force to draw the plot again")
+            print(f"plot:      {beside}")
+            return
         picture = _place(path, output, PLOTS, force)
     from perchctl.analysis import plot_flight
 
