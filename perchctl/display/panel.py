@@ -41,7 +41,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
     return [
         ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
         ("error", error),
-        ("markers", f"{stage}   attempts {state.attempts}"),
+        ("markers", f"{stage}   failed attempts {state.attempts}"),
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),
         ("ages", ages),
         *([] if tick.outside is None else [("outside", _outside_text(tick.outside))]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -167,9 +168,12 @@ class FlightSummary:
             )
             lines.append(("note", note))
         if self.miss_m is not None:
-            lines.append(("miss", f"{self.miss_m * 1e3:.1f} mm"))
+            lines.append(
+                ("miss", f"{self.miss_m * 1e3:.1f} mm off centre, by the simulator's truth")
+            )
         if self.contact is not None:
-            lines.append(("contact", self.contact.text))
+            source = ", by the camera's estimate" if math.isfinite(self.contact.sigma_m) else ""
+            lines.append(("contact", f"{self.contact.text}{source}"))
         attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         lines.append(("flight", f"{self.duration_s:.1f} s, {attempts}"))
         if self.battery_min_v is not None:

@@ -119,6 +119,7 @@ def test_the_panel_fits_into_80_columns(changes: dict[str, Any]) -> None:
     assert KEY_HELP in lines[0]
     assert len(lines) == 8
     assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80
+    assert "   failed attempts 1" in dict(status_rows(shown))["markers"]
     for name, _ in status_rows(shown):
         assert sum(f" {name} " in line for line in lines) == 1, name
 
