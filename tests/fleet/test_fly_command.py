@@ -19,6 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import fleet as fleets
 from perchctl.calibration import profile_camera
+from perchctl.commands import fly_fleet
 from perchctl.commands.fly_fleet import FleetSession
 from perchctl.display import FleetPage, FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
