@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from perchctl.commands import app
 from perchctl.commands.fly import positioning_methods, with_positioning
-from perchctl.errors import SafetyAbort
+from perchctl.errors import InvalidValue, SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
 from perchctl.faults.catalogue import BY_NAME, Fault, draw_case, draw_fault_case
@@ -352,5 +352,5 @@ def test_the_command_lists_and_refuses() -> None:
     told = json.loads(simulate("--faults", "list", "--json").stdout)
     assert told["faults"] == {fault.name: fault.description for fault in FAULTS}
     refused = simulate("--faults", "hanged")
-    assert refused.exit_code == 2
+    assert refused.exit_code == InvalidValue.exit_code
     assert "--faults list" in refused.stderr

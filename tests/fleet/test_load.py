@@ -203,7 +203,7 @@ def test_two_names_of_one_camera_are_one_camera(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plugged = [device.ConnectedCamera(0, "FPV receiver", "/dev/v4l/by-id/usb-fpv")]
-    monkeypatch.setattr(device, "find_cameras", lambda *_: plugged)
+    monkeypatch.setattr(device, "_known_cameras", lambda *_: plugged)
     text = two(RADIO.format("01", 0), RADIO.format("02", "receiver"))
     words = "vehicles north and east have one camera, camera:0: give each its own source"
     assert refusal(tmp_path, text) == words
