@@ -9,7 +9,9 @@ distinguish the magnet from the floor, and both from another object.
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`CONTACT`), against an obstacle if its setpoint is above it (`BLOCKED`), and against an
-unknown object without a position (`SUPPORTED_BY_IMU`, which also covers too little thrust).
+unknown object without a position (`SUPPORTED_BY_IMU`). The last one also covers too little thrust,
+by the same threshold below hover thrust as the other is above it: `PRESS_THRUST_RATIO` moves all of
+these, and `Support.AIR`.
 `HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
 (`is_thrust_too_low_to_fly`).
 

@@ -29,8 +29,8 @@ class Maneuver:
         climbs_to_target: the vehicle climbs to the target. Close to the target, hover thrust is not
             learned because the ground effect of the ceiling supports part of the weight.
         presses: the vehicle is meant to touch the target. With the target alone, the position of
-            the last sighting may prove a contact. No hold applies because a hold would leave the
-            vehicle pressed.
+            the last sighting may prove a contact. Such a maneuver is neither in free air nor guided
+            by the camera, so that no hold applies: it would leave the vehicle pressed.
         retreats: the vehicle leaves the position where an attempt ended, so the last touch still
             counts.
         descends: the vehicle descends. The support may be the floor; the start of the descent

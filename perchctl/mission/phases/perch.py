@@ -4,10 +4,11 @@ ASCEND ends with the vehicle settled at the stand-off; PERCH has no entry action
 setpoint rises through the target, or raw thrust presses (`planner.perch` in the profile,
 `PerchConfig`). Position, acceleration and thrust together prove a contact (`CONTACT` in
 `belief/contact.py`). A contact within the magnet's radius leads to COMPLETE. A contact outside it
-leads to RECOVER, and so does a push from the side, a press that lasts too long without a sighting,
-or a press without contact; each of these is a failed attempt. The rows in `safety.py` come first,
-among them those for a magnet that catches early and for an obstacle. No hold applies in this phase
-because a hold would leave the vehicle pressed (`hold_reason`).
+leads to RECOVER, and so does a push from the side, a press without contact, and with the target
+alone a press that lasts too long without a new position; each of these is a failed attempt. The
+rows in `safety.py` come first, among them those for a magnet that catches early and for an
+obstacle. No hold applies in this phase because a hold would leave the vehicle pressed
+(`hold_reason`).
 """
 
 from __future__ import annotations
