@@ -133,7 +133,7 @@ class EmergencyStopped(PerchError):
 
 class LogIncomplete(PerchError):
     exit_code = 60
-    meaning = "perched or simulated, but a flight log is incomplete"
+    meaning = "perched, hovered or simulated, but a flight log is incomplete"
 
 
 class ReplayDiffers(PerchError):
@@ -162,6 +162,6 @@ class ProfileNote(Note):
 
 
 _ALL: list[type[PerchError]] = [PerchError, *PerchError.__subclasses__()]
-EXIT_CODES: dict[int, str] = {0: "perched (or the command did what was asked)"} | {
-    cls.exit_code: cls.meaning for cls in _ALL
-}
+EXIT_CODES: dict[int, str] = {
+    0: "perched, or hovered and landed (or the command did what was asked)"
+} | {cls.exit_code: cls.meaning for cls in _ALL}

@@ -23,7 +23,7 @@ from perchctl.analysis.story import Sentence, count_text, length_text, tell_stor
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
-from perchctl.record import path_beside, read_log, recorded_pictures, wrap_log_errors
+from perchctl.record import FlightLog, path_beside, read_log, recorded_pictures, wrap_log_errors
 from perchctl.report_page import data_url, render_template
 
 UNFINISHED = "unfinished"
@@ -117,6 +117,8 @@ class ReportedFlight:
     @property
     def outcome_grade(self) -> str:
         """Grade of the outcome: good, warn or bad."""
+        if self.flight.summary.is_hover_completed:
+            return "good"
         return GRADES.get(self.outcome, "bad")
 
     @property
@@ -124,6 +126,8 @@ class ReportedFlight:
         """The vehicle's name in a fleet, the outcome and, if known, the miss distance."""
         miss_m = self.flight.summary.miss_m
         title = OUTCOME_TITLES.get(self.outcome, self.outcome)
+        if self.flight.summary.is_hover_completed:
+            title = "Hovered and landed"
         title = f"{self.name}: {title}" if self.name else title
         return title if miss_m is None else f"{title}, {length_text(miss_m)} off centre"
 
@@ -193,10 +197,17 @@ def _render(name: str, **values: Any) -> Markup:
     return render_template(
         "perchctl.analysis",
         name,
-        seven_phases=[phase.value for phase in tuple(Phase)[:7]],
+        phases_of=mission_phases,
         plot_of=lambda flight: data_url("image/png", flight_png(flight)),
         **values,
     )
+
+
+def mission_phases(log: FlightLog) -> list[str]:
+    """The phases of a log's mission in their order: the paper's seven, or those of a hover."""
+    seven = [phase.value for phase in tuple(Phase)[:7]]
+    planner = (log.header.get("profile") or {}).get("planner") or {}
+    return [*seven[:5], Phase.HOVER.value] if planner.get("hover") else seven
 
 
 def film_url_and_problem(
@@ -227,7 +238,13 @@ def _without_folder(error: PerchError, log_path: Path) -> str:
 
 # --- What the camera saw when the mission decided: out of the recording beside the log ---
 
-DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
+DECIDED = {
+    "ESTIMATE": "found",
+    "ASCEND": "aligned",
+    "PERCH": "settled",
+    "COMPLETE": "contact",
+    "HOVER": "at its place",
+}
 WIDEST_PX = 480
 """Width to which a wider picture is reduced. Larger: a larger file."""
 REPORT_JPEG_QUALITY = 80

@@ -96,7 +96,7 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
 
 LEAST_LOSS_S = 0.3
 """A shorter gap is coasted through and changes nothing."""
-NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER"})
+NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER", "HOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 

@@ -27,10 +27,11 @@ ACTIONS = {
     "PERCH": "it pressed against the target",
     "COMPLETE": "it put its weight on the magnet",
     "RECOVER": "it backed off",
+    "HOVER": "it hovered under the target",
     "LANDING": "it landed",
 }
 FINAL_PHASE_TEXTS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
-SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH"})
+SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "HOVER"})
 """Phases whose sentence tells where the target was as they began."""
 MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
 

@@ -224,6 +224,8 @@ STATE = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "v
 # --- The faults ---
 
 
+# The phases in which a campaign's faults begin. A campaign flies perches, and its seeds have to
+# draw the same faults as ever, so HOVER is in none of these sets. Tests fly faults in it.
 AIR = (
     P.APPROACH,
     P.SEARCH,
@@ -250,6 +252,7 @@ USUAL_S = {
     P.PERCH: 1.0,
     P.COMPLETE: 5.2,
     P.RECOVER: 1.5,
+    P.HOVER: 20.0,
     P.LANDING: 5.0,
 }
 """The usual duration of each phase; a fault begins somewhere within it."""

@@ -371,6 +371,7 @@ ROW_CLAIMS: dict[str, Claims] = {
 PHASE_CLAIMS: dict[Phase, Claims] = {Phase.PERCHED: {"hangs"}, Phase.LANDED: {"stands"}}
 OUTCOME_CLAIMS: dict[Outcome, Claims] = {
     Outcome.PERCHED: {"hangs on the target"},
+    Outcome.HOVERED: {"stands"},
     Outcome.TARGET_NOT_FOUND: {"stands"},
     Outcome.ATTEMPTS_USED_UP: {"hangs or stands"},
     Outcome.SAFETY: set(),

@@ -223,10 +223,11 @@ class FactsRecorder(Facts):
 Place = tuple[float, float]
 """On the floor, world axes, m."""
 
-UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE})
+UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE, Phase.HOVER})
 STEERED_BY_TARGET = UNDER_TARGET | {Phase.ESTIMATE, Phase.ALIGN}
 TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
-FREE_AIR = frozenset(CAMERA_GUIDED) | {Phase.APPROACH}
+GUIDED_BY_CAMERA = frozenset(CAMERA_GUIDED) | {Phase.HOVER}
+FREE_AIR = GUIDED_BY_CAMERA | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
 """The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
 NO_SIGHT = (*NO_PICTURE, "covered")  # in the dark a target that is near is found
@@ -417,7 +418,7 @@ def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
         if silent and values.get("delay_s", math.inf) > safety.telemetry_land_s:
             limit_s = safety.telemetry_land_s
     elif effect.func is e.camera_fault:
-        if values["kind"] in NO_PICTURE and phase in CAMERA_GUIDED:
+        if values["kind"] in NO_PICTURE and phase in GUIDED_BY_CAMERA:
             limit_s = safety.camera_land_s
         if values["kind"] in NO_SIGHT and profile.positioning.source.is_target:
             limit_s = min(limit_s, profile.positioning.land_s)

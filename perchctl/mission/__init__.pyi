@@ -23,6 +23,7 @@ from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
+from .report import HoverReport as HoverReport
 from .report import RestReport as RestReport
 from .report import Touchdown as Touchdown
 from .report import find_rest as find_rest

@@ -74,7 +74,9 @@ def predict_hover_time_s(
     press_v = safety.min_load_v - (0.0 if lasts else MAX_PRESS_VOLTAGE_DIP_V)
     press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
     sag_v, discharge_factor = fit_sag_model(state)
-    end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
+    end_v = hover_v + sag_v * load
+    if profile.planner.hover is None:
+        end_v = max(end_v, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (
         discharge_factor * load * full_thrust_discharge_per_s(profile.vehicle.battery_mah, drive)
@@ -93,12 +95,19 @@ class MissionDurations:
 def predict_durations(c: Context) -> MissionDurations:
     """Predict how long this attempt, each retry and the landing take, from the height of the known
     target."""
-    planner = c.planner
-    up_m = max(0.0, c.belief.target.contact_body_z_m - c.telemetry.position_m[2])
-    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCH_DURATION_S
-    touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
+    planner, hover = c.planner, c.planner.hover
+    top_z_m = c.belief.target.contact_body_z_m - (0.0 if hover is None else hover.below_m)
+    up_m = max(0.0, top_z_m - c.telemetry.position_m[2])
+    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s
+    if hover is None:
+        touch_s += TOUCH_DURATION_S
+        touch_s += (
+            planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
+        )
+    else:
+        touch_s += hover.duration_s
     aligned_s = 0.0
-    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
+    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH, Phase.HOVER):
         aligned_s = (
             BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
         )

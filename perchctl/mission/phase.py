@@ -14,7 +14,7 @@ from perchctl.errors import (
 
 
 class Phase(Enum):
-    """The paper's seven phases, recovery, landing, and the three final phases."""
+    """The paper's seven phases, recovery, hover, landing, and the three final phases."""
 
     __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks phases up
 
@@ -26,6 +26,7 @@ class Phase(Enum):
     PERCH = "PERCH"
     COMPLETE = "COMPLETE"
     RECOVER = "RECOVER"
+    HOVER = "HOVER"
     LANDING = "LANDING"
     PERCHED = "PERCHED"
     LANDED = "LANDED"
@@ -58,7 +59,7 @@ FLYING_PHASES = AIRBORNE_PHASES - {Phase.LANDING}
 PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
 """Phases before a contact is proven."""
 CAMERA_GUIDED_PHASES = frozenset(
-    {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER}
+    {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER, Phase.HOVER}
 )
 """Phases in which the camera guides the vehicle: their maneuver is `is_camera_guided`."""
 FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
@@ -95,6 +96,7 @@ class Outcome(Enum):
     """Why the flight ended; each outcome has one exit code."""
 
     PERCHED = "perched"
+    HOVERED = "hovered"
     TARGET_NOT_FOUND = "target not found"
     ATTEMPTS_USED_UP = "attempts used up"
     SAFETY = "safety abort"
@@ -109,6 +111,7 @@ class Outcome(Enum):
 
 _EXIT_CODES: dict[Outcome, int] = {
     Outcome.PERCHED: 0,
+    Outcome.HOVERED: 0,
     Outcome.TARGET_NOT_FOUND: TargetNotFound.exit_code,
     Outcome.ATTEMPTS_USED_UP: AttemptsUsedUp.exit_code,
     Outcome.SAFETY: SafetyAbort.exit_code,
@@ -138,6 +141,8 @@ class Claim(Flag):
     """The camera's mounting differs from the profile, or the axes of the positions are wrong."""
     PROFILE_SUSPECT = auto()
     """The profile's camera or positioning section may be wrong and should be checked."""
+    HOVER_CONTINUES = auto()
+    """A hover has sunk below its place, and continues once the vehicle has climbed back."""
     UNCONFIRMED = auto()
     """The end of the landing could not be confirmed in time."""
 

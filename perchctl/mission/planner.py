@@ -23,11 +23,12 @@ from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.approach import MIN_HEIGHT_CONTROL_M
+from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
 from perchctl.mission.table import PHASE_CONDITIONS, PHASES, TABLE, first_transition
 from perchctl.mission.transition import Transition
-from perchctl.profile import Profile
+from perchctl.profile import HoverConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command
 
@@ -65,12 +66,24 @@ def _update_before_decision(
     if obs.new_frame:
         measured = target is not None and target.measured and target.world_m is not None
         confirmed_frames = confirmed_frames + 1 if measured else 0
+        if measured and is_hovering(state):
+            state = _add_hover_error(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
     since = update_start_times(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
     state = replace(
         state, confirmed_frames=confirmed_frames, hold=hold, since={} if hold else since
     )
     return replace(state, battery=compute_battery_outlook(Context(state)))
+
+
+def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+    """Return the state with the position error of the observation's frame."""
+    target, below_m = obs.target, (profile.planner.hover or HoverConfig()).below_m
+    assert target is not None
+    x_m, y_m, z_m = (float(each) for each in target.e_m)
+    e_m = x_m, y_m, z_m - below_m
+    errors = state.hover_errors.with_error(obs.t_s, e_m, target.e_yaw_rad)
+    return replace(state, hover_errors=errors)
 
 
 def _enter_phase(c: Context, row: Transition) -> PlannerState:

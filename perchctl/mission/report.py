@@ -123,6 +123,37 @@ def _is_significant(off: float, gate: float, sigma: float) -> bool:
 
 
 @dataclass(frozen=True)
+class HoverReport:
+    """Time and RMS position errors of a hover below the target, as the camera measured them
+    (`HoverErrors`): x forward, y left, z up, and heading."""
+
+    duration_s: float
+    below_m: float
+    rms_m: tuple[float, float, float]
+    rms_yaw_rad: float
+
+    @classmethod
+    def from_state(cls, state: PlannerState, profile: Profile) -> HoverReport | None:
+        """Return the report of the newest hover; None if there was none."""
+        hover, errors = profile.planner.hover, state.hover_errors
+        if hover is None or not errors.frames:
+            return None
+        x_m, y_m, z_m, yaw_rad = errors.rms
+        return cls(errors.duration_s, hover.below_m, (x_m, y_m, z_m), yaw_rad)
+
+    @property
+    def text(self) -> str:
+        """The report in words, for example ``20.0 s, 0.5 m below the target; RMS error x 4.1, y
+        3.0, z 6.2 mm, heading 0.8 deg``."""
+        x, y, z = (f"{1e3 * each:.1f}" for each in self.rms_m)
+        yaw = f"{math.degrees(self.rms_yaw_rad):.1f}"
+        return (
+            f"{self.duration_s:.1f} s, {self.below_m:g} m below the target; RMS error x {x}, "
+            f"y {y}, z {z} mm, heading {yaw} deg"
+        )
+
+
+@dataclass(frozen=True)
 class FlightReport:
     """How a flight ended, and its findings."""
 
@@ -136,6 +167,7 @@ class FlightReport:
     findings: Findings | None = None  # latency and mounting, if the flight was long enough
     contact: ContactOffset | None = None  # offset of a vehicle that hangs
     touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
+    hover: HoverReport | None = None  # the newest hover of a mission that hovers
     detached: tuple[str, ...] = ()  # one sentence for each watcher detached after an exception
 
     @property
@@ -166,7 +198,9 @@ class FlightReport:
             reason=_reason(state, history),
             # If a hanging vehicle is noticed after the last attempt, that attempt was counted as
             # failed.
-            attempts=state.attempts + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP),
+            attempts=state.attempts
+            + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP)
+            + int(state.outcome is Outcome.HOVERED),
             duration_s=obs.t_s - state.started_s,
             # The available telemetry is older than an emergency stop, which always locks the
             # vehicle.
@@ -177,6 +211,7 @@ class FlightReport:
             else Findings.from_camera_errors(consistency, profile.camera, simulated=simulated),
             contact=contact if placed else None,
             touchdown=find_touchdown(Context(replace(state, belief=b))),
+            hover=HoverReport.from_state(state, profile),
         )
 
 

@@ -133,7 +133,7 @@ def has_diverged(c: Context) -> bool:
 
 
 def _is_oscillating(c: Context) -> bool:
-    moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
+    moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
     most_mps = c.planner.ascend.speed_mps + OSCILLATION_CLIMB_EXCESS_MPS
     return moves and by_capture and not -OSCILLATION_SINK_MPS <= c.belief.climb_mps <= most_mps
@@ -278,13 +278,27 @@ def is_blocked_off_target(c: Context) -> bool:
 
 def is_press_thrust_insufficient(c: Context) -> bool:
     """True if no thrust remains for a press: measured at full thrust, or predicted before the
-    press."""
+    press. A mission that hovers does not press, so nothing is predicted for it."""
     if c.state.pressed:
         return False
     if c.held_s(SATURATED_THRUST) >= SATURATED_THRUST_DWELL_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
+    near = near and c.planner.hover is None
     return near and c.belief.hover_thrust > PRESS_SATURATION_FRACTION * max_press_thrust(c.profile)
+
+
+def _outcome_after_lock(before: Outcome | None) -> Outcome:
+    """Return the outcome of a locked vehicle that hangs: a landing keeps its own, except that a
+    hover ends on the floor."""
+    return Outcome.SAFETY if before is Outcome.HOVERED else before or Outcome.PERCHED
+
+
+def is_time_over(c: Context) -> bool:
+    """True if the time for all attempts has run out; a hover has its own duration in addition."""
+    hover = c.planner.hover
+    allowed_s = c.planner.perching_time_s + (0.0 if hover is None else hover.duration_s)
+    return c.t_s - c.state.started_s > allowed_s
 
 
 SAFETY_ROWS: tuple[Transition, ...] = (
@@ -300,7 +314,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.telemetry.has_bit(LOCKED) and is_hanging_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=lambda before: before or Outcome.PERCHED,  # a landing keeps its own outcome
+        outcome=_outcome_after_lock,
     ),
     supervisor_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
@@ -428,8 +442,12 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "time-over",
         PRE_CONTACT_PHASES,
-        lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
-        "the perching time has run out",
+        is_time_over,
+        lambda c: (
+            "the perching time has run out"
+            if c.planner.hover is None
+            else "the hover was not completed in time"
+        ),
         Outcome.ATTEMPTS_USED_UP,
     ),
     # --- the magnet may catch early ---

@@ -36,6 +36,44 @@ class LevelDescent:
     floor_detected_s: float | None = None  # time at which the floor was detected
 
 
+@dataclass(frozen=True)
+class HoverErrors:
+    """Position errors of the gear during a hover, from all frames that measured the target.
+
+    The errors are those of the filtered pose in the level frame: the place of the hover relative to
+    the gear along x (forward), y (left) and z (up), m, and the heading error, rad. The camera
+    measures them, so an error of its calibration or mounting, which shifts the vehicle and the
+    measurement alike, is not in them.
+    """
+
+    began_s: float = 0.0  # start of the hover
+    newest_s: float = 0.0  # time of the newest of these frames
+    frames: int = 0
+    squares: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Sums of the squares of x, y, z and yaw."""
+
+    def with_error(
+        self, t_s: float, e_m: tuple[float, float, float], e_yaw_rad: float
+    ) -> HoverErrors:
+        """Return the errors with those of one more frame at `t_s`."""
+        errors = (*e_m, e_yaw_rad)
+        x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squares, errors, strict=True))
+        return HoverErrors(self.began_s, t_s, self.frames + 1, (x2, y2, z2, yaw2))
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the start of the hover to the newest frame, s."""
+        return self.newest_s - self.began_s
+
+    @property
+    def rms(self) -> tuple[float, float, float, float]:
+        """Root mean squares of the errors in x, y, z, m, and heading, rad; NaN without a frame."""
+        if not self.frames:
+            return math.nan, math.nan, math.nan, math.nan
+        x, y, z, yaw = (math.sqrt(each / self.frames) for each in self.squares)
+        return x, y, z, yaw
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhaseEntry:
     """How the present phase was entered."""
@@ -82,6 +120,7 @@ class PlannerState:
     waiting_reason: str = ""  #: why your own row keeps the mission in its phase; empty if none does
     waited_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
+    hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
 
     @property
     def row(self) -> str:

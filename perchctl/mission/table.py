@@ -21,6 +21,7 @@ from perchctl.mission.phases.ascend import ASCEND
 from perchctl.mission.phases.complete import COMPLETE
 from perchctl.mission.phases.estimate import ESTIMATE
 from perchctl.mission.phases.final import ABORTED, LANDED, PERCHED
+from perchctl.mission.phases.hover import HOVER
 from perchctl.mission.phases.landing import LANDING
 from perchctl.mission.phases.perch import PERCH
 from perchctl.mission.phases.recover import RECOVER
@@ -41,6 +42,7 @@ PHASES: dict[Phase, PhaseDefinition] = {
         PERCH,
         COMPLETE,
         RECOVER,
+        HOVER,
         LANDING,
         PERCHED,
         LANDED,

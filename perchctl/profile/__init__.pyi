@@ -17,6 +17,7 @@ from .load import read_mask as read_mask
 from .load import read_yaml as read_yaml
 from .load import target_keys as target_keys
 from .mission import CorridorConfig as CorridorConfig
+from .mission import HoverConfig as HoverConfig
 from .mission import PlannerConfig as PlannerConfig
 from .mission import SafetyConfig as SafetyConfig
 from .positioning import PositioningConfig as PositioningConfig

@@ -176,6 +176,15 @@ class RecoverConfig(Section):
     """It lands if it is not steady by then."""
 
 
+class HoverConfig(Section):
+    """A mission that hovers below the target and lands, instead of a perch (`perchctl hover`)."""
+
+    below_m: float = key(
+        0.5, "distance of the gear below the target during the hover", ge=0.2, le=2
+    )
+    duration_s: float = key(20.0, "duration of the hover", ge=1, le=300)
+
+
 OVERDUE_SHARE = 0.5
 """Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
 
@@ -216,6 +225,9 @@ class PlannerConfig(Section):
     complete: CompleteConfig = CompleteConfig()
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
+    hover: HoverConfig | None = key(
+        None, "hover below the target instead of a perch; `perchctl hover` sets it"
+    )
     rows: str | None = key(
         None, "your own mission transitions, as `my_module:ROWS`", pattern=PATTERN
     )

@@ -15,6 +15,7 @@ from perchctl.mission import (
     Claim,
     ContactOffset,
     Findings,
+    HoverReport,
     Outcome,
     Touchdown,
     find_row_claims,
@@ -55,6 +56,7 @@ class FlightSummary:
         miss_m: true distance from gear to target centre; None if unknown.
         contact: estimated error of the contact; None unless the vehicle hangs.
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
+        hover: time and position errors of a hover; None in a mission that perches.
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
         recording: its summary; None without a recording, and in a log that is read back.
         simulated: the vehicle was; then nothing here is advice for the profile of a real one.
@@ -73,6 +75,7 @@ class FlightSummary:
     findings: Findings | None = None
     contact: ContactOffset | None = None
     touchdown: Touchdown | None = None
+    hover: HoverReport | None = None
     lost_records: int = 0
     log_problem: str | None = None
     recording: RecordingEnd | None = None
@@ -113,6 +116,7 @@ class FlightSummary:
             findings=findings,
             contact=_part_in(end, ContactOffset, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
+            hover=_part_in(end, HoverReport, _HOVER),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
             simulated=simulated,
@@ -133,12 +137,18 @@ class FlightSummary:
             "miss_m": self.miss_m,
             **_keys_of(self.contact, _CONTACT),
             **_keys_of(self.touchdown, _TOUCHDOWN),
+            **_keys_of(self.hover, _HOVER),
             "battery_min_v": self.battery_min_v,
             "locked": self.locked,
             "fell": self.fell,
             **_keys_of(self.findings, _FINDINGS),
             **({} if self.recording is None else self.recording._asdict()),
         }
+
+    @property
+    def is_hover_completed(self) -> bool:
+        """True if the vehicle hovered for the whole time, and has landed."""
+        return self.cause == Outcome.HOVERED.value and self.outcome == "landed"
 
     @property
     def reason_text(self) -> str:
@@ -174,6 +184,8 @@ class FlightSummary:
         if self.contact is not None:
             source = ", by the camera's estimate" if math.isfinite(self.contact.sigma_m) else ""
             lines.append(("contact", f"{self.contact.text}{source}"))
+        if self.hover is not None:
+            lines.append(("hover", self.hover.text))
         attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         lines.append(("flight", f"{self.duration_s:.1f} s, {attempts}"))
         if self.battery_min_v is not None:
@@ -205,6 +217,12 @@ def is_simulated(header: Mapping[str, Any]) -> bool:
 # A part of the summary by the record's keys and its own fields, in their order.
 _CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
+_HOVER = {
+    "hover_s": "duration_s",
+    "hover_below_m": "below_m",
+    "hover_rms_m": "rms_m",
+    "hover_yaw_rms_rad": "rms_yaw_rad",
+}
 _FINDINGS = {
     "latency_s": "latency_s",
     "latency_sigma_s": "latency_sigma_s",

@@ -238,6 +238,7 @@ class LogWatcher:
             findings=report.findings,
             contact=report.contact,
             touchdown=report.touchdown,
+            hover=report.hover,
             simulated=self.simulated,
             is_profile_suspect=report.is_profile_suspect,
         )

@@ -60,7 +60,7 @@ def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
     meaning = EXIT_CODES[outcome.exit_code]
     words: dict[frozenset[str], str] = {
         frozenset({"hangs on the target"}): r"^perched",
-        frozenset({"stands"}): r"landed$",
+        frozenset({"stands"}): r"landed($| \()",
         frozenset({"hangs or stands"}): r"landed.* left",
         frozenset({"motors off"}): r"motors cut",
         frozenset(): r"^safety abort$",

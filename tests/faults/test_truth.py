@@ -31,11 +31,14 @@ DT_S = 0.01
 def test_the_faults_know_the_same_phases_as_the_mission() -> None:
     """They keep sets of their own, so that a judge asks nothing of what it judges; a new phase has
     to be put into each."""
-    assert set(catalogue.CAMERA_GUIDED) == phase.CAMERA_GUIDED_PHASES
+    hover = {phase.Phase.HOVER}  # not in the phases from which a campaign draws
+    assert set(catalogue.CAMERA_GUIDED) | hover == phase.CAMERA_GUIDED_PHASES
+    assert truth.GUIDED_BY_CAMERA == phase.CAMERA_GUIDED_PHASES
     assert truth.FREE_AIR == phase.FREE_AIR_PHASES
-    assert set(catalogue.AIR) == phase.AIRBORNE_PHASES == set(catalogue.USUAL_S)
+    assert set(catalogue.AIR) | hover == phase.AIRBORNE_PHASES == set(catalogue.USUAL_S)
     assert truth.STEERED_BY_TARGET | {phase.Phase.SEARCH, phase.Phase.APPROACH} == {
-        *phase.PUBLISHED_PHASES
+        *phase.PUBLISHED_PHASES,
+        *hover,
     }
 
 

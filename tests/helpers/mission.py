@@ -15,7 +15,7 @@ from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity
-from perchctl.mission.state import LevelDescent
+from perchctl.mission.state import HoverErrors, LevelDescent
 from perchctl.mission.table import PHASE_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
@@ -48,6 +48,10 @@ IN_CORRIDOR = PROFILE.with_(
     }
 )
 """A vehicle of a fleet, right below its target."""
+HOVERING = PROFILE.with_(
+    {"planner.hover": {"below_m": 1.2 - PROFILE.vehicle.gear_body_m[2], "duration_s": 5.0}}
+)
+"""A mission that hovers with its body 1 m above the ground."""
 MOCAP, BY_TARGET = PROFILES["mocap"], PROFILES["target"]
 HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 """Height of the body that hangs with its gear at the target."""
@@ -239,4 +243,5 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         hover_thrust=HOVER_THRUST,
         battery_fit=FINE_BATTERY,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
+        hover_errors=HoverErrors(t_s, t_s),
     )

@@ -11,6 +11,7 @@ import pytest
 
 from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
 from perchctl.mission.phase import FLYING_PHASES, Severity
+from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -28,6 +29,7 @@ from tests.helpers.mission import (
     CEILING_M,
     HANG_Z_M,
     HOVER_THRUST,
+    HOVERING,
     IN_CORRIDOR,
     PROFILE,
     READY,
@@ -54,7 +56,9 @@ def _bits(bit: int) -> Event:
 
 
 STOP, LAND = "stop", "land"
-CAMERA_PHASES = {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER}
+CAMERA_PHASES = {
+    Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER, Phase.HOVER,
+}  # fmt: skip
 PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
 ALL = FLYING_PHASES | {Phase.LANDING}
 
@@ -131,6 +135,13 @@ PROFILES = {name: IN_CORRIDOR for name in EVENTS if name.startswith("corridor")}
 """The profile of an event that another one than `PROFILE` meets."""
 
 
+def _profile(phase: Phase, event: str = "") -> Profile:
+    flown = PROFILES.get(event, PROFILE)
+    if phase is not Phase.HOVER:
+        return flown
+    return flown.with_({"planner.hover": HOVERING.planner.hover})
+
+
 def _begin(phase: Phase, event: str) -> PlannerState:
     z = CEILING_M - 0.03 if phase is Phase.COMPLETE else 1.0
     state = state_in(phase, z_m=z)
@@ -139,10 +150,11 @@ def _begin(phase: Phase, event: str) -> PlannerState:
 
 def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
     event, lasts_s, *_ = EVENTS[name]
+    profile = _profile(state.phase, name)
     commands: list[object] = []
     for t_s in times(lasts_s):
         obs = event(observation(t_s, state.entry.position_m[2]))
-        state, command = planner.step_mission(state, obs, PROFILES.get(name, PROFILE))
+        state, command = planner.step_mission(state, obs, profile)
         commands.append(command)
         if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row != "":
             break
@@ -209,7 +221,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
 def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
     state = state_in(phase)
     before = state.setpoint
-    state, command = planner.step_mission(state, event(observation(10.02)), PROFILE)
+    state, command = planner.step_mission(state, event(observation(10.02)), _profile(phase))
     if state.phase is Phase.RECOVER:  # the target is lost in the ascent: down, not up
         assert isinstance(command, PositionSetpoint)
         assert before is not None
@@ -224,7 +236,7 @@ def test_an_undisturbed_phase_neither_climbs_nor_stops(phase: Phase) -> None:
     """Only search, ascent, press and take-off climb; motors stop only on proof, and nothing else
     in the table leads to a stop."""
     begin = _begin(phase, "")
-    flight = fly(begin, at(begin.entry.position_m[2]), 6.0)
+    flight = fly(begin, at(begin.entry.position_m[2]), 6.0, _profile(phase))
     assert not any(isinstance(c, EmergencyStop | StopMotors) for c in flight.commands)
     climbs = {Phase.SEARCH, Phase.ASCEND, Phase.PERCH, Phase.APPROACH, Phase.COMPLETE}
     start_z = begin.setpoint.z_m if begin.setpoint else 0.0

@@ -50,6 +50,7 @@ from tests.helpers.mission import (
     CEILING_M,
     FINE_BATTERY,
     HOVER_THRUST,
+    HOVERING,
     IN_CORRIDOR,
     MOCAP,
     PROFILE,
@@ -242,10 +243,15 @@ CASES: dict[str, Case] = {
         P.ALIGN, P.LANDING, at(battery_v=3.24), 1.0, O.SAFETY,
         state={"battery_fit": replace(FINE_BATTERY, rest_v=3.77)},
     ),
+    "hover-height": Case(
+        P.ALIGN, P.LANDING, seen(), 0.6, O.SAFETY,
+        profile=changed({"safety.max_height_m": 1.04}, HOVERING),
+    ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
     "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen(), 0.6),
     "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),
     "ascend-timeout": Case(P.ASCEND, P.RECOVER, seen(), state={"entered_s": -50.0}),
+    "at-hover-place": Case(P.ASCEND, P.HOVER, seen(), 0.5, profile=HOVERING),
     "settled": Case(P.ASCEND, P.PERCH, seen(STANDOFF_Z_M), 0.5, z_m=STANDOFF_Z_M),
     "beside-the-magnet": Case(
         P.PERCH, P.RECOVER, aside(0.06, CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
@@ -290,6 +296,10 @@ CASES: dict[str, Case] = {
         P.RECOVER, P.LANDING, at(velocity_mps=(0.5, 0.0, 0.0)), 0.1, O.SAFETY,
         state={"entered_s": 0.0},
     ),
+    "hover-lost": Case(P.HOVER, P.RECOVER, unseen(), 0.6, profile=HOVERING),
+    "left-place": Case(P.HOVER, P.ALIGN, aside(0.4), profile=HOVERING),
+    "hovered": Case(P.HOVER, P.LANDING, seen(), 5.1, O.HOVERED, profile=HOVERING),
+    "sunk": Case(P.HOVER, P.ASCEND, seen(0.9), 0.5, profile=HOVERING),
     "hung": Case(
         P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.OPERATOR,
         state={"outcome": O.OPERATOR, "stopped_s": BEGIN_S, "contact_z_m": CONTACT_Z_M},

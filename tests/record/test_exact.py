@@ -172,7 +172,7 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "why"),
-    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"), ({"speed": 1}, "speed: "),
+    [({"phase": "CIRCLE"}, "phase: 'CIRCLE' is not a valid Phase"), ({"speed": 1}, "speed: "),
      ({"t_s": "soon"}, "t_s: 'soon'"), ({"t_s": True}, "t_s: float is needed"),
      ({"command": ["Jump", {}]}, "command: 'Jump'"), ({"command": 3}, "command: "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),

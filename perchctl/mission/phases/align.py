@@ -10,8 +10,14 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low
 from perchctl.mission.phase import Phase, Severity
+from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
 from perchctl.mission.phases.recover import has_recovered
-from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.setpoints import (
+    MIN_HOLD_HEIGHT_M,
+    Action,
+    fly_under_target,
+    hold_here,
+)
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
 ALIGNED = Condition[Context](
@@ -42,6 +48,35 @@ def is_charge_too_low_to_begin(c: Context) -> bool:
     return begins and c.state.attempts < c.planner.attempts and is_charge_too_low(c)
 
 
+def hover_height_m(c: Context) -> float | None:
+    """Return the height above the ground at which the vehicle would hover below the target, m; None
+    if the mission does not hover."""
+    hover, b = c.planner.hover, c.belief
+    return None if hover is None else b.target.contact_body_z_m - hover.below_m - b.ground_z_m
+
+
+def is_hover_height_unsafe(c: Context) -> bool:
+    """True if an aligned vehicle would hover near the ground, or at the height limit."""
+    height_m = hover_height_m(c)
+    if height_m is None or not is_aligned(c):
+        return False
+    highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
+    return not MIN_HOLD_HEIGHT_M <= height_m <= highest_m
+
+
+def unsafe_hover_reason(c: Context) -> str:
+    """Return at which height the vehicle would hover, and which heights are allowed."""
+    hover, height_m = c.planner.hover, hover_height_m(c)
+    assert hover is not None
+    assert height_m is not None
+    highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
+    return (
+        f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground; the vehicle "
+        f"hovers {MIN_HOLD_HEIGHT_M:g} to {highest_m:g} m above the ground: change the distance "
+        f"below the target"
+    )
+
+
 ALIGN = PhaseDefinition(
     phase=Phase.ALIGN,
     maneuver=Maneuver(
@@ -69,6 +104,12 @@ ALIGN = PhaseDefinition(
             {Phase.ALIGN, Phase.RECOVER},
             is_charge_too_low_to_begin,
             battery_shortfall_text,
+        ),
+        land_row(
+            "hover-height",
+            {Phase.ALIGN},
+            is_hover_height_unsafe,
+            unsafe_hover_reason,
         ),
         Transition(
             "aligned", {Phase.ALIGN}, is_aligned, Phase.ASCEND, "aligned in position and heading"

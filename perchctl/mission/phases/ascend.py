@@ -1,4 +1,5 @@
-"""Phase 5, ASCEND: climb inside a cone below the target, and settle at the stand-off."""
+"""Phase 5, ASCEND: climb inside a cone below the target, and settle at the stand-off, or where the
+mission hovers."""
 
 from __future__ import annotations
 
@@ -8,8 +9,13 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.phase import Claim, Phase, Severity
+from perchctl.mission.setpoints import (
+    MAX_IN_PLACE_SPEED_MPS,
+    Action,
+    fly_under_target,
+    hold_here,
+)
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
@@ -22,10 +28,16 @@ MAX_SETPOINT_LEAD_M = 0.15
 far ahead of a weak vehicle."""
 MIN_CLIMB_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
+HOVER_HEIGHT_TOLERANCE_M = 0.05
+"""Largest vertical distance from the hover's place at which the vehicle has reached it, m. Larger:
+the hover begins during the climb. Smaller: an error of the height keeps it from beginning."""
+HOVER_SETPOINT_TOLERANCE_M = 0.01
+"""The same distance of the setpoint, m, which stays at this height during the hover. Larger: the
+vehicle hovers too low. Smaller: noise of the target's height keeps the hover from beginning."""
 MAX_TARGET_LOST_S = 1.5
-"""Time since the last sighting of the target after which an ascent is given up, s, if a positioning
-system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that has moved
-or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
+"""Time since the last sighting of the target after which an ascent or a hover is given up, s, if a
+positioning system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that
+has moved or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
 
 
 def cone_radius_m(c: Context) -> float:
@@ -35,10 +47,15 @@ def cone_radius_m(c: Context) -> float:
     return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.error_z_m)
 
 
+def standoff_m(c: Context) -> float:
+    """Return the distance of the gear below the target at which the ascent ends, m."""
+    hover = c.planner.hover
+    return c.planner.ascend.standoff_m if hover is None else hover.below_m
+
+
 def is_near_standoff(c: Context) -> bool:
     """True if the gear has reached the height at which the ascent settles."""
-    ascend = c.planner.ascend
-    return c.belief.target.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+    return c.belief.target.error_z_m <= standoff_m(c) + c.planner.ascend.settle_z_m
 
 
 def _is_settled(c: Context) -> bool:
@@ -55,7 +72,29 @@ def _is_settled(c: Context) -> bool:
     )
 
 
-def _is_target_lost(c: Context) -> bool:
+def _is_at_hover_place(c: Context) -> bool:
+    """True if the vehicle is slow, with the gear aligned below a fresh target where the mission
+    hovers. The tolerances are those of ALIGN, since the small marker may be too far away to be
+    seen."""
+    align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
+    goal_z_m = target.contact_body_z_m - standoff_m(c)
+    return (
+        target.is_fresh
+        and setpoint is not None
+        and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_TOLERANCE_M
+        and abs(target.error_z_m - standoff_m(c)) <= HOVER_HEIGHT_TOLERANCE_M
+        and target.error_xy_m <= align.xy_m
+        and abs(target.error_yaw_rad) <= math.radians(align.yaw_deg)
+        and c.belief.speed_mps <= MAX_IN_PLACE_SPEED_MPS
+    )
+
+
+def is_climbing_back(state: PlannerState) -> bool:
+    """True if the ascent brings a hover that has sunk back to its place."""
+    return state.phase is Phase.ASCEND and Claim.HOVER_CONTINUES in state.entry.claims
+
+
+def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, every moment without it is too long, since the position drifts."""
     b = c.belief
@@ -69,6 +108,10 @@ NEAR_STANDOFF = Condition[Context](
 """The gear is at the stand-off below a tracked target."""
 SETTLED = Condition[Context]("settled", _is_settled)
 """The vehicle is slow and aligned at the stand-off."""
+AT_HOVER_PLACE = Condition[Context](
+    "at the hover's place", lambda c: c.planner.hover is not None and _is_at_hover_place(c)
+)
+"""The mission hovers, and the vehicle is slow and aligned where it does."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
@@ -82,7 +125,7 @@ def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
-    goal_z = target.contact_body_z_m - ascend.standoff_m
+    goal_z = target.contact_body_z_m - standoff_m(c)
     may_climb = target.is_fresh and target.error_xy_m < CLIMB_CONE_FRACTION * cone_radius_m(c)
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
@@ -103,12 +146,12 @@ ASCEND = PhaseDefinition(
     ),
     enter=enter,
     act=act,
-    conditions=(NEAR_STANDOFF, SETTLED),
+    conditions=(NEAR_STANDOFF, SETTLED, AT_HOVER_PLACE),
     exits=(
         back_off_row(
             "ascend-lost",
             {Phase.ASCEND},
-            _is_target_lost,
+            is_target_lost,
             "target lost during the ascent",
         ),
         Transition(
@@ -129,9 +172,18 @@ ASCEND = PhaseDefinition(
             "did not settle under the target",
         ),
         Transition(
+            "at-hover-place",
+            {Phase.ASCEND},
+            lambda c: c.held_s(AT_HOVER_PLACE) >= c.planner.ascend.settle_dwell_s,
+            Phase.HOVER,
+            lambda c: f"steady {standoff_m(c):g} m below the target",
+        ),
+        Transition(
             "settled",
             {Phase.ASCEND},
-            lambda c: c.held_s(SETTLED) >= c.planner.ascend.settle_dwell_s,
+            lambda c: (
+                c.planner.hover is None and c.held_s(SETTLED) >= c.planner.ascend.settle_dwell_s
+            ),
             Phase.PERCH,
             "settled at the stand-off",
         ),

@@ -60,7 +60,10 @@ def unconfirmed_reason(c: Context) -> str:
 
 
 def _outcome_after_hanging(before: Outcome | None) -> Outcome | None:
-    """Return the outcome of a vehicle that hangs: it has found its target after all."""
+    """Return the outcome of a vehicle that hangs: it has found its target after all. A hover that
+    ends on the magnet has gone wrong."""
+    if before is Outcome.HOVERED:
+        return Outcome.SAFETY
     return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before
 
 

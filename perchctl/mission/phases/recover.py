@@ -149,7 +149,11 @@ RECOVER = PhaseDefinition(
             lambda c: (
                 c.state.attempts >= c.planner.attempts and c.in_phase_s > LAST_RECOVERY_DURATION_S
             ),
-            "all perching attempts are used up",
+            lambda c: (
+                "all perching attempts are used up"
+                if c.planner.hover is None
+                else "all attempts to hover are used up"
+            ),
             Outcome.ATTEMPTS_USED_UP,
         ),
         Transition(

@@ -108,6 +108,7 @@ FLIGHTS: dict[str, Callable[[Path], None]] = {
     "perched": _fly,
     "searched-out": partial(_fly, changes={"simulation.no_target": True}),
     "slipped": partial(_fly, changes={"simulation.first_contact_fails": 1.0}),
+    "hovered": partial(_fly, changes={"planner.hover": {"below_m": 0.6, "duration_s": 1.0}}),
     "seen": _seen,
     "stopped": partial(_fly, operator_at={Phase.ALIGN: Operator.STOP}),
     "link-silent": partial(_fault, fault="link-silent", seed=2),
@@ -115,8 +116,8 @@ FLIGHTS: dict[str, Callable[[Path], None]] = {
     "hung": partial(_fault, fault="hung", seed=2),
     "external-occluded": partial(_fault, fault="external-occluded", seed=6),
 }
-"""Perched; landed without a target; a contact that fails; cut by the operator; hung within two
-turns; and faults of the link, of the loop and of positions from outside."""
+"""Perched; landed without a target; a contact that fails; hovered and landed; cut by the operator;
+hung within two turns; and faults of the link, of the loop and of positions from outside."""
 
 
 def made(name: str) -> Path:

@@ -1,0 +1,140 @@
+"""HOVER: hold below the target for a time, then land; the mission of `perchctl hover`.
+
+The mission is that of a perch up to ASCEND, which ends at the hover's place instead of the
+stand-off. HOVER itself never climbs. A vehicle that sinks below its place, for example because the
+estimated height drifts, climbs back in ASCEND, and its time goes on meanwhile. A vehicle that
+leaves its place returns to ALIGN, and its time starts anew. So a hover that is completed has kept
+its place for the whole time.
+"""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Claim, Outcome, Phase, Severity
+from perchctl.mission.phases.ascend import cone_radius_m, is_climbing_back, is_target_lost
+from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.state import HoverErrors, PlannerState
+from perchctl.mission.transition import Transition, back_off_row, land_row
+from perchctl.profile import HoverConfig
+from perchctl.values import replace
+
+MAX_HOVER_RISE_M = 0.02
+"""Height of the setpoint above the hover's place from which it sinks, m. Larger: a drift of the
+estimated height brings the vehicle closer to the ceiling. Smaller: the noise of the target's height
+lowers it step by step."""
+MAX_HOVER_SINK_M = 0.06
+"""Distance below the hover's place from which the vehicle climbs back, m. Larger: a drift of the
+estimated height moves the vehicle further. Smaller: the noise of the target's height makes it climb
+back needlessly."""
+HOVER_SINK_DWELL_S = 0.3
+"""Time for which the vehicle must be so low, s."""
+MAX_CLIMB_BACK_S = 5.0
+"""Longest time of a climb back after which the hover's time goes on, s. Larger: a weak vehicle
+counts as hovering although it is too low. Smaller: a windy climb starts the time anew."""
+MAX_HOVER_HEIGHT_ERROR_M = 0.15
+"""Vertical distance from its place at which the vehicle has left it, m. Larger: a hover that sinks
+or rises still counts. Smaller: a gust starts the time anew."""
+
+SUNK = Condition[Context]("sunk", lambda c: height_error_m(c) > MAX_HOVER_SINK_M)
+"""The vehicle is too low for a hover."""
+
+
+def hover_of(c: Context) -> HoverConfig:
+    """Return the hover that the mission flies."""
+    return c.planner.hover or HoverConfig()
+
+
+def is_hovering(state: PlannerState) -> bool:
+    """True while the hover's time runs."""
+    return state.phase is Phase.HOVER or is_climbing_back(state)
+
+
+def hover_duration_s(c: Context) -> float:
+    """Return the time since the hover began, s."""
+    return c.t_s - c.state.hover_errors.began_s
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """Start the hover's time and its position errors, unless the vehicle has only climbed back."""
+    if is_climbing_back(before.state) and before.in_phase_s <= MAX_CLIMB_BACK_S:
+        return state
+    return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
+
+
+def act(c: Context) -> Action:
+    """Stay under the target at the setpoint's height; sink if the target is nearer than it should
+    be."""
+    old = c.state.setpoint or hold_here(c)
+    goal_z_m = c.belief.target.contact_body_z_m - hover_of(c).below_m
+    return fly_under_target(c, min(old.z_m, goal_z_m + MAX_HOVER_RISE_M))
+
+
+def height_error_m(c: Context) -> float:
+    """Return how far the vehicle is below its place, m; negative above it."""
+    return c.belief.target.error_z_m - hover_of(c).below_m
+
+
+def has_left_place(c: Context) -> bool:
+    """True if the vehicle is outside the cone, or too high or too low."""
+    lateral_m = c.belief.target.error_xy_m
+    return lateral_m > cone_radius_m(c) or abs(height_error_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
+
+
+def left_place_reason(c: Context) -> str:
+    """Return how far the vehicle is from its place."""
+    return (
+        f"moved {c.belief.target.error_xy_m:.2f} m to the side and {abs(height_error_m(c)):.2f} m "
+        f"{'down' if height_error_m(c) > 0.0 else 'up'} from its place"
+    )
+
+
+HOVER = PhaseDefinition(
+    phase=Phase.HOVER,
+    maneuver=Maneuver(
+        in_free_air=True,
+        is_camera_guided=True,
+        needs_pictures=True,
+        learns_hover_thrust=True,
+        climbs_to_target=True,
+    ),
+    enter=enter,
+    act=act,
+    conditions=(SUNK,),
+    exits=(
+        back_off_row(
+            "hover-lost",
+            {Phase.HOVER},
+            is_target_lost,
+            "target lost during the hover",
+        ),
+        Transition(
+            "left-place",
+            {Phase.HOVER},
+            has_left_place,
+            Phase.ALIGN,
+            left_place_reason,
+            Severity.HOLD,
+        ),
+        land_row(
+            "hovered",
+            {Phase.HOVER},
+            lambda c: hover_duration_s(c) >= hover_of(c).duration_s and c.belief.target.is_fresh,
+            lambda c: (
+                f"hovered for {hover_of(c).duration_s:g} s, {hover_of(c).below_m:g} m below the "
+                f"target"
+            ),
+            Outcome.HOVERED,
+        ),
+        Transition(
+            "sunk",
+            {Phase.HOVER},
+            lambda c: c.held_s(SUNK) >= HOVER_SINK_DWELL_S,
+            Phase.ASCEND,
+            lambda c: f"{height_error_m(c):.2f} m too low: climbing back",
+            claims=Claim.HOVER_CONTINUES,
+        ),
+    ),
+)
