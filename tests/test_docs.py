@@ -101,7 +101,7 @@ def cheap(line: str) -> list[str]:
     """The same command, kept from arming anything and from working for minutes."""
     words = shlex.split(line)
     match words[:2]:
-        case ["perchctl", "fly"] if "--dry-run" not in words:
+        case ["perchctl", "fly" | "hover"] if "--dry-run" not in words:
             words.append("--dry-run")
         case ["perchctl", "fleet"] if "fly" in words and "--dry-run" not in words:
             words.append("--dry-run")

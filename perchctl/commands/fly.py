@@ -53,6 +53,27 @@ from perchctl.errors import (
     UsageError,
 )
 
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of the simulated scenario. Default: 11.")
+]
+LogDirOption = Annotated[
+    Path | None, typer.Option("--log-dir", help="Folder for the flight log and plot.")
+]
+RecordOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--record/--no-record",
+        help="Record the pictures to an MCAP file next to the log. Default: only for a real "
+        "vehicle.",
+    ),
+]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Show the resolved plan, and connect to nothing.")
+]
+YesOption = Annotated[
+    bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")
+]
+
 app = new_app()
 
 
@@ -68,26 +89,11 @@ def fly(
     uri: UriOption = None,
     source: SourceOption = None,
     positioning: PositioningOption = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", help="Seed of the simulated scenario. Default: 11.")
-    ] = None,
-    log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder for the flight log and plot.")
-    ] = None,
-    record: Annotated[
-        bool | None,
-        typer.Option(
-            "--record/--no-record",
-            help="Record the pictures to an MCAP file next to the log. Default: only for a real "
-            "vehicle.",
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the resolved plan, and connect to nothing.")
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")
-    ] = False,
+    seed: SeedOption = None,
+    log_dir: LogDirOption = None,
+    record: RecordOption = None,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
     as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> int:
@@ -98,12 +104,30 @@ def fly(
     """
     say_on_terminal(f"reading profile {profile}")
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
+    refuse_hover(options.profile)
+    return plan_or_fly(options, dry_run=dry_run, yes=yes, as_json=as_json, view=view)
+
+
+def refuse_hover(profile: profiles.Profile) -> None:
+    """Raise InvalidValue for a profile whose mission hovers, for a command that perches."""
+    if profile.planner.hover is not None:
+        raise InvalidValue(
+            "planner.hover is set, so the vehicle would hover instead of perching: remove it from "
+            "the profile, or use `perchctl hover`"
+        )
+
+
+def plan_or_fly(
+    options: flights.FlyOptions, *, dry_run: bool, yes: bool, as_json: bool, view: bool
+) -> int:
+    """Show the plan of a flight, or fly it; return the exit code. Errors: UsageError without a
+    terminal for the confirmation, and those of the flight."""
     if dry_run:
         refused = plan_problem(options)
         print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))
         if refused is None:
             return 0
-        say(f"fly would refuse this: {refused}")
+        say(f"{command_name(options.profile)} would refuse this: {refused}")
         return refused.exit_code
     for warning in checks.warnings_before_flight(options):
         say(f"check: {warning}")
@@ -141,6 +165,11 @@ def resolve_options(
     options = replace(options, record=not options.simulated if record is None else record)
     flights.check_options(options)
     return options
+
+
+def command_name(profile: profiles.Profile) -> str:
+    """Return the name of the command that flies the profile's mission."""
+    return "fly" if profile.planner.hover is None else "hover"
 
 
 def with_positioning(profile: profiles.Profile, method: str | None) -> profiles.Profile:
@@ -283,7 +312,7 @@ def flight_page(
     if not view:
         yield None
         return
-    title = f"perchctl fly {options.uri}"
+    title = f"perchctl {command_name(options.profile)} {options.uri}"
     camera = calibrations.profile_camera(options.profile.camera)
     with displays.live_page(camera, title, view, say, switch.land, switch.cut) as page:
         yield None if page is None else displays.FlightPage.of(page, options.profile)
@@ -376,6 +405,10 @@ def plan_text(options: flights.FlyOptions) -> str:
         ),
         ("log", f"{resolved['log_directory']}{', with pictures' if options.record else ''}"),
     ]
+    if planner.hover is not None:
+        below_m, duration_s = planner.hover.below_m, planner.hover.duration_s
+        mission = f"hover {below_m:g} m below the target for {duration_s:g} s, then land"
+        rows.insert(rows.index(next(row for row in rows if row[0] == "path")), ("mission", mission))
     rows += [
         (row["verdict"], f"{row['name']}: {row['found']}; {row['advice']}")
         for row in resolved["check"]

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from perchctl.display.fleet_panel import FleetRow
-from perchctl.display.page import STEPS
+from perchctl.display.page import PERCH_STEPS
 from perchctl.display.serve import Page
 from perchctl.mission import Phase
 
@@ -64,9 +64,9 @@ class FleetPage(Page):
         """Show these vehicles. With `live`, the page warns when this is no longer called."""
         for row in rows:
             if row.hangs or row.phase == Phase.PERCHED.value:
-                self._reached[row.name] = len(STEPS)
-            elif row.phase in STEPS:
-                self._reached[row.name] = STEPS.index(row.phase)
+                self._reached[row.name] = len(PERCH_STEPS)
+            elif row.phase in PERCH_STEPS:
+                self._reached[row.name] = PERCH_STEPS.index(row.phase)
         self._rows = tuple(rows)
         self.set_state(self._tiles, live=live and not all(row.has_ended for row in rows))
 
@@ -82,7 +82,7 @@ class FleetPage(Page):
     def _tiles(self) -> dict[str, Any]:
         rows = self._rows
         return {
-            "steps": STEPS,
+            "steps": PERCH_STEPS,
             "vehicles": [self._tile(row) for row in rows],
             "events": list(self._events),
             "over": bool(rows) and all(row.has_ended for row in rows),

@@ -12,12 +12,11 @@ from typing import Any
 
 from perchctl.display.live import LivePage, Sketch, make_sketch
 from perchctl.display.panel import status_rows
-from perchctl.mission import Event, Phase, Tick
+from perchctl.mission import Event, Outcome, Phase, Tick
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
-GOOD = "perched"
 TRACE_S = 20.0
 """Span of the page's trace of the error, s; `page.html` has the same."""
 PAST_PERIOD_S = 0.5
@@ -25,8 +24,10 @@ PAST_PERIOD_S = 0.5
 and larger messages."""
 Past = tuple[float, float | None, float | None]
 """The time of a tick in s, and the target's lateral offset and distance above in m."""
-STEPS = [phase.value for phase in Phase if phase.is_flying and phase is not Phase.RECOVER]
+PERCH_STEPS = [phase.value for phase in tuple(Phase)[:7]]
 """The paper's seven phases, in the order in which a flight has them."""
+HOVER_STEPS = [*PERCH_STEPS[:5], Phase.HOVER.value]
+"""The phases of a mission that hovers, in their order."""
 
 
 class FlightPage:
@@ -86,7 +87,8 @@ class FlightPage:
     def end(self, summary: FlightSummary, log: Path) -> None:
         """Show the flight's outcome, its log, and the command for a report, as the final state."""
         rows = [list(row) for row in summary.rows()]
-        self._end(summary.outcome, summary.reason_text, rows, log)
+        good = summary.outcome == "perched" or summary.is_hover_completed
+        self._end(summary.outcome, summary.reason_text, rows, log, good)
 
     def fail(self, error: BaseException, log: Path | None) -> None:
         """Show that the flight ended in an error or never began, with the rescue's report, and the
@@ -94,12 +96,18 @@ class FlightPage:
         rows = [["flight", self._rescue]] if self._rescue else []
         self._end("failed", str(error) or type(error).__name__, rows, log)
 
-    def _end(self, outcome: str, reason: str, rows: list[list[str]], log: Path | None) -> None:
+    def _end(
+        self,
+        outcome: str,
+        reason: str,
+        rows: list[list[str]],
+        log: Path | None,
+        good: bool = False,
+    ) -> None:
         if log is not None:
             path = log.resolve()
             command = f"perchctl log report {shlex.quote(str(path))}"
             rows = [*rows, ["log", str(path)], ["report", command]]
-        good = outcome == GOOD
         self.page.end({"outcome": outcome.upper(), "good": good, "reason": reason, "rows": rows})
 
 
@@ -117,14 +125,15 @@ def flight_state(
     that is opened now has missed, sent as age in s, offset and distance."""
     state, volts = tick.state, tick.telemetry.battery_v
     off_m, below_m = _off_and_below_m(tick)
-    ground_m = state.belief.ground_z_m
+    ground_m, hover = state.belief.ground_z_m, state.belief.profile.planner.hover
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "rows": [list(row) for row in status_rows(tick) if row[0] != "phase"],
         "note": f"held: {state.pause_reason}" if state.pause_reason else "",
         "over": state.phase.is_over,
-        "steps": STEPS,
+        "steps": PERCH_STEPS if hover is None else HOVER_STEPS,
+        "done": state.phase is Phase.PERCHED or state.outcome is Outcome.HOVERED,
         "height_m": tick.telemetry.position_m[2] - ground_m,
         "off_m": off_m,
         "below_m": below_m,

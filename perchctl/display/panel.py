@@ -16,7 +16,7 @@ from perchctl.display.terminal import (
     frame_table,
     phase_style,
 )
-from perchctl.mission import Event, EventKind, ExternalPositions, Tick
+from perchctl.mission import Event, EventKind, ExternalPositions, Phase, PlannerState, Tick
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -45,8 +45,22 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),
         ("ages", ages),
         *([] if tick.outside is None else [("outside", _outside_text(tick.outside))]),
+        *([("hover", _hover_text(state))] if state.phase is Phase.HOVER else []),
         ("held" if state.pause_reason else "reason", state.pause_reason or state.reason),
     ]
+
+
+def _hover_text(state: PlannerState) -> str:
+    errors, hover = state.hover_errors, state.belief.profile.planner.hover
+    of = "" if hover is None else f" of {hover.duration_s:g}"
+    *axes, yaw_rad = errors.rms
+    if not errors.frames:
+        return f"{errors.duration_s:.0f}{of} s"
+    x, y, z = (f"{1e3 * each:.1f}" for each in axes)
+    return (
+        f"{errors.duration_s:.0f}{of} s   RMS x {x}  y {y}  z {z} mm   "
+        f"yaw {math.degrees(yaw_rad):.1f} deg"
+    )
 
 
 def _battery_text(tick: Tick) -> str:
@@ -127,8 +141,9 @@ class FlightPanel(TerminalDisplay):
 
 
 def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
-    """The status panel of a tick: at most `PANEL_COLUMNS` columns and eight lines, nine with
-    external positions. `below` and `above` are sentences in its frame."""
+    """The status panel of a tick: at most `PANEL_COLUMNS` columns and eight lines, one more
+    with external positions, and one more during a hover. `below` and `above` are sentences in its
+    frame."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")

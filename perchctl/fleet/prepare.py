@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from perchctl.check import warnings_before_flight
-from perchctl.errors import PerchError
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.fleet.fleet import vehicle_seed
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.schedule import flown_profile
@@ -106,6 +106,8 @@ def flight_options(
         )
         with naming(vehicle.name):
             check_options(each)
+            if each.profile.planner.hover is not None:
+                raise InvalidValue("planner.hover is set, but a fleet perches: remove it")
         options[vehicle.name] = each
     return options
 

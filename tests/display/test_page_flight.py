@@ -30,9 +30,10 @@ from perchctl.mission import (
     Watcher,
 )
 from perchctl.profile import load_profile
+from perchctl.record import FlightSummary
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
-from tests.helpers.live_page import CORNERS, ask, press, tick
+from tests.helpers.live_page import CORNERS, ask, hover_tick, press, tick
 from tests.helpers.mission import entered, note
 
 START_S = 100.0
@@ -124,6 +125,19 @@ def test_the_numbers_tell_their_age(page: LivePage, clock: list[float]) -> None:
     clock[0] += 3.25  # the loop hangs, the page's threads do not
     state = state_of(page)
     assert (state["age_s"], state["fresh"]) == (3.25, False)
+
+
+def test_a_hover_has_steps_of_its_own_and_is_done_once_it_lands(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15, 0.03)
+    flight.tick(hover_tick())
+    state = state_of(page)
+    steps = ["APPROACH", "SEARCH", "ESTIMATE", "ALIGN", "ASCEND", "HOVER"]
+    assert (state["steps"], state["done"]) == (steps, False)
+    flight.tick(hover_tick("LANDING", Outcome.HOVERED))
+    assert state_of(page)["done"]
+    summary = FlightSummary("landed", "motors off", Outcome.HOVERED.value)
+    flight.end(summary, Path("flight.jsonl"))
+    assert state_of(page)["card"]["good"]
 
 
 @pytest.mark.parametrize("phase", OVER)

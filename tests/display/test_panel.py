@@ -16,7 +16,7 @@ from perchctl.display import FlightPanel
 from perchctl.display.panel import status_panel, status_rows
 from perchctl.flight import KEY_HELP, STOP_HELP
 from perchctl.mission import Phase
-from tests.helpers.live_page import tick
+from tests.helpers.live_page import hover_tick, tick
 from tests.helpers.mission import entered, held, note
 from tests.helpers.waiting import until
 
@@ -81,6 +81,12 @@ def test_the_panel_on_a_terminal(terminal: Terminal) -> None:
     assert COLOUR.search(terminal.getvalue())
     line = next(line for line in terminal.getvalue().splitlines() if "radio://" in line)
     assert not COLOUR.search(line)
+
+
+def test_the_panel_shows_the_errors_of_a_hover_while_it_lasts() -> None:
+    rows = dict(status_rows(hover_tick()))
+    assert rows["hover"] == "1 of 5 s   RMS x 3.0  y 0.0  z 4.0 mm   yaw 5.7 deg"
+    assert "hover" not in dict(status_rows(hover_tick("LANDING")))
 
 
 @pytest.mark.parametrize("name", ["NO_COLOR", "TERM"])

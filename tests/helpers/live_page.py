@@ -11,11 +11,11 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from perchctl.display.serve import TOKEN_HEADER
-from perchctl.mission import Observation, Phase, Tick
-from perchctl.mission.state import BatteryOutlook
+from perchctl.mission import Observation, Outcome, Phase, Tick
+from perchctl.mission.state import BatteryOutlook, HoverErrors
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
-from tests.helpers.mission import state_with
+from tests.helpers.mission import HOVERING, state_with
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
 
@@ -42,6 +42,18 @@ def tick(
     obs = Observation(t_s, sample, seen, camera_age_s=camera_age_s, loop_late_s=0.001)
     turn = synthetic.flown_turn(obs, command)
     return Tick(turn=turn, state=state, output=output)
+
+
+def hover_tick(phase: str = "HOVER", outcome: Outcome | None = None) -> Tick:
+    """A moment of a mission that hovers, after two frames: 3 mm ahead, 4 mm low, turned by 0.1."""
+    errors = HoverErrors(100.0)
+    for t_s in (100.5, 101.0):
+        errors = errors.with_error(t_s, (0.003, 0.0, 0.004), 0.1)
+    told = tick(phase=phase, reason="steady 1.17 m below the target")
+    belief = replace(told.state.belief, profile=HOVERING)
+    return replace(
+        told, state=replace(told.state, belief=belief, hover_errors=errors, outcome=outcome)
+    )
 
 
 def ask(
