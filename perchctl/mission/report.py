@@ -143,14 +143,11 @@ class HoverReport:
 
     @property
     def text(self) -> str:
-        """The report in words, for example ``20.0 s, 0.5 m below the target; RMS error x 4.1, y
-        3.0, z 6.2 mm, heading 0.8 deg``."""
+        """The report in words, for example ``20.0 s; RMS error x 4.1, y 3.0, z 6.2 mm, heading 0.8
+        deg``."""
         x, y, z = (f"{1e3 * each:.1f}" for each in self.rms_m)
         yaw = f"{math.degrees(self.rms_yaw_rad):.1f}"
-        return (
-            f"{self.duration_s:.1f} s, {self.below_m:g} m below the target; RMS error x {x}, "
-            f"y {y}, z {z} mm, heading {yaw} deg"
-        )
+        return f"{self.duration_s:.1f} s; RMS error x {x}, y {y}, z {z} mm, heading {yaw} deg"
 
 
 @dataclass(frozen=True)
