@@ -93,6 +93,7 @@ FIRST_WORDS = {
     "check --cameras": "listing the cameras",
     "check --scan": "scanning all channels and rates",
     "fly": "reading profile sim",
+    "hover": "reading profile sim",
     "fleet check": "reading the example fleet",
     "fleet fly mine.yaml": "reading fleet mine.yaml",
     "fleet simulate": "reading the example fleet",

@@ -281,6 +281,7 @@ def test_a_vehicle_that_is_back_hears_nothing_of_a_flight_that_is_over(
     old = carrier.driver
     end(flight)
     until(lambda: carrier.driver is not old and not carrier._waiting)
+    monkeypatch.setattr(sharing, "LINGER_S", 60.0)  # the next flight speaks once a second
     vehicle.silent = False
     bench.flights[FOUR[1]] = Flight(bench.hub.uris[FOUR[1]])
     bench.flights[FOUR[1]].send(99)
