@@ -210,7 +210,7 @@ def test_convert(tmp_path: Path) -> None:
         "  distortion_coeffs: [0.01, 0.02, -0.01, 0.002]\n"
         "  intrinsics: [300.5, 301.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
     )
-    output = tmp_path / "new" / "camera.yaml"
+    output = tmp_path / "camera.yaml"
     assert calibrate("convert", kalibr, "-o", output).exit_code == 0
     camera = load_calibration(output)
     assert camera.model == "fisheye"

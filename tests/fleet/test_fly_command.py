@@ -23,7 +23,7 @@ from perchctl.commands import fly_fleet
 from perchctl.commands.fly_fleet import FleetSession
 from perchctl.display import FleetPage, FleetPanel
 from perchctl.display.fleet_panel import FleetRow, fleet_table
-from perchctl.errors import PerchError
+from perchctl.errors import NotFound, PerchError
 from perchctl.fleet import (
     Coordinator,
     FleetOutcome,
@@ -460,7 +460,7 @@ def test_one_that_does_not_answer_and_nothing_arms(tmp_path: Path) -> None:
     bad = two(tmp_path, ", uri: 'udp://127.0.0.1:9', source: 'http://127.0.0.1:9/'")
     done = run_apart("fleet", "fly", str(bad), "--yes", "--log-dir", str(tmp_path / "logs"))
     sentence = done.stderr.splitlines()[-1]
-    assert done.code == 40, done.stderr
+    assert done.code == NotFound.exit_code, done.stderr
     assert sentence.startswith("perchctl: east: http://127.0.0.1:9/ delivered no picture")
     assert sentence.endswith("no vehicle was armed")
     assert "APPROACH" not in done.stderr
