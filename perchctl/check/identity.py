@@ -26,7 +26,7 @@ from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.rehearsal import Rehearsal, rehearse
-from perchctl.check.row import Finding, Row, failed, passed, skipped, skipped_rows
+from perchctl.check.row import Finding, Row, Verdict, failed, passed, skipped, skipped_rows
 from perchctl.check.session import CheckScope, MocapOrError, open_room, start_if_simulated
 from perchctl.corridor import Point
 from perchctl.errors import ConnectionFailed, PerchError
@@ -110,7 +110,7 @@ def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask
             return
         stack.callback(source.close)
         size = camera.size_finding(source.size_px, calibrated.size_px)
-        if size.verdict != "pass":
+        if size.verdict is not Verdict.PASS:
             yield Row("camera", *size)
             yield from skipped_rows(["target"], "pictures of another size cannot be checked")
             return

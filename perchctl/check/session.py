@@ -13,7 +13,7 @@ from perchctl.camera import FrameSource, open_camera, parse_source, without_pass
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.profile import offline_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
-from perchctl.check.row import Finding, Row, evaluate_row, passed, skipped, skipped_rows
+from perchctl.check.row import Finding, Row, Verdict, evaluate_row, passed, skipped, skipped_rows
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight import FlyOptions, WallClock, check_options, start_simulated_vehicle
 from perchctl.link import ProbeLink, check_uri, find_uris_and_problem
@@ -221,7 +221,7 @@ def _camera_rows(
     """Yields the rows; returns the rehearsal, None where there could be none."""
     size = camera.size_finding(source.size_px, pipeline.camera.size_px)
     yield Row("size", *size)
-    if size.verdict != "pass":
+    if size.verdict is not Verdict.PASS:
         why = "pictures of another size cannot be checked"
         yield from skipped_rows(camera.picture_row_names(profile), why)
         return None
