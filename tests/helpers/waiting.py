@@ -10,8 +10,8 @@ from typing import Any
 
 
 def until(condition: Callable[[], Any], limit_s: float = 60.0) -> Any:
-    """What `condition` returns once that is true; fails when it stays away so long, which a busy
-    computer does not."""
+    """What `condition` returns once that is true. Fails after `limit_s`, more than even a busy
+    computer needs."""
     end_s, pause = time.monotonic() + limit_s, threading.Event()
     while not (value := condition()):
         assert time.monotonic() < end_s, "waited in vain"

@@ -2,9 +2,9 @@
 
 The mission is that of a perch up to ASCEND, which ends at the hover's place instead of the
 stand-off. HOVER itself never climbs. A vehicle that sinks below its place, for example because the
-estimated height drifts, climbs back in ASCEND, and its time goes on meanwhile. A vehicle that
-leaves its place returns to ALIGN, and its time starts anew. So a hover that is completed has kept
-its place for the whole time.
+estimated height drifts, climbs back in ASCEND; its time goes on if that takes at most
+`MAX_CLIMB_BACK_S`. A vehicle that leaves its place returns to ALIGN, and its time starts anew. So a
+completed hover has kept its place for the whole time, apart from such climbs.
 """
 
 from __future__ import annotations
