@@ -25,6 +25,8 @@ from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import (
     HANGING,
     HANGING_DWELL_S,
+    MOTORS_OFF_DESPITE_ORDER,
+    MOTORS_OFF_DWELL_S,
     ON_FLOOR,
     has_slipped,
     is_pressing,
@@ -190,7 +192,8 @@ def act(c: Context) -> Action:
         if (caught := _catch_fall(c)) is not None:
             return caught
         c = Context(replace(state, catch_above_m=None))
-    if c.state.stopped_s is not None or _is_standing(c):
+    is_off = c.held_s(MOTORS_OFF_DESPITE_ORDER) >= MOTORS_OFF_DWELL_S
+    if c.state.stopped_s is not None or is_off or _is_standing(c):
         return stop_motors(c)
     if c.state.released_s is not None:
         return _complete_weight_transfer(c)

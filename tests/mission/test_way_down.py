@@ -201,6 +201,22 @@ def test_a_loop_that_hangs_in_every_turn_sees_a_landing_end(
     assert state.phase is ends
 
 
+@pytest.mark.parametrize(("z_m", "ends"), [(HANG_Z_M, Phase.PERCHED), (0.02, Phase.LANDED)])
+def test_motors_that_are_off_despite_an_order_are_stopped_before_the_flight_ends(
+    z_m: float, ends: Phase
+) -> None:
+    """The supervisor ends a flight whose motors idle, and soon lets them turn by the last order
+    again: seed 20731163 ended with raw thrust as its last order, and a motor turned 5 s later."""
+    idles = at(z_m, acc_z_g=1.15, **OFF)
+    ticks = fly(hanging(raw_thrust_order=1000, released_s=BEGIN_S), idles, 3.0).ticks
+    assert ticks[-1].state.phase is ends
+    orders = [tick.command for tick in ticks if not isinstance(tick.command, Idle)]
+    assert isinstance(orders[-1], StopMotors)
+    first = next(tick for tick in ticks if isinstance(tick.command, StopMotors))
+    assert first.t_s - BEGIN_S >= 0.1, "one sample is no evidence"
+    assert not any(isinstance(tick.command, RawThrust) for tick in ticks if tick.t_s > first.t_s)
+
+
 @pytest.mark.parametrize("bit", [LOCKED, TUMBLED, CRASHED])
 def test_the_supervisors_word_has_no_age(bit: int) -> None:
     """Whoever was locked before the telemetry stopped has its motors off: no landing is flown."""

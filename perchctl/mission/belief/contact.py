@@ -104,6 +104,9 @@ climb, m/s."""
 MOTORS_OFF_TIMEOUT_S = 5.0
 """Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
 s."""
+MOTORS_OFF_DWELL_S = 0.1
+"""Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
+sample ends the flight. Larger: the flight ends later."""
 HANGING_DWELL_S = 1.0
 """Time that the proof of a magnet's hold takes, s."""
 
@@ -304,11 +307,23 @@ def _is_hanging(b: Belief) -> bool:
     return held and (at_contact or at_target or stayed)
 
 
-def _has_stopped_motors(b: Belief) -> bool:
+def _are_motors_off(b: Belief) -> bool:
     """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
     stopped_s = b.sent.stopped_s
     long_off = stopped_s is not None and b.obs.t_s - stopped_s > MOTORS_OFF_TIMEOUT_S
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
+
+
+def _is_raw_thrust_ordered(b: Belief) -> bool:
+    return (b.sent.raw_thrust or 0) > 0
+
+
+def _have_motors_stopped(b: Belief) -> bool:
+    return _are_motors_off(b) and not _is_raw_thrust_ordered(b)
+
+
+def _are_motors_off_despite_order(b: Belief) -> bool:
+    return _are_motors_off(b) and _is_raw_thrust_ordered(b)
 
 
 def _is_on_floor(b: Belief) -> bool:
@@ -362,8 +377,13 @@ FULL_WEIGHT_HANGS = Condition(
 """The whole weight hangs: the motors stand still, and nothing slips."""
 HANGING = Condition("hanging", _is_hanging, depends_on=Dependency.POSITION)
 """Something holds the vehicle up, off the floor."""
-MOTORS_STOPPED = Condition("motors stopped", _has_stopped_motors, depends_on=Dependency.TELEMETRY)
-"""The motors are off."""
+MOTORS_STOPPED = Condition("motors stopped", _have_motors_stopped, depends_on=Dependency.TELEMETRY)
+"""The motors are off, and the last order does not let them turn."""
+MOTORS_OFF_DESPITE_ORDER = Condition(
+    "motors off despite an order", _are_motors_off_despite_order, depends_on=Dependency.TELEMETRY
+)
+"""The motors are off although the last order was raw thrust: the supervisor has ended the flight.
+It soon lets them turn by that order again (docs/firmware.md, "Supervisor")."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=Dependency.POSITION)
 """The vehicle stands on the floor."""
 BLOCKED = Condition("blocked", _is_blocked)
@@ -386,6 +406,7 @@ SUPPORT_CONDITIONS = (
     FULL_WEIGHT_HANGS,
     HANGING,
     MOTORS_STOPPED,
+    MOTORS_OFF_DESPITE_ORDER,
     ON_FLOOR,
     BLOCKED,
     SUPPORTED_BY_IMU,

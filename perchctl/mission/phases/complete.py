@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import (
     MAGNET_HOLDS,
+    MOTORS_OFF_DWELL_S,
     MOTORS_STOPPED,
     has_slipped,
     newest_contact_offset,
@@ -20,9 +21,6 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
-MOTORS_OFF_DWELL_S = 0.1
-"""Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
-sample ends the flight. Larger: the flight ends later."""
 MOTOR_STOP_TIMEOUT_S = 10.0
 """Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 

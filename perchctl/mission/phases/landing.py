@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import MOTORS_STOPPED
+from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, MOTORS_STOPPED
 from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
@@ -14,9 +14,6 @@ from perchctl.mission.transition import Predicate, Transition, give_up_row
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
-MOTORS_OFF_DWELL_S = 0.1
-"""Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
-sample ends the flight. Larger: the flight ends later."""
 TARGET_LOOK_DURATION_S = 2.0
 """Time after the motors are off in which the camera may still show the target far above, s."""
 
