@@ -381,10 +381,11 @@ class DatagramSender:
             )
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError: not the form of a host name
+            reason = getattr(error, "strerror", None) or "it is not a host name"
             raise InvalidValue(
-                f"--udp {address}: {host} has no address ({error.strerror}); check the name, or "
-                "give its IP address"
+                f"--udp {address}: {host} has no address ({reason}); check the name, or give its "
+                "IP address"
             ) from None
         self._address = found[0][4]
         self._socket = socket.socket(found[0][0], socket.SOCK_DGRAM)

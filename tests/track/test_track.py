@@ -448,6 +448,13 @@ def test_a_host_without_an_address_is_named(
     assert "--udp robot:9870: robot has no address (Name or service not known)" in said.complaint
 
 
+@pytest.mark.parametrize("host", ["a..b", "a" * 64])
+def test_a_text_that_is_no_host_name_is_named(host: str, pictures: Path) -> None:
+    said = run("track", str(pictures), "--udp", f"{host}:9870")
+    assert said.code == 30
+    assert f"{host} has no address (it is not a host name)" in said.complaint
+
+
 def test_an_address_out_of_reach_is_said_once_and_tracking_goes_on(pictures: Path) -> None:
     # The operating system refuses broadcasts that nobody has permitted.
     said = run(
