@@ -57,12 +57,13 @@ def load_calibration(file: Path | str) -> CameraModel:
 
 def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
     """The camera, and the values of all keys of the file."""
+    text = _text(path)
     try:
-        lens, values = parse_calibration(_text(path))
+        lens, values = parse_calibration(text)
         return _checked(lens), values
     except InvalidValue as error:
-        what = "" if "this is" in str(error) else kind_note(path, "a camera calibration")
-        raise InvalidValue(f"{path}: {error}{what}") from None
+        note = kind_note(path, "a camera calibration")
+        raise InvalidValue(f"{path}: {error}{note}") from None
 
 
 def _text(path: Path) -> str:
@@ -73,7 +74,7 @@ def _text(path: Path) -> str:
     except FileNotFoundError:
         raise NotFound(f"calibration file {path} does not exist") from None
     except OSError as error:
-        raise InvalidValue(f"cannot be read as a calibration: {error.strerror}") from None
+        raise InvalidValue(f"{path}: cannot be read as a calibration: {error.strerror}") from None
     try:
         if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             return data.decode("utf-16")
@@ -83,7 +84,7 @@ def _text(path: Path) -> str:
         if file_kind(path) in ("another kind of file", "a camera calibration", "a profile"):
             return data.decode("cp1252", errors="replace")  # Latin-1, and quotes of Windows
     raise InvalidValue(
-        f"this is {file_kind(path)}, not a camera calibration: name the .yaml file from "
+        f"{path}: this is {file_kind(path)}, not a camera calibration: name the .yaml file from "
         "perchctl calibrate, or one from ROS, OpenCV or Kalibr"
     )
 

@@ -367,8 +367,10 @@ def test_other_forms_are_refused_by_name(text: str, said: str, tmp_path: Path) -
 
 def test_bytes_that_are_no_text_are_named(tmp_path: Path) -> None:
     for content, said in ((b"\x89PNG\r\n\x1a\n\0\0", "is a picture"), (b"PK\3\4\0", "is another")):
-        with pytest.raises(InvalidValue, match=f"{said}.*, not a camera calibration"):
+        with pytest.raises(InvalidValue, match=f"{said}.*, not a camera calibration") as refused:
             load(tmp_path, content)
+        assert str(refused.value).count(str(tmp_path)) == 1
+        assert "(it is" not in str(refused.value), "the kind is said once"
 
 
 @pytest.mark.parametrize(
