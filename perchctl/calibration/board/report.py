@@ -28,7 +28,7 @@ from perchctl.geometry import Array
 from perchctl.report_page import render_template
 from perchctl.target import Board
 
-_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
+_VERDICT_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
 _LONG_SHARE = 0.04
 """Length of a long residual as drawn, in picture widths. Larger: neighbours cross. Smaller: their
 directions cannot be seen."""
@@ -97,7 +97,7 @@ class CalibrationReport:
     @property
     def grade(self) -> str:
         """Grade of the verdict: good, warn or bad."""
-        return _GRADES[self.result.verdict]
+        return _VERDICT_GRADES[self.result.verdict]
 
     @property
     def verdict(self) -> str:
