@@ -368,6 +368,11 @@ def plan_text(options: flights.FlyOptions) -> str:
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
     edges = front_left_edges(camera.mount, camera.mirrored)
     late = camera.latency_s
+    mission = []
+    if planner.hover is not None:
+        below_m, duration_s = planner.hover.below_m, planner.hover.duration_s
+        hover = f"hover {below_m:g} m below the target for {duration_s:g} s, then land"
+        mission = [("mission", hover)]
     rows = [
         ("vehicle", f"{options.uri}{f', seed {options.seed}' if options.simulated else ''}"),
         ("camera", f"{resolved['source']}, calibration {resolved['calibration_file']}{mask}"),
@@ -391,6 +396,7 @@ def plan_text(options: flights.FlyOptions) -> str:
         ),
         ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
         ("merge", f"{profile.merge.method} {profile.merge.weights_file or ''}".rstrip()),
+        *mission,
         (
             "path",
             f"take off to {planner.takeoff_height_m:g} m, search up to "
@@ -405,10 +411,6 @@ def plan_text(options: flights.FlyOptions) -> str:
         ),
         ("log", f"{resolved['log_directory']}{', with pictures' if options.record else ''}"),
     ]
-    if planner.hover is not None:
-        below_m, duration_s = planner.hover.below_m, planner.hover.duration_s
-        mission = f"hover {below_m:g} m below the target for {duration_s:g} s, then land"
-        rows.insert(rows.index(next(row for row in rows if row[0] == "path")), ("mission", mission))
     rows += [
         (row["verdict"], f"{row['name']}: {row['found']}; {row['advice']}")
         for row in resolved["check"]
