@@ -47,6 +47,8 @@ ERRORS = (
 WORK = (
     "fly",
     "fly --dry-run",
+    "hover",
+    "hover --dry-run",
     "check",
     "check --cameras",
     "check --scan",
