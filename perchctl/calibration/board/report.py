@@ -99,11 +99,6 @@ class CalibrationReport:
         """Grade of the verdict: good, warn or bad."""
         return _VERDICT_GRADES[self.result.verdict]
 
-    @property
-    def verdict(self) -> str:
-        """The expected error in mm, as a sentence."""
-        return self.result.verdict_text.removeprefix(f"{self.title}: ")
-
     @cached_property
     def views(self) -> tuple[ReportedView, ...]:
         """The views used, the largest residuals first."""

@@ -92,10 +92,15 @@ class Calibration:
     @property
     def verdict_text(self) -> str:
         """The verdict in words, with the predicted errors at 10 cm and 1 m."""
+        return f"{TITLES[self.verdict]}: {self.errors_text}"
+
+    @property
+    def errors_text(self) -> str:
+        """The predicted errors at 10 cm and 1 m in words."""
         near, far = (e for e in self.errors if e.z_m in (0.1, 1.0))
         text = (
-            f"{TITLES[self.verdict]}: the target's centre is within {near.axis_mm95:.2g} mm at "
-            f"10 cm and {far.axis_mm95:.2g} mm at 1 m (95 %)"
+            f"the target's centre is within {near.axis_mm95:.2g} mm at 10 cm and "
+            f"{far.axis_mm95:.2g} mm at 1 m (95 %)"
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
