@@ -19,6 +19,7 @@ from matplotlib.patches import Circle
 from perchctl.analysis.film import (
     LAST_PICTURE_S,
     CameraView,
+    Progress,
     Recorded,
     Rgb,
     ShownPicture,
@@ -89,10 +90,15 @@ class FilmedVehicle:
 
 
 def write_fleet_film(
-    vehicles: Sequence[FilmedVehicle], path: Path, rate_hz: float = 15.0, width_px: int = 960
+    vehicles: Sequence[FilmedVehicle],
+    path: Path,
+    rate_hz: float = 15.0,
+    width_px: int = 960,
+    progress: Progress = lambda done, total: None,
 ) -> int:
     """Write the flight of a fleet as a film (.mp4 or .gif) at its own pace, and return its number
-    of pictures. `rate_hz`, `width_px` and errors are those of `perchctl.analysis.write_film`.
+    of pictures. `rate_hz`, `width_px`, `progress` and errors are those of
+    `perchctl.analysis.write_film`.
     """
     for vehicle in vehicles:
         if not vehicle.flight.log.records:
@@ -102,16 +108,17 @@ def write_fleet_film(
     begin_s = min(vehicle.begin_s for vehicle in vehicles)
     end_s = max(vehicle.end_s for vehicle in vehicles)
     times_s = np.arange(begin_s, end_s + LAST_PICTURE_S, float(period))
-    write_pictures(_fleet_pictures(vehicles, times_s, width_px), path, period)
+    write_pictures(_fleet_pictures(vehicles, times_s, width_px, progress), path, period)
     return len(times_s)
 
 
 def _fleet_pictures(
-    vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int
+    vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int, progress: Progress
 ) -> Iterator[Rgb]:
     stage = _FleetStage(vehicles, times_s, width_px)
-    for t_s in times_s:
+    for number, t_s in enumerate(times_s, start=1):
         yield stage.drawn(float(t_s))
+        progress(number, len(times_s))
 
 
 class _FleetStage:

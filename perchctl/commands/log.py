@@ -321,11 +321,14 @@ def film(
     if fleet is not None:
         if not fleet.logs:
             raise NotFound("no vehicle of this fleet has left a log: there is nothing to film")
+        say_on_terminal(f"reading {file}")
         first = next(iter(fleet.logs.values()))
         place = _place(first, output or first.with_name("fleet.mp4"), FILMS, force)
-        from perchctl.analysis import write_fleet_film
+        from perchctl.commands.progress import done_of_total_bar
 
-        write_fleet_film(fleet.filmed(), place, rate_hz, width_px)
+        filmed = fleet.filmed()
+        with done_of_total_bar("pictures") as progress:
+            analysis.write_fleet_film(filmed, place, rate_hz, width_px, progress)
         print(f"film:      {place}")
         return
     path = _log_file(file)
@@ -333,10 +336,9 @@ def film(
     is_recorded = records.path_beside(path, ".mcap").is_file()
     with _opened(path) as log:
         flight = analysis.FlightAnalysis(log)
-    from perchctl.analysis import write_film
     from perchctl.commands.progress import done_of_total_bar
 
     pictures = records.recorded_pictures(path) if is_recorded else None
     with done_of_total_bar("pictures") as progress:
-        write_film(flight, pictures, place, rate_hz, width_px, progress)
+        analysis.write_film(flight, pictures, place, rate_hz, width_px, progress)
     print(f"film:      {place}")

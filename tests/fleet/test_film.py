@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from perchctl.analysis import write_fleet_film
 from perchctl.fleet import read_fleet_folder
 from perchctl.record import read_log
 from tests.helpers import log as synthetic
@@ -69,6 +70,14 @@ def test_the_command_makes_one_film_of_all(folder: Path) -> None:
     assert len(pictures) == pytest.approx(end_s - begin_s + 2.0, abs=1.5)
     assert pictures[0].shape == (WIDTH_PX * 9 // 16, WIDTH_PX, 3)
     assert run(*words).code == 30, "it exists"
+
+
+def test_a_film_of_a_fleet_tells_how_far_it_is(folder: Path) -> None:
+    filmed = read_fleet_folder(folder).filmed()  # type: ignore[union-attr]
+    done: list[tuple[int, int | None]] = []
+    path = folder / "film.mp4"
+    count = write_fleet_film(filmed, path, 0.5, WIDTH_PX, lambda *now: done.append(now))
+    assert done == [(number, count) for number in range(1, count + 1)]
 
 
 def test_a_folder_that_cannot_be_filmed_is_refused_in_a_sentence(folder: Path) -> None:
