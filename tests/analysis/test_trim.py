@@ -16,9 +16,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text, write_report
 from perchctl.analysis.show import COLUMNS
-from perchctl.analysis.trim import MOTOR_OFFSET_M, Trim, mean_and_margin
+from perchctl.analysis.trim import MOTOR_OFFSET_M, SAMPLE_PERIOD_S, Trim, mean_and_margin
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
+from perchctl.link.telemetry import SLOW_PERIOD_S
 from perchctl.mission import Phase
 from perchctl.profile import load_profile
 from perchctl.record import FlightLog, LogWatcher, read_log
@@ -232,6 +233,10 @@ def test_what_is_no_hover_or_not_known_is_left_out(changes: dict[str, object]) -
 def test_too_short_a_hover_says_nothing() -> None:
     assert FlightAnalysis(made_up(seconds=1.9)).trim is None
     assert trim_of(made_up(seconds=2.2)).hover_s == 2.2
+
+
+def test_a_sample_lasts_as_long_as_its_log_packet() -> None:
+    assert SAMPLE_PERIOD_S == SLOW_PERIOD_S
 
 
 def test_a_log_without_ticks_or_target_is_no_error() -> None:
