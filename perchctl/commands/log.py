@@ -127,9 +127,7 @@ def plot(
             print(f"plot:      {beside}")
             return
         picture = _place(path, output, PLOTS, force)
-    from perchctl.analysis import plot_flight
-
-    plot_flight(log, picture)
+    analysis.plot_flight(log, picture)
     print(f"plot:      {picture}")
 
 

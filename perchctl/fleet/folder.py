@@ -54,7 +54,7 @@ class FleetFolder:
 def _filmed(
     name: str, flight: FlightAnalysis, plan: Mapping[str, Any], end: Mapping[str, Any]
 ) -> FilmedVehicle:
-    from perchctl.analysis import FilmedVehicle  # loads matplotlib, which a report needs not
+    from perchctl.analysis import FilmedVehicle  # loads matplotlib; a report does without it
 
     log = Path(flight.log.path)
     pace = (end.get("pace") or {}).get("ratio") or 1.0
