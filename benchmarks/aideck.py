@@ -126,7 +126,7 @@ def mosaic(number: int) -> int:
                 pictures |= {n: w(delivered(coloured + noise, as_jpeg)) for n, w in WAYS.items()}
                 for way, image in pictures.items():
                     found = detect_markers(
-                        Frame(0, 0.0, image, fields="whole"), None, setup, camera
+                        Frame(0, 0.0, image, picture_kind="whole"), None, setup, camera
                     )
                     for name in names:
                         seen = getattr(found, name)

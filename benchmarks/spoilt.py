@@ -13,7 +13,7 @@ from common import CAMERA, Picture, marker_pose, true_corners
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision import project, undistort
+from perchctl.vision import project, undistort_to_normalised
 
 Rng = np.random.Generator
 Spoil = Callable[[Picture, Array, Rng], Picture]
@@ -131,7 +131,7 @@ def bulge(picture: Picture, T: Array, rng: Rng) -> Picture:
 def _rays() -> Array:
     w, h = CAMERA.size_px
     pixels = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=2).reshape(-1, 2)
-    return np.append(undistort(pixels, CAMERA), np.ones((len(pixels), 1)), axis=1)
+    return np.append(undistort_to_normalised(pixels, CAMERA), np.ones((len(pixels), 1)), axis=1)
 
 
 def _grid(picture: Picture) -> tuple[Array, Array]:

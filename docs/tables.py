@@ -199,7 +199,7 @@ def corner_methods() -> str:
     """A Markdown table of the methods that find corners, in the order in which they are tried."""
     rows = (
         f"| [{method.name}](#{method.name.lower().replace(' ', '-')}) | {method.needs} "
-        f"| {method.cost} | {method.used_when} |"
+        f"| {method.cost_text} | {method.used_when} |"
         for method in CORNER_METHODS
     )
     return "\n".join(["| method | needs | cost | used when |", "|---|---|---|---|", *rows])

@@ -255,7 +255,7 @@ class Tracker:
         return _add_pose(seen, self._perception.state, attitude, self.pipeline)
 
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
-        if output.fields != "whole":
+        if output.picture_kind != "whole":
             yield INTERLACED
         if output.lock_note:
             yield output.lock_note

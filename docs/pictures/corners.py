@@ -21,7 +21,7 @@ from PIL import Image
 
 from perchctl.geometry import Array
 from perchctl.plot import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, figure_bytes, new_figure
-from perchctl.vision.lens import distort, undistort_px
+from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
     apply_homography,
     homography_from_unit_square,
@@ -38,7 +38,7 @@ from perchctl.vision.markers.photometric_fit import (
     project_nodes,
     render_blurred,
 )
-from perchctl.vision.markers.search import search, search_half_size, search_window
+from perchctl.vision.markers.search import make_search_window, search, search_half_size
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import SETUP
 from tests.helpers.target_picture import CAMERA
@@ -55,11 +55,11 @@ def edge_fit(file: Path) -> None:
     """The profiles across the sides, the edges on them, and where the lines meet."""
     view = _view("Edge fit")
     figure, whole, near = _panels(view)
-    markers = prepare_marker_sides(_expected(view)[None], [_LARGE.rim], CAMERA)
+    markers = prepare_marker_sides(_expected(view)[None], [_LARGE.border_cells], CAMERA)
     assert markers is not None
-    edges, _ = measure_edges(view.image, markers, CAMERA, with_inner=False)
+    edges, _ = measure_edges(view.image, markers, CAMERA, with_inner_edges=False)
     used = edges.points[edges.weight > 0.0]
-    at = distort(used, CAMERA)
+    at = distort_to_px(used, CAMERA)
     _dots(whole, near, at, "edge on a profile")
     _finish(figure, file, whole, view)
 
@@ -68,7 +68,12 @@ def half_size_search(file: Path) -> None:
     """The window in the picture, and the same at half size."""
     view = _view("Half-size search")
     figure, whole, half = _panels(view, width_ratios=(2.0, 1.0))
-    rows, columns = search_window(view.prior.expected_both, SETUP.ratio, view.image.shape) or _WHOLE
+    rows, columns = (
+        make_search_window(
+            view.prior.expected_both_corners_px, SETUP.small_to_large_side, view.image.shape
+        )
+        or _WHOLE
+    )
     half.clear()
     reduced = cv2.resize(
         view.image[rows, columns], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
@@ -77,7 +82,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_half_size(view.picture, view.prior.expected_both)
+    searched = search_half_size(view.picture, view.prior.expected_both_corners_px)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25
@@ -108,14 +113,21 @@ def cut_view_fit(file: Path) -> None:
     view = _view("Cut-view fit")
     figure, whole, near = _panels(view)
     small = SETUP.patterns["small"]
-    outline = make_outline(_LARGE.drawing, _LARGE.rim.tolerance, small.rim.tolerance)
+    outline = make_outline(
+        _LARGE.drawing,
+        _LARGE.border_cells.print_tolerance_cells,
+        small.border_cells.print_tolerance_cells,
+    )
     R, t = cv2.Rodrigues(view.pose[0])[0], view.pose[1] / 0.075
     start = RigidPose(np.asarray(R) @ np.diag([1.0, -1.0, -1.0]), t)
     fit = fit_pose(view.image, start, outline, CAMERA)
     assert fit is not None
-    X = np.column_stack([outline.points, np.zeros(len(outline.points))]) @ fit.pose.R.T + fit.pose.t
+    X = (
+        np.column_stack([outline.points, np.zeros(len(outline.points))]) @ fit.pose.R_cam_drawing.T
+        + fit.pose.t_cam_half_sides
+    )
     x = X[:, :2] / X[:, 2:]
-    at = distort(x[np.hypot(*x.T) < make_lattice(CAMERA).reach], CAMERA)
+    at = distort_to_px(x[np.hypot(*x.T) < make_lattice(CAMERA).valid_radius_normalised], CAMERA)
     _dots(whole, near, at[((at > 0.0) & (at < (639.0, 479.0))).all(axis=1)], "edge of the drawing")
     _finish(figure, file, whole, view)
 
@@ -125,7 +137,7 @@ def search_and_refinement(file: Path) -> None:
     view = _view("Search")
     figure, whole, near = _panels(view, zoom_px=_NEARER_PX)
     raw = search(view.picture, {}).corners_px["large"]
-    subpix = refine_subpix(view.image, raw, _LARGE.rim.cells).corners_px
+    subpix = refine_subpix(view.image, raw, _LARGE.border_cells.cells_per_side).corners_px
     near.plot(*raw.T, "s", color=ORANGE, label="found by the search", zorder=5)
     near.plot(*subpix.T, "o", color=VERMILLION, label="subpixel refinement", zorder=5)
     _finish(figure, file, whole, view)
@@ -144,7 +156,7 @@ def _view(method: str) -> View:
 
 
 def _expected(view: View) -> Array:
-    return view.prior.expected_both[view.marker]
+    return view.prior.expected_both_corners_px[view.marker]
 
 
 def _found(view: View) -> Array:
@@ -179,7 +191,7 @@ def _panels(
     whole.set_ylim(bottom, top)
     whole.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor="black"))
     for ax in (whole, near):
-        if view.prior.expected:
+        if view.prior.expected_corners_px:
             _square(ax, _expected(view), ORANGE, "expected", linestyle="dashed")
         _square(ax, found, BLUE, "found")
         size = 8.0 if ax is whole else 16.0
@@ -207,11 +219,11 @@ def _drawing(view: View, file: Path) -> None:
     fit = align_drawing(view.image, found, drawing, CAMERA, view.blur_px)
     assert fit is not None
     n = 44
-    grid = make_grid(n, drawing.reach)
+    grid = make_grid(n, drawing.compared_half_side)
     H = homography_from_unit_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
-    node_px = drawing.reach * mean_side_px(fit.corners_px) / n
+    node_px = drawing.compared_half_side * mean_side_px(fit.corners_px) / n
     rows, _ = render_blurred(
         drawing, n, round(np.log(fit.blur_px / node_px) / 0.02)
     ).illumination_basis

@@ -18,7 +18,14 @@ from perchctl.geometry import Array
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck
 from perchctl.vehicle import Telemetry
-from perchctl.vision import MARKERS, Frame, Pipeline, PipelineOutput, TargetEstimate, refine_lines
+from perchctl.vision import (
+    MARKERS,
+    Frame,
+    Pipeline,
+    PipelineOutput,
+    TargetEstimate,
+    refine_corners_by_lines,
+)
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
@@ -200,10 +207,10 @@ def _blur_px(
             seen = output.detections.get(name)
             if seen is None:
                 continue
-            rim = pipeline.detector.patterns[name].rim
+            rim = pipeline.detector.patterns[name].border_cells
             corners = seen.corners_px.reshape(1, 4, 2)
-            (refined,) = refine_lines(frame.image, corners, [rim], pipeline.camera)
+            (refined,) = refine_corners_by_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:
-                found_px.append(refined.min_blur_px)
+                found_px.append(refined.sharpest_side_blur_px)
                 break  # the large one, where there is one
     return float(np.median(found_px)) if found_px else None

@@ -137,7 +137,7 @@ class FlightInputs:
         if frame is not None:
             self.on_frame(frame)
             times_s = frame.t_s, frame.t_arrival_s
-            seen = FrameRecord(frame.index, *times_s, frame.fields, frame.repeated)
+            seen = FrameRecord(frame.index, *times_s, frame.picture_kind, frame.repeated)
         self.taken = TurnInputs(
             tuple(samples),
             frame=seen,

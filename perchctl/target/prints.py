@@ -16,7 +16,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target.drawing import marker_corners_m, print_scale
-from perchctl.vision import CameraModel, PipelineOutput, undistort
+from perchctl.vision import CameraModel, PipelineOutput, undistort_to_normalised
 
 MEASURED_SIGMA = 0.001
 """What measured sizes may be off by, relative: 0.15 mm of a large marker."""
@@ -69,7 +69,7 @@ def size_ratio(
     """The ratio of the small marker's to the large marker's size over the profile's (1.01: printed
     1 % too large), from one frame's corners, (4, 2) px each; and the ratio's possible systematic
     error by the corners. None where the corners span no plane."""
-    rays = undistort(np.concatenate([large_px, small_px]), camera)
+    rays = undistort_to_normalised(np.concatenate([large_px, small_px]), camera)
     seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
     sides = [
         float(np.linalg.norm(q - np.roll(q, 1, axis=0), axis=1).mean()) for q in np.split(seen, 2)

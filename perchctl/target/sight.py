@@ -13,7 +13,12 @@ import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
 from perchctl.profile import Mounting, Profile, TargetConfig
-from perchctl.vision import CameraModel, shows_enough_of_target, square_corners, undistort
+from perchctl.vision import (
+    CameraModel,
+    shows_enough_of_target,
+    square_corners,
+    undistort_to_normalised,
+)
 
 ARUCO_MARGIN_PX = 3.0
 """cv2.aruco drops markers nearer than this to the picture's edge."""
@@ -30,7 +35,7 @@ class FieldOfView:
         corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
         s = np.linspace(0.0, 1.0, _EDGE_POINTS, endpoint=False)[:, None]
         ways = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-        rays = undistort(np.concatenate([a + s * (b - a) for a, b in ways]), camera)
+        rays = undistort_to_normalised(np.concatenate([a + s * (b - a) for a, b in ways]), camera)
         rays = rays[np.isfinite(rays).all(axis=1)]
         angle = np.arctan2(rays[:, 1], rays[:, 0])
         order = np.argsort(angle)

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from perchctl.values import replace
 from perchctl.vision.types import FieldState, Frame
 
-Grey = NDArray[np.uint8]
+GreyImage = NDArray[np.uint8]
 
 # threshold of the ratio of differences; exceeded by fields one pixel apart
-_MIN_COMBING_RATIO = 1.4
+_MIN_COMBING_ENERGY_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
-_GROUP_ROWS = 8
+_ROWS_PER_COMBING_GROUP = 8
 # multiple of the mean difference within a field above which a difference counts
-_STRONG_DIFFERENCE_RATIO = 5.0
-_MIN_DIFFERENCE_GREY = 8.0
+_MIN_ROW_TO_MEAN_DIFFERENCE_RATIO = 5.0
+_MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _CLASSIFICATION_PERIOD_FRAMES = 3
 _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
@@ -38,40 +38,40 @@ _STANDARD_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
 _STANDARD_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
 _VALID_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_KEPT_PERIODS = 25
-_LOST_FRAME_PERIOD_RATIO = 1.8
-_MAX_GAP_S = 0.25  # s; older pictures carry no information about the order
+_MIN_LOST_FRAME_PERIOD_RATIO = 1.8
+_MAX_FRAME_GAP_S = 0.25  # s; older pictures carry no information about the order
 _MIN_ORDER_VOTES = 1.0  # sum of votes, each at most 1, that decides the order: two frames at least
 _MAX_ORDER_VOTES = 3.0  # limit of the sum, so that a changed order is noticed in time
 _MIN_REVERSAL_VOTES = 1.0  # sum of votes that reverses an order decided before
 
 
-def is_combed(image: Grey) -> bool:
+def is_combed(image: GreyImage) -> bool:
     """True if an interlaced picture (h, w) shows combing: a row differs more from its neighbours
     than from the rows of its own field."""
-    groups, width = len(image) // _GROUP_ROWS, image.shape[1]
+    groups, width = len(image) // _ROWS_PER_COMBING_GROUP, image.shape[1]
     if groups == 0:
         return False
     # Groups of rows in one row: the next row is `width` further on. Every third group is enough.
-    flat = np.ascontiguousarray(image[: groups * _GROUP_ROWS]).reshape(groups, _GROUP_ROWS * width)[
-        ::3
-    ]
+    flat = np.ascontiguousarray(image[: groups * _ROWS_PER_COMBING_GROUP]).reshape(
+        groups, _ROWS_PER_COMBING_GROUP * width
+    )[::3]
     above2, above, row, below, below2 = (
-        flat[:, k * width : (k + _GROUP_ROWS - 4) * width] for k in range(5)
+        flat[:, k * width : (k + _ROWS_PER_COMBING_GROUP - 4) * width] for k in range(5)
     )
     # In place, to keep the frame in the processor's cache for the next steps.
     other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_STRONG_DIFFERENCE_RATIO * cv2.mean(own)[0], _MIN_DIFFERENCE_GREY)
+    least = max(_MIN_ROW_TO_MEAN_DIFFERENCE_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
-    return energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_COMBING_RATIO
+    return energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_COMBING_ENERGY_RATIO
 
 
-def split_fields(image: Grey) -> tuple[Grey, ...]:
+def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
     """Return the top and bottom field, each (h, w), of a combed picture; otherwise the picture
     alone."""
     if not is_combed(image):
@@ -79,7 +79,7 @@ def split_fields(image: Grey) -> tuple[Grey, ...]:
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
-def interpolate_field(image: Grey, first_row: int) -> Grey:
+def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
     """Return the field whose first row is `first_row` (0 or 1), interpolated to full height."""
     own = image[first_row::2]
     # Row k of the result is between rows k and k + 1 of the field.
@@ -95,7 +95,7 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
     return picture
 
 
-def interpolated_sigma_px(blur_px: float) -> float:
+def interpolated_edge_sigma_px(blur_px: float) -> float:
     """Return the standard deviation, px, of an edge along interpolated rows with a blur of
     `blur_px`."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_px * blur_px)
@@ -103,42 +103,44 @@ def interpolated_sigma_px(blur_px: float) -> float:
 
 def classify_fields(frame: Frame) -> Frame:
     """Return the frame with `fields` set to ``woven`` or ``whole`` if it was None."""
-    if frame.fields is not None:
+    if frame.picture_kind is not None:
         return frame
-    return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
+    return replace(frame, picture_kind="woven" if is_combed(frame.image) else "whole")
 
 
 def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
     """Return the top and the bottom field of a woven frame, both with the frame's time."""
     return (
-        replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
-        replace(frame, image=interpolate_field(frame.image, 1), fields="bottom", encoded=None),
+        replace(frame, image=interpolate_field(frame.image, 0), picture_kind="top", encoded=None),
+        replace(
+            frame, image=interpolate_field(frame.image, 1), picture_kind="bottom", encoded=None
+        ),
     )
 
 
-def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
+def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
     """Return the new state, and the pictures of a stream's frame in time order: the frame itself,
     or its two fields, a quarter of a period before and after the frame's time.
 
     In a stream without fields so far, only every third frame is examined.
     """
     skip = (
-        frame.fields is None
+        frame.picture_kind is None
         and state.kind == "whole"
-        and state.skipped + 1 < _CLASSIFICATION_PERIOD_FRAMES
+        and state.frames_since_examined + 1 < _CLASSIFICATION_PERIOD_FRAMES
     )
-    frame = replace(frame, fields="whole") if skip else classify_fields(frame)
-    skipped = state.skipped + 1 if skip else 0
+    frame = replace(frame, picture_kind="whole") if skip else classify_fields(frame)
+    skipped = state.frames_since_examined + 1 if skip else 0
     # Once interlaced, a stream counts as interlaced.
-    kind = state.kind if state.kind == "woven" else frame.fields
+    kind = state.kind if state.kind == "woven" else frame.picture_kind
     periods_s = _update_periods_s(state, frame)
-    if frame.fields == "whole":
+    if frame.picture_kind == "whole":
         new = FieldState(kind, skipped, state.order_votes, state.is_top_first, periods_s, frame.t_s)
         return new, (frame,)
     state = _vote_on_field_order(
-        replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame
+        replace(state, kind=kind, frames_since_examined=skipped, periods_s=periods_s), frame
     )
-    if frame.fields != "woven" or state.is_top_first is None:
+    if frame.picture_kind != "woven" or state.is_top_first is None:
         return state, (frame,)
     top, bottom = interpolate_fields(frame)
     early, late = (top, bottom) if state.is_top_first else (bottom, top)
@@ -155,23 +157,26 @@ def _estimate_period_s(periods_s: tuple[float, ...]) -> float:
     middle_s = median(periods_s)
     # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
     # ms apart.
-    period_s = mean(p for p in periods_s if p < _LOST_FRAME_PERIOD_RATIO * middle_s)
+    period_s = mean(p for p in periods_s if p < _MIN_LOST_FRAME_PERIOD_RATIO * middle_s)
     if _STANDARD_PERIOD_RANGE_S[0] < period_s < _STANDARD_PERIOD_RANGE_S[1]:
         return min(_STANDARD_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s
 
 
 def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    if state.last_frame_s is not None:
-        gap_s = frame.t_s - state.last_frame_s
+    if state.last_frame_t_s is not None:
+        gap_s = frame.t_s - state.last_frame_t_s
         if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
             return (*state.periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
     return state.periods_s
 
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
-    before, order_votes, is_top_first = state.previous, state.order_votes, state.is_top_first
-    near = state.last_frame_s is not None and 0.0 < frame.t_s - state.last_frame_s < _MAX_GAP_S
+    before, order_votes, is_top_first = state.previous_image, state.order_votes, state.is_top_first
+    near = (
+        state.last_frame_t_s is not None
+        and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FRAME_GAP_S
+    )
     if near and before is not None and before.shape == frame.image.shape:
         rows = (len(before) - 2) // 2 * 2
         tops = [image[0:rows:2] for image in (before, frame.image)]
@@ -191,8 +196,8 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         is_top_first = not is_top_first
     return replace(
         state,
-        last_frame_s=frame.t_s,
+        last_frame_t_s=frame.t_s,
         order_votes=order_votes,
         is_top_first=is_top_first,
-        previous=frame.image,
+        previous_image=frame.image,
     )

@@ -18,7 +18,7 @@ _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-
 _ZERO_VECTOR = np.zeros(3)
 
 
-def undistort(points_px: Array, camera: CameraModel) -> Array:
+def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
     A point that the lens model cannot image becomes NaN or lies far outside; no exception is
@@ -35,7 +35,7 @@ def undistort(points_px: Array, camera: CameraModel) -> Array:
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) of the lens to pixels (n, 2) of a pinhole camera with the same `K`."""
-    return pinhole_px(undistort(points_px, camera), camera)
+    return pinhole_px(undistort_to_normalised(points_px, camera), camera)
 
 
 def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
@@ -48,7 +48,7 @@ def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
     return result
 
 
-def distort(normalised: Array, camera: CameraModel) -> Array:
+def distort_to_px(normalised: Array, camera: CameraModel) -> Array:
     """Convert normalised coordinates (n, 2) to pixels (n, 2); the inverse of `undistort`."""
     rays = np.ones((len(normalised), 1, 3))
     rays[:, 0, :2] = normalised

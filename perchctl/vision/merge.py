@@ -178,7 +178,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
     late = UNKNOWN_READOUT_SIGMA_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
-        flow = detections.flow_px_s.get(d.marker)
+        flow = detections.flow_pxps.get(d.marker)
         if flow is None:
             out.append(d)
             continue
@@ -188,7 +188,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
-            out.append(replace(d, common_shift_px=moved_px))
+            out.append(replace(d, common_error_shift_px=moved_px))
         else:
             turned_px = FLOW_ROTATION_SIGMA * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
@@ -198,7 +198,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    common_shift_px=FLOW_SIGMA_FRACTION * moved_px,
+                    common_error_shift_px=FLOW_SIGMA_FRACTION * moved_px,
                 )
             )
     return out

@@ -22,7 +22,7 @@ from perchctl.extensions import error_at, load_extension
 from perchctl.opencv_threads import one_thread
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import classify_fields, separate_fields
+from perchctl.vision.fields import classify_fields, deinterlace_frame
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import warm_up_cut_marker_fit
 from perchctl.vision.markers.detect import detect_markers
@@ -120,7 +120,7 @@ def make_pipeline(
         mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
     detector = make_detector_setup(profile.detector, profile.target, mask)
-    if detector.fits_lines:
+    if detector.is_line_fit_enabled:
         warm_up_cut_marker_fit(detector.patterns, camera)
     target = profile.target
     # the position where the vehicle searches for it
@@ -166,8 +166,8 @@ def deinterlace(
     two fields in time order if the camera is interlaced. Raises InvalidValue as `step` does."""
     with one_thread():
         frame = _grey_frame(frame, pipeline.camera)
-        fields, found = separate_fields(state.fields, frame)
-    return replace(state, fields=fields), found
+        fields, found = deinterlace_frame(state.field_state, frame)
+    return replace(state, field_state=fields), found
 
 
 def step(
@@ -199,7 +199,9 @@ def step(
                 empty,
                 own,
             )
-    return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
+    return step_detections(
+        state, detections, attitude, pipeline, near, frame.picture_kind or "whole"
+    )
 
 
 def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
@@ -279,7 +281,7 @@ def step_detections(
         empty_frames=0 if anything else state.empty_frames + 1,
         lock=followed.lock,
         rival=followed.rival,
-        fields=state.fields,
+        field_state=state.field_state,
     )
     output = PipelineOutput(
         detections=detections,
@@ -288,7 +290,7 @@ def step_detections(
         stage=stage,
         disagreeing_frames=disagreeing,
         lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
-        fields=fields,
+        picture_kind=fields,
         refused=verdict.is_foreign_target,
     )
     return new, output

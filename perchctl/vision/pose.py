@@ -101,7 +101,7 @@ def estimate_pose(
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
     if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
-    if any(d.horizontal_side_sigma_px > 0.0 for d in detections):
+    if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
         return pose  # sides between interpolated rows look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
@@ -493,7 +493,7 @@ def weigh_corners(
     moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
-        shift[rows, 0] = d.shift_sigma_px * moved[i]
+        shift[rows, 0] = d.edge_shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
@@ -501,22 +501,24 @@ def weigh_corners(
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.refined:
             spread_px = (
-                d.sigma_px if d.horizontal_side_sigma_px == 0.0 else _side_sigma_px(d, corners)
+                d.sigma_px
+                if d.horizontal_side_extra_sigma_px == 0.0
+                else _side_sigma_px(d, corners)
             )
             own = np.zeros(64)
             own[_SIDE_MATRIX_INDICES] = _whitening_of_lines(normals[i], spread_px)
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
-        if d.common_shift_px is not None:
-            shift[rows, 1] = d.common_shift_px.ravel()
-        if d.row_sigma_px > 0.0:
+        if d.common_error_shift_px is not None:
+            shift[rows, 1] = d.common_error_shift_px.ravel()
+        if d.row_jitter_sigma_px > 0.0:
             # As for a line: half to all of its rows shift alike, and they slant.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)
-            shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
-            shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
+            shift[along_x, 2 + 2 * i] = 0.5 * d.row_jitter_sigma_px
+            shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
     return WeightedCorners(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
 
@@ -539,7 +541,7 @@ def _side_sigma_px(d: Detection, corners: Array) -> Array:
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])
     return np.asarray(
-        np.hypot(d.sigma_px, d.horizontal_side_sigma_px * lying / np.hypot(1.0, rows))
+        np.hypot(d.sigma_px, d.horizontal_side_extra_sigma_px * lying / np.hypot(1.0, rows))
     )
 
 

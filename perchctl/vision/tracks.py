@@ -500,7 +500,10 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (place_m - attitude.position_m - _camera_offset_m(attitude, setup))
     # Further off the axis, a lens model may fold back into the picture.
-    if tvec_m[2] <= 0.0 or np.hypot(*tvec_m[:2]) > make_lattice(setup.camera).reach * tvec_m[2]:
+    if (
+        tvec_m[2] <= 0.0
+        or np.hypot(*tvec_m[:2]) > make_lattice(setup.camera).valid_radius_normalised * tvec_m[2]
+    ):
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), tvec_m, setup.camera)
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())

@@ -93,7 +93,7 @@ class Frame:
 
     `image` is grey, uint8, shape (height, width); `step` also accepts BGR, (height, width, 3).
 
-    `fields` is the kind of the picture: ``whole`` for one exposure, ``woven`` for two fields,
+    `picture_kind` is the kind of the picture: ``whole`` for one exposure, ``woven`` for two fields,
     ``top`` or ``bottom`` for one field of a woven picture at full height, None if not classified
     yet (`perchctl.vision.fields`). `repeated`: the source returned the previous picture again,
     which is not a measurement. `encoded` is the source's JPEG, from which `cv2.imdecode` with
@@ -105,7 +105,7 @@ class Frame:
     t_s: float
     image: NDArray[np.uint8]
     t_arrival_s: float = 0.0
-    fields: PictureKind | None = None
+    picture_kind: PictureKind | None = None
     repeated: bool = False
     encoded: bytes | None = None
 
@@ -150,13 +150,15 @@ class Detection:
     corners_px: Array
     sigma_px: float
     refined: bool
-    shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
+    edge_shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
     # (4, 2): one standard deviation of a shift common to all corners
-    common_shift_px: Array | None = None
+    common_error_shift_px: Array | None = None
     cov_px2: Array | None = None
-    row_sigma_px: float = 0.0  # standard deviation due to the jitter of rows in analogue video
+    row_jitter_sigma_px: float = (
+        0.0  # standard deviation due to the jitter of rows in analogue video
+    )
     # for sides along the rows, if every second one is interpolated
-    horizontal_side_sigma_px: float = 0.0
+    horizontal_side_extra_sigma_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class Detections:
     small: Detection | None = None
     mirrored: bool = False  # a marker decoded as its mirror image
     target_count: int = 0  # complete targets, with both markers, found by a search
-    flow_px_s: dict[MarkerName, Array] = field(
+    flow_pxps: dict[MarkerName, Array] = field(
         default_factory=dict
     )  # (4, 2), or (2,) for all corners
     edge_shift: EdgeShift | None = None
@@ -384,17 +386,17 @@ class MeasuredMarkers:
 @dataclass(frozen=True, eq=False)
 class FieldState:
     """State of the detection of interlacing in a stream: `kind` of the last examined frame,
-    `skipped` frames ago; whether the top field is first, None until the `order_votes` decide; the
-    last periods of the frames; the time of the last frame; and the picture of the `previous` frame,
-    unless that was whole."""
+    `frames_since_examined` frames ago; whether the top field is first, None until the `order_votes`
+    decide; the last periods of the frames; the time of the last frame; and the picture of the
+    `previous_image` frame, unless that was whole."""
 
     kind: PictureKind | None = None
-    skipped: int = 0
+    frames_since_examined: int = 0
     order_votes: float = 0.0
     is_top_first: bool | None = None
     periods_s: tuple[float, ...] = ()
-    last_frame_s: float | None = None
-    previous: NDArray[np.uint8] | None = None
+    last_frame_t_s: float | None = None
+    previous_image: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,7 +413,7 @@ class PipelineState:
     empty_frames: int = 0  # number of successive frames without a marker
     lock: Lock | None = None
     rival: RivalTrack | None = None
-    fields: FieldState = FieldState()
+    field_state: FieldState = FieldState()
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,7 +425,7 @@ class PipelineOutput:
     target: TargetEstimate | None  # at the frame's time
     stage: Stage  # from this frame's detections
     disagreeing_frames: int = 0  # number of successive frames with contradicting markers
-    fields: PictureKind = "whole"  # kind of the picture
+    picture_kind: PictureKind = "whole"  # kind of the picture
     lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
     refused: bool = False  # this frame showed another vehicle's target, by its position
 

@@ -14,7 +14,7 @@ from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import project, split_fields
+from perchctl.vision import deinterlace_image, project
 from tests.helpers.boards import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera, draw_poses
 from tests.helpers.gear import SIZE_PX, Pictures, legs, turned_about
 from tests.helpers.orientation import turned_picture
@@ -136,7 +136,7 @@ def test_the_corners_of_an_interlaced_picture_are_its_first_fields() -> None:
         after = pose + np.array([0.0, 0.0, 0.0, 0.004, 0.001, 0.0])
         picture, bottom = (renderer.render(each, rng, noise=2.0) for each in (pose, after))
         picture[1::2] = bottom[1::2]
-        assert len(split_fields(picture)) == 2
+        assert len(deinterlace_image(picture)) == 2
         view = _view(CHARUCO, picture)
         there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
         assert rms(view.corners_px - there) < 0.1

@@ -13,7 +13,7 @@ from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.target.boards import black_squares
-from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision import CameraModel, project, undistort_to_normalised
 
 CHARUCO = Board.parse("charuco:10x7:25mm:18mm:DICT_5X5_100")
 CHESSBOARD = Board.parse("chessboard:9x6:25mm")
@@ -56,7 +56,9 @@ def draw_poses(
         # Spread over the picture in thirds, then at random within.
         thirds = np.array([i % 3, i // 3 % 3]) + rng.uniform(0.1, 0.9, 2)
         px = thirds / 3 * (w, h)
-        ray = undistort(((1 - aside) * np.array([w / 2, h / 2]) + aside * px)[None], camera)[0]
+        ray = undistort_to_normalised(
+            ((1 - aside) * np.array([w / 2, h / 2]) + aside * px)[None], camera
+        )[0]
         tilt = np.radians(rng.uniform(0.3, 1.0) * max_tilt_deg)
         about = rng.uniform(0, 2 * np.pi)
         roll = rng.normal(0, 0.3)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rotation_from_rpy
 from perchctl.profile import aruco_dictionary
-from perchctl.vision import CameraModel, undistort
+from perchctl.vision import CameraModel, undistort_to_normalised
 
 LARGE_M, SMALL_M, SHEET_M = 0.150, 0.025, 0.200
 BACKGROUND = 120.0
@@ -126,5 +126,5 @@ def _rays(camera: CameraModel) -> Array:
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2)
     rays = np.ones((h * w, 3))
-    rays[:, :2] = undistort(grid.astype(np.float64), camera)
+    rays[:, :2] = undistort_to_normalised(grid.astype(np.float64), camera)
     return rays.reshape(h, w, 3)

@@ -19,7 +19,7 @@ from perchctl.vision import (
     estimate_pose,
     step,
 )
-from perchctl.vision.fields import interpolate_field, is_combed, separate_fields
+from perchctl.vision.fields import deinterlace_frame, interpolate_field, is_combed
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
@@ -88,8 +88,8 @@ def test_noise_and_snow_and_nothing_are_not_combed() -> None:
 def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
     found = []
     for frame in frames:
-        state, parts = separate_fields(state, frame)
-        found.append(tuple(part.fields for part in parts))
+        state, parts = deinterlace_frame(state, frame)
+        found.append(tuple(part.picture_kind for part in parts))
     return found
 
 
@@ -137,7 +137,7 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     for k in range(40):
         index += 1 + (rng.random() < 0.1)
         t_s = index * period_s + rng.normal(0.0, 0.03 * period_s)
-        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s))
+        state, parts = deinterlace_frame(state, replace(frames[k % 3], t_s=t_s))
     early, late = parts
     assert (early.t_s + late.t_s) / 2.0 == pytest.approx(t_s)
     assert late.t_s - early.t_s == pytest.approx(apart_s, rel=0.03)
@@ -184,12 +184,12 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
     for k in range(12):
         T = pose_of(0.0, 0.0005 * k, 0.4)
         image = render(*T, noise=2.0, seed=k)
-        field = Frame(0, 0.0, interpolate_field(image, first_row), fields=kind)
+        field = Frame(0, 0.0, interpolate_field(image, first_row), picture_kind=kind)
         seen = detect_markers(field, None, setup.detector, CAMERA).large
-        assert seen.horizontal_side_sigma_px > 0.0
+        assert seen.horizontal_side_extra_sigma_px > 0.0
         for name, d in (
             ("claimed", seen),
-            ("as elsewhere", replace(seen, horizontal_side_sigma_px=0.0)),
+            ("as elsewhere", replace(seen, horizontal_side_extra_sigma_px=0.0)),
         ):
             pose = estimate_pose([d], 0.0, None, setup.pose)
             e = pose.tvec_m - T[1]

@@ -14,7 +14,7 @@ from scipy.special import stdtrit
 from perchctl.calibration.board.detect import MIN_CORNERS, BoardView, Rejection
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision import CameraModel, project, undistort_to_normalised
 
 ModelName = Literal["plumb_bob", "fisheye"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)  # the simplest first
@@ -95,7 +95,7 @@ def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | No
     """Fit the board poses for a fixed camera; None if a board is not in its view."""
     poses = []
     for view in views:
-        seen = undistort(view.corners_px, camera)
+        seen = undistort_to_normalised(view.corners_px, camera)
         if not np.isfinite(seen).all():
             return None
         _, rvec, tvec = cv2.solvePnP(

@@ -13,7 +13,7 @@ from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig, aruco_dictionary
 from perchctl.target import Board
-from perchctl.vision import split_fields
+from perchctl.vision import deinterlace_image
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
@@ -150,7 +150,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     picture the first field is used, as a moving board has two positions. Both layouts of a ChArUco
     board are looked for, whichever `board` has."""
     picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
-    image = split_fields(image)[0]
+    image = deinterlace_image(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image

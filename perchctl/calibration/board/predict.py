@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from perchctl.calibration.board.adjust import SIGMAS_95, fit_poses, projection_derivatives
 from perchctl.calibration.board.detect import BoardView
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision import CameraModel, project, undistort_to_normalised
 
 RANGES_M = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 LARGE_M, SMALL_M = 0.150, 0.025
@@ -111,7 +111,7 @@ def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None) 
     """Return target centres at that depth, (n, 3), the first straight ahead."""
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 9), np.linspace(0, h - 1, 7)), axis=-1)
-    rays = undistort(grid.reshape(-1, 2), camera)
+    rays = undistort_to_normalised(grid.reshape(-1, 2), camera)
     rays = rays[np.isfinite(rays).all(axis=1)]
     corners_m = _marker_m(camera, z_m)
     places = [np.array([0.0, 0.0, z_m])]
@@ -129,7 +129,7 @@ def _cells(camera: CameraModel, place: Array, corners_m: Array) -> NDArray[np.in
         return None
     # Far outside its field a lens polynomial folds back into the picture.
     straight = corners_m[:, :2] * (1.0, -1.0) + place[:2]
-    if not np.allclose(undistort(pixels, camera), straight / place[2], atol=1e-3):
+    if not np.allclose(undistort_to_normalised(pixels, camera), straight / place[2], atol=1e-3):
         return None
     rows, columns = CELLS
     return np.floor((pixels + 0.5) / (w, h) * (columns, rows)).astype(np.intp)

@@ -30,7 +30,7 @@ from perchctl.calibration.board.predict import (
 from perchctl.calibration.files import calibration_text
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision import CameraModel, project, undistort_to_normalised
 
 Level = Literal["fly", "care", "stop"]
 TITLES: dict[Level, str] = {
@@ -235,7 +235,7 @@ def _is_usable(camera: CameraModel) -> bool:
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)), axis=-1)
     pixels = grid.reshape(-1, 2)
-    rays = undistort(pixels, camera)
+    rays = undistort_to_normalised(pixels, camera)
     if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h and np.isfinite(rays).all()):
         return False
     ahead = np.column_stack([rays, np.ones(len(rays))])

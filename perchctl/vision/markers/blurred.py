@@ -6,8 +6,8 @@ drawing correlates best with the picture I:
     max of  sum (I(x+s) - mean I) (T(x) - mean T) / (|I - mean I| |T - mean T|)
 
 Without an expectation, the fits start at the quadrilaterals whose cells correlate best with the
-drawing. Any start is safe because the photometric fit must verify it (`is_verified`,
-`is_distinctive`) and measures the corners.
+drawing. Any start is safe because the photometric fit must verify it (`has_matching_drawing`,
+`has_distinctive_bits`) and measures the corners.
 
 The result is wrong where the photometric fit is (`perchctl.vision.markers.photometric_fit`). It is
 empty if another codeword would look the same, or if the marker is further from its expected
@@ -34,44 +34,55 @@ from perchctl.vision.markers.corners import (
     signed_double_area,
 )
 from perchctl.vision.markers.detector import Picture, make_quad_detector
-from perchctl.vision.markers.edge_fit import CLIPPED_FRACTION, CLIPPED_GREY, CLIPPED_SIGMA_PX
+from perchctl.vision.markers.edge_fit import (
+    CLIPPED_CORNER_SIGMA_PX,
+    CLIPPED_GREY,
+    MIN_CLIPPED_FRACTION,
+)
 from perchctl.vision.markers.pattern import MIN_MARKER_SIDE_PX, Pattern, correlate_pattern
 from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
-_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
+_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
 # largest error of an expected position
 _MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_START_CORRELATION = 0.5
 # minimum at an expected position; textures seldom reach it, and each costs a fit
-_MIN_EXPECTED_CORRELATION = 0.45
+_MIN_EXPECTED_MARKER_CORRELATION = 0.45
 _MAX_CANDIDATES = 3
 _CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # grey of areas with unknown content
-_MAX_DUPLICATE_DISTANCE = 0.15  # distance, as a share of a side, of candidates that count as one
-_PAPER_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
+_MAX_DUPLICATE_DISTANCE_SIDES = (
+    0.15  # distance, as a share of a side, of candidates that count as one
+)
+_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
-    picture: Picture, expected: Mapping[MarkerName, Array], blur_guess_index: int | None = None
+    picture: Picture,
+    expected_corners_px: Mapping[MarkerName, Array],
+    start_blur_index: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first marker found near its `expected` corners (4, 2) px; empty if none is found.
+    """Return the first marker found near its `expected_corners_px` corners (4, 2) px; empty if none
+    is found.
 
-    An even or odd `blur_guess_index` selects fits that start with little or with much blur; None
+    An even or odd `start_blur_index` selects fits that start with little or with much blur; None
     tries both.
     """
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = (
-        _BLURS_PX if blur_guess_index is None else (_BLURS_PX[blur_guess_index % len(_BLURS_PX)],)
+        _START_BLURS_PX
+        if start_blur_index is None
+        else (_START_BLURS_PX[start_blur_index % len(_START_BLURS_PX)],)
     )
     for name in MARKERS:
-        corners = expected.get(name)
+        corners = expected_corners_px.get(name)
         if corners is None or not is_inside_picture(corners, image.shape):
             continue
         if mean_side_px(corners) < MIN_MARKER_SIDE_PX:
             continue
         start = _align_by_correlation(image, corners, patterns[name])
-        if correlate_pattern(image, start, patterns[name])[0] < _MIN_EXPECTED_CORRELATION:
+        if correlate_pattern(image, start, patterns[name])[0] < _MIN_EXPECTED_MARKER_CORRELATION:
             continue
         for blur_px in blurs_px:
             seen = align_marker(picture, name, start, blur_px=blur_px)
@@ -111,7 +122,7 @@ def _rank_quads(
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
         middle, room_px = (
             corners_px.mean(axis=0),
-            _MAX_DUPLICATE_DISTANCE * mean_side_px(corners_px),
+            _MAX_DUPLICATE_DISTANCE_SIDES * mean_side_px(corners_px),
         )
         if not any(
             name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
@@ -127,7 +138,7 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _PAPER_HALF_SIDES
+    half = float(np.abs(corners_px - centre).max()) * _PAPER_REACH_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -150,16 +161,20 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
     return np.asarray(corners_px + (np.array(peak) - first) / scale, dtype=np.float64)
 
 
-def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
+def _render_template(
+    pattern: Pattern, marker_coordinates: Array, side_px: float
+) -> NDArray[np.float32]:
     """Return the blurred drawing at the marker's own coordinates (n, n, 2)."""
-    n = len(pattern.drawing.cells)
-    cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
+    n = len(pattern.drawing.cell_whiteness)
+    cell = np.floor((marker_coordinates + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
     cell = np.clip(cell, 0, n - 1)
-    white = np.where(inside, pattern.drawing.cells[cell[..., 1], cell[..., 0]], 1.0)
-    if pattern.drawing.centre is not None:
-        white[np.abs(own).max(axis=2) < pattern.drawing.ratio] = _CENTRE_GREY
-    white[np.abs(own).max(axis=2) > _PAPER_HALF_SIDES] = _OUTSIDE_GREY
+    white = np.where(inside, pattern.drawing.cell_whiteness[cell[..., 1], cell[..., 0]], 1.0)
+    if pattern.drawing.small_cell_whiteness is not None:
+        white[np.abs(marker_coordinates).max(axis=2) < pattern.drawing.small_to_large_side] = (
+            _CENTRE_GREY
+        )
+    white[np.abs(marker_coordinates).max(axis=2) > _PAPER_REACH_HALF_SIDES] = _OUTSIDE_GREY
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
@@ -167,81 +182,90 @@ def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np
 # --- Measure a marker by its drawing, and accept it only if the picture matches beyond doubt ---
 
 
-_MIN_SIGMA_PX = 0.015
-_BLUR_SIGMA = 0.012  # share of the blur: no picture equals its drawing with uniform blur
+_MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
+_CORNER_SIGMA_PER_BLUR = 0.012  # share of the blur: no picture equals its drawing with uniform blur
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
-_MAX_CELL_DEVIATION = 0.3
-_MAX_WRONG_BIT_DEGREE, _MAX_WRONG_BIT_SIGMA = 0.4, 0.35
-_MAX_ALIGNED_SIGMA = 0.06  # share of the side
-_MIN_REACH_PX = 3.0
+_MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
+_MAX_BIT_FLIP_FRACTION, _MAX_BIT_FLIP_FRACTION_SIGMA = 0.4, 0.35
+_MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06  # share of the side
+_MIN_MOTION_LIMIT_PX = 3.0
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # ratio of the mean sides
-_MIN_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
+_MIN_SHORTEST_TO_LONGEST_SIDE = 0.6  # ratio of the shortest side to the longest
 
 
 def align_marker(
     picture: Picture,
     name: MarkerName,
     start_px: Array,
-    reach: float = 0.6,
+    max_motion_sides: float = 0.6,
     blur_px: float = 1.5,
-    max_sigma: float = _MAX_ALIGNED_SIGMA,
-    alone: bool = True,
+    max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
+    must_be_distinctive: bool = True,
 ) -> RefinedCorners | None:
     """Return the marker fitted by its drawing; None unless the picture matches the drawing.
 
-    `reach` is the largest distance of the corners from `start_px`, and `max_sigma` their largest
-    standard deviation, both in side lengths; `blur_px` is a first guess. If `alone`, the codeword
-    must be distinctive; otherwise the other marker identifies this one.
+    `max_motion_sides` is the largest distance of the corners from `start_px`, and
+    `max_corner_sigma_sides` their largest standard deviation, both in side lengths; `blur_px` is a
+    first guess. If `must_be_distinctive`, the codeword must be distinctive; otherwise the other
+    marker identifies this one.
     """
     side_px = mean_side_px(start_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
         return None
     image, drawing = picture.image, picture.setup.patterns[name].drawing
-    found = align_drawing(image, start_px, drawing, picture.camera, blur_px)
+    alignment = align_drawing(image, start_px, drawing, picture.camera, blur_px)
     if (
-        found is None
-        or not is_verified(found, max_sigma)
-        or (alone and not is_distinctive(found))
-        or found.motion_px > max(reach * side_px, _MIN_REACH_PX)
+        alignment is None
+        or not has_matching_drawing(alignment, max_corner_sigma_sides)
+        or (must_be_distinctive and not has_distinctive_bits(alignment))
+        or alignment.motion_from_start_px > max(max_motion_sides * side_px, _MIN_MOTION_LIMIT_PX)
     ):
         return None
     # The square must remain a square of about the same size and orientation.
-    sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
+    sides_px, areas = side_lengths_px(alignment.corners_px), [alignment.corners_px, start_px]
     if (
-        sides_px.min() < _MIN_SIDE_RATIO * sides_px.max()
+        sides_px.min() < _MIN_SHORTEST_TO_LONGEST_SIDE * sides_px.max()
         or not _MIN_SIZE_RATIO < float(sides_px.mean()) / side_px < _MAX_SIZE_RATIO
         or np.prod(signed_double_area(np.stack(areas))) <= 0.0
     ):
         return None
-    sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
-    (left, top), (right, bottom) = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    sigma_px = math.hypot(
+        max(alignment.sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
+        _CORNER_SIGMA_PER_BLUR * alignment.blur_px,
+    )
+    (left, top), (right, bottom) = (
+        alignment.corners_px.min(axis=0),
+        alignment.corners_px.max(axis=0),
+    )
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_FRACTION * part.size:
+    if int(np.count_nonzero(part > CLIPPED_GREY)) > MIN_CLIPPED_FRACTION * part.size:
         # The light model does not explain clipped white.
-        sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
-    return RefinedCorners(found.corners_px, sigma_px, True)
+        sigma_px = math.hypot(sigma_px, CLIPPED_CORNER_SIGMA_PX)
+    return RefinedCorners(alignment.corners_px, sigma_px, True)
 
 
-def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool:
+def has_matching_drawing(
+    alignment: Alignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
+) -> bool:
     """True if the picture matches the drawing.
 
     Without the marker, the correlation of the pattern stays below 0.72 at the right strength; with
     the marker, it is above 0.95.
     """
     return (
-        found.pattern_correlation > _MIN_INNER_CORRELATION
-        and found.fit_correlation > _MIN_CORRELATION
-        and _MIN_PATTERN_CONTRAST < found.pattern_contrast < _MAX_PATTERN_CONTRAST
-        and found.cell_deviation < _MAX_CELL_DEVIATION
-        and found.sigma_px < max_sigma * mean_side_px(found.corners_px)
+        alignment.pattern_correlation > _MIN_INNER_CORRELATION
+        and alignment.fit_correlation > _MIN_CORRELATION
+        and _MIN_PATTERN_CONTRAST < alignment.pattern_contrast < _MAX_PATTERN_CONTRAST
+        and alignment.cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
+        and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
 
-def is_distinctive(found: Alignment) -> bool:
-    """True if any other codeword would look different. All of 36 other markers that `is_verified`
-    accepted had a `wrong_bit_degree` above 0.5."""
+def has_distinctive_bits(alignment: Alignment) -> bool:
+    """True if any other codeword would look different. All of 36 other markers that
+    `has_matching_drawing` accepted had a `wrong_bit_degree` above 0.5."""
     return (
-        found.wrong_bit_degree < _MAX_WRONG_BIT_DEGREE
-        and found.wrong_bit_sigma < _MAX_WRONG_BIT_SIGMA
+        alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
+        and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA
     )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.lens import distort, undistort
+from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -54,7 +54,7 @@ def apply_homography(H: Array, points: Array) -> Array:
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
-def homography_jacobian(homography: Array) -> Array:
+def projected_corners_jacobian(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the projected corners of the unit square by the terms `p` of
     `increment_homography`, at a homography (3, 3)."""
     q = _UNIT_SQUARE_HOMOGENEOUS.dot(homography.T)
@@ -63,10 +63,16 @@ def homography_jacobian(homography: Array) -> Array:
     return np.asarray((A @ _INCREMENT_JACOBIANS).reshape(8, 8))
 
 
-def increment_homography(H: Array, p: Array) -> Array:
+def increment_homography(H: Array, increment: Array) -> Array:
     """Return H (I + P), scaled so that the last element is 1. p (8,) are the first elements of P
     (3, 3), row by row; the last one is 0."""
-    H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
+    H = H @ np.array(
+        [
+            [1 + increment[0], increment[1], increment[2]],
+            [increment[3], 1 + increment[4], increment[5]],
+            [increment[6], increment[7], 1.0],
+        ]
+    )
     return np.asarray(H / H[2, 2])
 
 
@@ -99,19 +105,19 @@ def is_inside_picture(corners_px: Array, shape: tuple[int, ...], margin_px: floa
 def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
     """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
     without a camera, lens distortion is ignored."""
-    straight = corners_px if camera is None else undistort(corners_px, camera)
+    straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_unit_square(straight), (_UNIT_SQUARE_F32 * ratio).astype(np.float64)
     )
-    return found if camera is None else distort(found, camera)
+    return found if camera is None else distort_to_px(found, camera)
 
 
 def add_missing_marker(
-    expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+    expected_corners_px: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
     """Return both markers' corners; a missing marker follows from the other one and their
     `ratio`."""
-    both = dict(expected)
+    both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], ratio, camera)
     elif "large" not in both and "small" in both:
@@ -128,7 +134,7 @@ DETECTOR_CORNER_SIGMA_PX = 0.6
 """Standard deviation of corners from OpenCV's detector, px."""
 SUBPIX_CORNER_SIGMA_PX = 0.25
 """Standard deviation of corners from `cv2.cornerSubPix`, px."""
-DERIVED_CORNER_SIGMA_PX = 0.6  # derived from the other marker, not measured
+CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6  # derived from the other marker, not measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,23 +146,24 @@ class RefinedCorners:
     corners_px: Array
     sigma_px: float
     refined: bool
-    shift_sigma_px: float = 0.0
+    edge_shift_sigma_px: float = 0.0
     blur_px: float = 0.0
     edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
-    row_sigma_px: float = 0.0
-    min_blur_px: float = math.inf
+    row_jitter_sigma_px: float = 0.0
+    sharpest_side_blur_px: float = math.inf
 
 
-def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
+def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells_per_side: int) -> RefinedCorners:
     """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep them raw if one leaves its window.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window of half
-    a cell to each side, 1 to 5 px; `cells` is the number of cells along a side. Blur biases such a
-    corner inwards by 0.15 to 0.3 px, so that the target looks too far away: `refined` is False.
+    a cell to each side, 1 to 5 px; `cells_per_side` is the number of cells along a side. Blur
+    biases such a corner inwards by 0.15 to 0.3 px, so that the target looks too far away: `refined`
+    is False.
     """
     side_px = float(side_lengths_px(raw_px).min())
-    half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
+    half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
     cv2.cornerSubPix(image, points, (half, half), (-1, -1), criteria)

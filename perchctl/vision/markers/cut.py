@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision.lens import distort, undistort
+from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
     UNIT_SQUARE,
     RefinedCorners,
@@ -53,17 +53,17 @@ _MAX_EDGE_DISTANCE_PX = 40  # from the edge of the picture, where a marker may j
 # cell of the small marker; if it is smaller, the large marker is in view
 _MIN_SMALL_CELL_PX = 8.0
 _MIN_OVERVIEW_CORRELATION = 0.6  # correlation required at the moved prediction
-_GOOD_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
+_SUFFICIENT_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
 _SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_CUT_GAIN = 0.9, 20.0
-_MIN_SHOWN_FRACTION = 0.75  # share of the edge points in view
+_MIN_FOUND_POINT_FRACTION = 0.75  # share of the edge points in view
 _MAX_CUT_RESIDUAL_PX = 1.2
-_MAX_CENTRE_SIGMA = 0.04  # of the centre, in half sides
+_MAX_CENTRE_SIGMA_HALF_SIDES = 0.04  # of the centre, in half sides
 _MIN_CORNER_SIGMA_PX = 0.02
 _MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
-_MAX_INVERSION_ERROR = 1e-3  # normalised; the lens model is valid where its inverse exists
+_MAX_LENS_INVERSION_ERROR = 1e-3  # normalised; the lens model is valid where its inverse exists
 # rotation from a marker's own coordinates to its axes
-_R_AXES_COORDINATES = np.diag([1.0, -1.0, -1.0])
+_R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 
 
 def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
@@ -72,50 +72,55 @@ def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: Camer
 
 
 def is_target_cut(
-    expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: HiddenMask | None = None
+    expected_corners_px: Mapping[MarkerName, Array],
+    shape: tuple[int, ...],
+    hidden: HiddenMask | None = None,
 ) -> bool:
     """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden by the
     vehicle's gear."""
     whole = [
         corners
-        for corners in expected.values()
+        for corners in expected_corners_px.values()
         if is_inside_picture(corners, shape, _MAX_EDGE_DISTANCE_PX)
     ]
-    return bool(expected) and all(is_hidden(hidden, c) for c in whole)
+    return bool(expected_corners_px) and all(is_hidden(hidden, c) for c in whole)
 
 
-def can_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
+def can_whole_marker_be_in_view(
+    expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
+) -> bool:
     """True if an expected marker (4, 2) px may be completely in the picture."""
     return any(
-        is_inside_picture(corners, shape, -_MAX_EDGE_DISTANCE_PX) for corners in expected.values()
+        is_inside_picture(corners, shape, -_MAX_EDGE_DISTANCE_PX)
+        for corners in expected_corners_px.values()
     )
 
 
 def fit_cut_markers(
-    picture: Picture, expected: Mapping[MarkerName, Array]
+    picture: Picture, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
     """Fit the target's visible part and return one marker's corners from the fit; empty if it
-    fails. `expected` are the predicted corners (4, 2) px."""
+    fails. `expected_corners_px` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
-    ratio, centre = drawing.ratio, drawing.centre
-    start = _initial_pose(expected, ratio, camera)
+    ratio, centre = drawing.small_to_large_side, drawing.small_cell_whiteness
+    start = _initial_pose(expected_corners_px, ratio, camera)
     if start is None or centre is None:
         return {}
-    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _MIN_SMALL_CELL_PX:
+    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t_cam_half_sides[2] < _MIN_SMALL_CELL_PX:
         return {}
     covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
-    view, texture = make_overview(image, camera, covered), make_texture(drawing)
-    near = _search_near_pose(start, texture, view)
+    overview, texture = make_overview(image, camera, covered), make_texture(drawing)
+    near = _search_near_pose(start, texture, overview)
     if near is None:
         return {}
     found = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
     if found is None or not _is_reliable(found):
         return {}
-    like, gain = correlate_drawing(found.pose.H, texture, view)
+    like, gain = correlate_drawing(found.pose.H, texture, overview)
     if like < _MIN_CORRELATION or gain < _MIN_CUT_GAIN:
         return {}
-    name = _measured_marker(found)
+    name = _select_measured_marker(found)
     corners = _marker_corners(found, ratio if name == "small" else 1.0, camera)
     return {} if corners is None else {name: corners}
 
@@ -126,12 +131,16 @@ def shows_enough_of_target(
     """True if the visible part of the target suffices for a measurement, for a large marker with
     the rotation (3, 3) and centre (3,) in the camera frame."""
     patterns = _make_patterns(target)
-    pose = RigidPose(R_cam_marker @ _R_AXES_COORDINATES, position_m / (target.large.side_m / 2.0))
-    found = predict_fit(pose, _make_target_outline(patterns), camera)
+    pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, position_m / (target.large.side_m / 2.0))
+    found = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
     if found is None or not _is_reliable(found):
         return False
-    half = patterns["large"].drawing.ratio if _measured_marker(found) == "small" else 1.0
-    return _marker_corners(found, half, camera) is not None
+    half_side = (
+        patterns["large"].drawing.small_to_large_side
+        if _select_measured_marker(found) == "small"
+        else 1.0
+    )
+    return _marker_corners(found, half_side, camera) is not None
 
 
 @lru_cache(maxsize=4)
@@ -141,24 +150,28 @@ def _make_patterns(target: TargetConfig) -> dict[MarkerName, Pattern]:
 
 def _make_target_outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
     large, small = patterns["large"], patterns["small"]
-    return make_outline(large.drawing, large.rim.tolerance, small.rim.tolerance)
+    return make_outline(
+        large.drawing,
+        large.border_cells.print_tolerance_cells,
+        small.border_cells.print_tolerance_cells,
+    )
 
 
-def _measured_marker(found: PoseFit) -> MarkerName:
+def _select_measured_marker(found: PoseFit) -> MarkerName:
     """Return the marker that was measured: the small one if enough of it was visible."""
-    return "small" if found.small_points >= _MIN_SMALL_MARKER_POINTS else "large"
+    return "small" if found.small_marker_points >= _MIN_SMALL_MARKER_POINTS else "large"
 
 
 def _initial_pose(
-    expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+    expected_corners_px: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    name: MarkerName = "small" if "small" in expected else "large"
-    rays = undistort(expected[name], camera)
+    name: MarkerName = "small" if "small" in expected_corners_px else "large"
+    rays = undistort_to_normalised(expected_corners_px[name], camera)
     if not np.isfinite(rays).all():
         return None
-    half = ratio if name == "small" else 1.0
+    half_side = ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform(
-        (half * UNIT_SQUARE).astype(np.float32), rays.astype(np.float32)
+        (half_side * UNIT_SQUARE).astype(np.float32), rays.astype(np.float32)
     )
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
@@ -169,21 +182,27 @@ def _initial_pose(
     return RigidPose(R, np.asarray(H[:, 2])) if np.linalg.det(R) > 0.0 else None
 
 
-def _search_near_pose(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
+def _search_near_pose(
+    start: RigidPose, texture: Texture, overview: UndistortedOverview
+) -> RigidPose | None:
     """Return the prediction moved to its best match in the picture; None without a match."""
-    best, pose, lattice = _MIN_OVERVIEW_CORRELATION, None, view.lattice
+    best, pose, lattice = _MIN_OVERVIEW_CORRELATION, None, overview.lattice
     for growth in _SCALE_CANDIDATES:
-        t = start.t * (1.0, 1.0, 1.0 / growth)
-        wide = render_drawing(RigidPose(start.R, t).H, texture, lattice, _SEARCH_RANGE_NODES)
-        mask = view.is_visible.astype(np.float32)
-        score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+        t = start.t_cam_half_sides * (1.0, 1.0, 1.0 / growth)
+        wide = render_drawing(
+            RigidPose(start.R_cam_drawing, t).H, texture, lattice, _SEARCH_RANGE_NODES
+        )
+        mask = overview.is_visible.astype(np.float32)
+        score = cv2.matchTemplate(wide, overview.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
-        drift = (_SEARCH_RANGE_NODES - np.array([column, row], dtype=np.float64)) * lattice.step
+        drift = (
+            _SEARCH_RANGE_NODES - np.array([column, row], dtype=np.float64)
+        ) * lattice.node_spacing_normalised
         if score[row, column] > best:
             best = float(score[row, column])
-            pose = RigidPose(start.R, t + np.append(drift * t[2], 0.0))
-        if best > _GOOD_OVERVIEW_CORRELATION:
+            pose = RigidPose(start.R_cam_drawing, t + np.append(drift * t[2], 0.0))
+        if best > _SUFFICIENT_OVERVIEW_CORRELATION:
             break
     return pose
 
@@ -192,16 +211,16 @@ def _is_reliable(found: PoseFit) -> bool:
     """True if nearly all edges were found and determine the position."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
-        found.points_shown >= _MIN_SHOWN_FRACTION * found.points_in_view
+        found.points_found >= _MIN_FOUND_POINT_FRACTION * found.points_in_view
         and found.residual_px < _MAX_CUT_RESIDUAL_PX
-        and spread < _MAX_CENTRE_SIGMA
+        and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
     )
 
 
-def _marker_corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
+def _marker_corners(found: PoseFit, half_side: float, camera: CameraModel) -> RefinedCorners | None:
     """Return the corners of the marker with this half side; None outside the lens model."""
-    r = np.column_stack([half * UNIT_SQUARE, np.zeros(4)]) @ found.pose.R.T
-    X = r + found.pose.t
+    r = np.column_stack([half_side * UNIT_SQUARE, np.zeros(4)]) @ found.pose.R_cam_drawing.T
+    X = r + found.pose.t_cam_half_sides
     if X[:, 2].min() <= 0.0:
         return None  # one corner is next to or behind the camera
     x = X[:, :2] / X[:, 2:]
@@ -211,8 +230,11 @@ def _marker_corners(found: PoseFit, half: float, camera: CameraModel) -> Refined
         P = camera.K[:2, :2] @ P
         J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
         J[2 * k : 2 * k + 2, 3:] = P
-    corners_px = distort(x, camera)
-    if not np.abs(undistort(corners_px, camera) - x).max() < _MAX_INVERSION_ERROR:
+    corners_px = distort_to_px(x, camera)
+    if (
+        not np.abs(undistort_to_normalised(corners_px, camera) - x).max()
+        < _MAX_LENS_INVERSION_ERROR
+    ):
         return None
     cov_px2 = J @ found.cov @ J.T + _MIN_CORNER_SIGMA_PX**2 * np.eye(8)
     sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
@@ -222,57 +244,58 @@ def _marker_corners(found: PoseFit, half: float, camera: CameraModel) -> Refined
 # --- A reduced picture through a pinhole camera, and the drawing rendered into it ---
 
 
-Grey = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 
 _LATTICE_COLUMNS = 80  # across the picture, approximately
 _SAMPLES_PER_NODE = 2  # samples per node in both directions
-_MAX_FIELD_OF_VIEW_RADIUS = 1.5  # normalised: 56 degrees off the axis
-_POINTS_PER_BORDER = 40
-_REACH_MARGIN = 1.02
+_MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
+_POINTS_PER_PICTURE_SIDE = 40
+_VALID_RADIUS_FACTOR = 1.02
 _SEARCH_RANGE_NODES = 6  # nodes to each side
 _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
-    """Nodes of a pinhole camera's picture, `step` apart in normalised coordinates, starting at
-    `first_node` (2,). `map_x` and `map_y` are the pixel positions of their samples in the
-    picture reduced to `size` (width, height).
+class OverviewLattice:
+    """Nodes of a pinhole camera's picture, `node_spacing_normalised` apart in normalised
+    coordinates, starting at `first_node_normalised` (2,). `map_x_px` and `map_y_px` are the pixel
+    positions of their samples in the picture reduced to `reduced_size_px` (width, height).
 
-    `inside` marks the nodes in the picture. Beyond `reach`, a lens model may fold back.
+    `is_in_picture` marks the nodes in the picture. Beyond `valid_radius_normalised`, a lens model
+    may fold back.
     """
 
-    first_node: Array
-    step: float
-    reach: float
-    map_x: Grey
-    map_y: Grey
-    size: tuple[int, int]
-    inside: NDArray[np.bool_]
+    first_node_normalised: Array
+    node_spacing_normalised: float
+    valid_radius_normalised: float
+    map_x_px: FloatImage
+    map_y_px: FloatImage
+    reduced_size_px: tuple[int, int]
+    is_in_picture: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Overview:
+class UndistortedOverview:
     """A reduced picture: grey values (rows, columns) at the nodes of a lattice; `is_visible` is
     True for nodes in view and uncovered."""
 
-    lattice: Lattice
-    grey: Grey
+    lattice: OverviewLattice
+    grey: FloatImage
     is_visible: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=8)
-def make_lattice(camera: CameraModel) -> Lattice:
+def make_lattice(camera: CameraModel) -> OverviewLattice:
     """Return the lattice over a camera's picture."""
     w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _POINTS_PER_BORDER)
+    s = np.linspace(0.0, 1.0, _POINTS_PER_PICTURE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
     rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
-    rays = undistort(rim * (w - 1.0, h - 1.0), camera)
+    rays = undistort_to_normalised(rim * (w - 1.0, h - 1.0), camera)
     rays = np.clip(
-        np.nan_to_num(rays, nan=0.0), -_MAX_FIELD_OF_VIEW_RADIUS, _MAX_FIELD_OF_VIEW_RADIUS
+        np.nan_to_num(rays, nan=0.0), -_MAX_VIEW_RADIUS_NORMALISED, _MAX_VIEW_RADIUS_NORMALISED
     )
-    reach = _REACH_MARGIN * float(np.hypot(*rays.T).max())
+    reach = _VALID_RADIUS_FACTOR * float(np.hypot(*rays.T).max())
     step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
@@ -281,7 +304,7 @@ def make_lattice(camera: CameraModel) -> Lattice:
         for k in (0, 1)
     ]
     x, y = np.meshgrid(*fine)
-    at = distort(np.stack([x.ravel(), y.ravel()], axis=1), camera)
+    at = distort_to_px(np.stack([x.ravel(), y.ravel()], axis=1), camera)
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
     inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
     at = np.where(inside[:, None], at, -1e3)
@@ -290,53 +313,66 @@ def make_lattice(camera: CameraModel) -> Lattice:
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
     shape = (int(nodes[1]), _SAMPLES_PER_NODE, int(nodes[0]), _SAMPLES_PER_NODE)
     flat = x.shape
-    return Lattice(
-        first_node=rays.min(axis=0) + step / 2.0,
-        step=step,
-        reach=reach,
-        map_x=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
-        map_y=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
-        size=size,
-        inside=inside.reshape(shape).all(axis=(1, 3)),
+    return OverviewLattice(
+        first_node_normalised=rays.min(axis=0) + step / 2.0,
+        node_spacing_normalised=step,
+        valid_radius_normalised=reach,
+        map_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
+        map_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
+        reduced_size_px=size,
+        is_in_picture=inside.reshape(shape).all(axis=(1, 3)),
     )
 
 
 def make_overview(
-    image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
-) -> Overview:
-    """Return the reduced picture at the lattice's nodes; nodes with `mask` (h, w) set are not
-    seen."""
+    image: NDArray[np.uint8], camera: CameraModel, hidden_mask: NDArray[np.uint8] | None = None
+) -> UndistortedOverview:
+    """Return the reduced picture at the lattice's nodes; nodes with `hidden_mask` (h, w) set are
+    not seen."""
     lattice = make_lattice(camera)
-    seen = lattice.inside
-    if mask is not None:
-        covered = (mask != 0).astype(np.float32)
+    seen = lattice.is_in_picture
+    if hidden_mask is not None:
+        covered = (hidden_mask != 0).astype(np.float32)
         seen = seen & (_sample_at_nodes(covered, lattice) < 1e-3)
-    return Overview(lattice, _sample_at_nodes(image, lattice), seen)
+    return UndistortedOverview(lattice, _sample_at_nodes(image, lattice), seen)
 
 
-def _sample_at_nodes(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
-    small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    fine = cv2.remap(small, lattice.map_x, lattice.map_y, cv2.INTER_LINEAR)
+def _sample_at_nodes(
+    picture: NDArray[np.uint8] | FloatImage, lattice: OverviewLattice
+) -> FloatImage:
+    small = cv2.resize(picture, lattice.reduced_size_px, interpolation=cv2.INTER_AREA).astype(
+        np.float32
+    )
+    fine = cv2.remap(small, lattice.map_x_px, lattice.map_y_px, cv2.INTER_LINEAR)
     return _downsample(np.asarray(fine, np.float32))
 
 
-def _downsample(fine: Grey) -> Grey:
+def _downsample(fine: FloatImage) -> FloatImage:
     rows, columns = (n // _SAMPLES_PER_NODE for n in fine.shape)
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes
-    around."""
-    step = lattice.step / _SAMPLES_PER_NODE
-    start = lattice.first_node - 0.5 * (lattice.step - step) - margin * lattice.step
+def render_drawing(
+    H: Array, texture: Texture, lattice: OverviewLattice, margin_nodes: int = 0
+) -> FloatImage:
+    """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin_nodes`
+    nodes around."""
+    step = lattice.node_spacing_normalised / _SAMPLES_PER_NODE
+    start = (
+        lattice.first_node_normalised
+        - 0.5 * (lattice.node_spacing_normalised - step)
+        - margin_nodes * lattice.node_spacing_normalised
+    )
     G = np.array(
         [[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step], [0.0, 0.0, 1.0]]
     )
     white, T = texture
     M = G @ H @ np.linalg.inv(T)
-    rows, columns = lattice.inside.shape
-    size = (_SAMPLES_PER_NODE * (columns + 2 * margin), _SAMPLES_PER_NODE * (rows + 2 * margin))
+    rows, columns = lattice.is_in_picture.shape
+    size = (
+        _SAMPLES_PER_NODE * (columns + 2 * margin_nodes),
+        _SAMPLES_PER_NODE * (rows + 2 * margin_nodes),
+    )
     fine = cv2.warpPerspective(
         white,
         M,
@@ -348,20 +384,24 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
     return _downsample(np.asarray(fine, np.float32))
 
 
-def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
+def correlate_drawing(
+    H: Array, texture: Texture, overview: UndistortedOverview
+) -> tuple[float, float]:
     """Return the view's correlation with the drawing projected by H (3, 3), and the contrast in
     grey levels."""
-    lattice = view.lattice
-    rows, columns = np.nonzero(view.is_visible)
-    at = lattice.first_node + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
+    lattice = overview.lattice
+    rows, columns = np.nonzero(overview.is_visible)
+    at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
+        [columns, rows], axis=1
+    ).astype(np.float64)
     on = (
         np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1)
-        < LARGE_PAPER_HALF_SIDES
+        < PAPER_REACH_LARGE_HALF_SIDES
     )
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return 0.0, 0.0
     white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
-    grey = view.grey[rows[on], columns[on]].astype(np.float64)
+    grey = overview.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
@@ -371,12 +411,12 @@ def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
 
 
-LARGE_PAPER_HALF_SIDES = 1.25  # half sides of the large marker that are certainly paper
+PAPER_REACH_LARGE_HALF_SIDES = 1.25  # half sides of the large marker that are certainly paper
 _POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # points along a cell's side
 # share of a cell's side near its ends, where the next cell's corner blurs the edge
-_END_MARGIN_CELLS = 0.15
-_CENTRAL_MARKER_HALF_SIDES = 1.2  # half sides of the central marker, which hides the large one
-_TEXTURE_SIZE = 320
+_EDGE_END_MARGIN_CELLS = 0.15
+_SMALL_MARKER_REACH_HALF_SIDES = 1.2  # half sides of the central marker, which hides the large one
+_TEXTURE_SIZE_PX = 320
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,8 +428,8 @@ class Outline:
     points: Array
     normal: Array
     line_index: NDArray[np.intp]
-    print_sigma: Array
-    cell_width: Array
+    print_sigma_half_sides: Array
+    cell_width_half_sides: Array
     is_small_marker: NDArray[np.bool_]
 
 
@@ -399,63 +439,75 @@ pixels."""
 
 
 @lru_cache(maxsize=8)
-def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
+def make_outline(
+    drawing: Drawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
+) -> Outline:
     """Return the edges of both markers; tolerances are print errors of an edge's position, in
     cells."""
-    hidden = _CENTRAL_MARKER_HALF_SIDES * drawing.ratio
+    hidden = _SMALL_MARKER_REACH_HALF_SIDES * drawing.small_to_large_side
     edges = [
         edge
-        for edge in _iterate_edges(drawing.cells, 1.0, _POINTS_PER_LARGE_CELL)
+        for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
         if np.abs(edge[0]).max(axis=1).min() > hidden
     ]
     large = len(edges)
-    if drawing.centre is not None:
-        edges += _iterate_edges(drawing.centre, drawing.ratio, _POINTS_PER_SMALL_CELL)
+    if drawing.small_cell_whiteness is not None:
+        edges += _iterate_cell_edges(
+            drawing.small_cell_whiteness, drawing.small_to_large_side, _POINTS_PER_SMALL_CELL
+        )
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
-    places = np.array([len(each) for each in at])
-    cell = np.repeat(cells, places)
-    small = np.repeat(np.arange(len(edges)) >= large, places)
+    points_per_edge = np.array([len(each) for each in at])
+    cell = np.repeat(cells, points_per_edge)
+    small = np.repeat(np.arange(len(edges)) >= large, points_per_edge)
     return Outline(
         points=np.concatenate(at),
-        normal=np.repeat(normals, places, axis=0),
-        line_index=np.repeat([numbers[name] for name in names], places),
-        print_sigma=np.where(small, small_tolerance, large_tolerance) * cell,
-        cell_width=cell,
+        normal=np.repeat(normals, points_per_edge, axis=0),
+        line_index=np.repeat([numbers[name] for name in names], points_per_edge),
+        print_sigma_half_sides=np.where(
+            small, small_print_tolerance_cells, large_print_tolerance_cells
+        )
+        * cell,
+        cell_width_half_sides=cell,
         is_small_marker=small,
     )
 
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """Return a picture of the drawing up to `LARGE_PAPER_HALF_SIDES`, and the homography (3, 3) to
-    its pixels."""
-    axis = make_grid(_TEXTURE_SIZE, LARGE_PAPER_HALF_SIDES).axis
-    wide = render_cells(drawing, axis, LARGE_PAPER_HALF_SIDES / _TEXTURE_SIZE)
-    more = (len(wide) - _TEXTURE_SIZE) // 2
-    scale = _TEXTURE_SIZE / (2.0 * LARGE_PAPER_HALF_SIDES)
-    first = LARGE_PAPER_HALF_SIDES * scale - 0.5 + more
+    """Return a picture of the drawing up to `PAPER_REACH_LARGE_HALF_SIDES`, and the homography (3,
+    3) to its pixels."""
+    axis = make_grid(_TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES).node_positions
+    wide = render_cells(drawing, axis, PAPER_REACH_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
+    more = (len(wide) - _TEXTURE_SIZE_PX) // 2
+    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_HALF_SIDES)
+    first = PAPER_REACH_LARGE_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
     return np.clip(wide, 0.0, 1.0), T
 
 
-def _iterate_edges(
-    cells: Array, half: float, places: int
+def _iterate_cell_edges(
+    cells: Array, half_side: float, points_per_edge: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
     """Yield the sides between cells of different colour, in the form of `Outline`."""
-    width = 2.0 * half / len(cells)
-    s = _END_MARGIN_CELLS + (1.0 - 2.0 * _END_MARGIN_CELLS) * (np.arange(places) + 0.5) / places
+    width = 2.0 * half_side / len(cells)
+    s = (
+        _EDGE_END_MARGIN_CELLS
+        + (1.0 - 2.0 * _EDGE_END_MARGIN_CELLS)
+        * (np.arange(points_per_edge) + 0.5)
+        / points_per_edge
+    )
     for across in (0, 1):
         rows = cells if across == 0 else cells.T
         padded = np.pad(rows, 1, constant_values=1.0)[1:-1]
         step = padded[:, 1:] - padded[:, :-1]
         for i, j in np.argwhere(step != 0.0).tolist():
-            at = np.empty((places, 2))
-            at[:, across] = width * j - half
-            at[:, 1 - across] = width * (i + s) - half
+            at = np.empty((points_per_edge, 2))
+            at[:, across] = width * j - half_side
+            at[:, 1 - across] = width * (i + s) - half_side
             towards = float(np.sign(step[i, j]))
             normal = (towards, 0.0) if across == 0 else (0.0, towards)
-            yield at, normal, (half, across, j), width
+            yield at, normal, (half_side, across, j), width
 
 
 # --- Pose of the target from the edges in view ---
@@ -502,13 +554,15 @@ class RigidPose:
     """Rotation R (3, 3) and translation t (3,), in half sides of the large marker, of the drawing
     in the camera."""
 
-    R: Array
-    t: Array
+    R_cam_drawing: Array
+    t_cam_half_sides: Array
 
     @property
     def H(self) -> Array:
         """Homography (3, 3) from the drawing's coordinates to normalised image coordinates."""
-        return np.column_stack([self.R[:, 0], self.R[:, 1], self.t])
+        return np.column_stack(
+            [self.R_cam_drawing[:, 0], self.R_cam_drawing[:, 1], self.t_cam_half_sides]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -520,8 +574,8 @@ class PoseFit:
     pose: RigidPose
     cov: Array
     points_in_view: int
-    points_shown: int
-    small_points: int
+    points_found: int
+    small_marker_points: int
     residual_px: float
 
 
@@ -529,13 +583,13 @@ class PoseFit:
 class _EdgePoints:
     """Edge points of an outline in the picture: `points` (n, 2) px and unit normal (n, 2) from
     black to white. `J` (n, 7) is their motion along the normal with rotation, translation and the
-    shift of all edges (white over black), `px_per_unit` (n,) the scale across the edge, and
+    shift of all edges (white over black), `px_per_half_side` (n,) the scale across the edge, and
     `outline_index` (n,) their index in the outline."""
 
     points: Array
     normal: Array
     J: Array
-    px_per_unit: Array
+    px_per_half_side: Array
     outline_index: NDArray[np.intp]
 
 
@@ -549,66 +603,73 @@ def fit_pose(
     start: RigidPose,
     outline: Outline,
     camera: CameraModel,
-    mask: NDArray[np.uint8] | None = None,
+    hidden_mask: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
     """Fit the pose in which the drawing's edges match the picture's; None if the fit fails."""
-    pose, total, found, moved_px = start, np.zeros(7), None, math.inf
-    for reach_px in _PROFILE_HALF_LENGTHS_PX:
-        places = _edge_points_in_view(pose, outline, reach_px, image.shape, camera, mask)
-        if len(places.outline_index) < _MIN_EDGE_POINTS:
+    pose, change_from_start, found, moved_px = start, np.zeros(7), None, math.inf
+    for profile_reach_px in _PROFILE_HALF_LENGTHS_PX:
+        edge_points = _edge_points_in_view(
+            pose, outline, profile_reach_px, image.shape, camera, hidden_mask
+        )
+        if len(edge_points.outline_index) < _MIN_EDGE_POINTS:
             return None
         reach_cells_px = (
-            _PROFILE_REACH_CELLS * outline.cell_width[places.outline_index] * places.px_per_unit
+            _PROFILE_REACH_CELLS
+            * outline.cell_width_half_sides[edge_points.outline_index]
+            * edge_points.px_per_half_side
         )
-        half_px = np.minimum(reach_px, reach_cells_px)
-        offset_px, shows = _measure_offsets(image, places, half_px)
-        if np.count_nonzero(shows) < _MIN_EDGE_POINTS:
+        profile_half_lengths_px = np.minimum(profile_reach_px, reach_cells_px)
+        offset_px, is_edge_found = _measure_offsets(image, edge_points, profile_half_lengths_px)
+        if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
             return None
-        found = _solve_step(places, offset_px, shows, total)
+        found = _solve_step(edge_points, offset_px, is_edge_found, change_from_start)
         if found is None:
             return None
         step = found[0][:6]
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
-        pose = RigidPose(turn @ pose.R, pose.t + step[3:])
-        total[:6] += step
-        moved_px = float(np.abs(places.J[:, :6] @ step).max())
+        pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_half_sides + step[3:])
+        change_from_start[:6] += step
+        moved_px = float(np.abs(edge_points.J[:, :6] @ step).max())
         if moved_px < _CONVERGED_FIT_PX:
             break
     if found is None or not (
-        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t[2] > 0.0
+        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t_cam_half_sides[2] > 0.0
     ):  # also for NaN
         return None
-    return _make_pose_fit(pose, found, places, outline)
+    return _make_pose_fit(pose, found, edge_points, outline)
 
 
-def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
+def predict_fit_accuracy(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
     """Return the result of `fit_pose` for a perfect picture at that pose; None if too little is
     visible."""
-    places = _edge_points_in_view(
+    edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTHS_PX[0], camera.size_px[::-1], camera, None
     )
-    n = len(places.outline_index)
+    n = len(edge_points.outline_index)
     if n < _MIN_EDGE_POINTS:
         return None
-    found = _solve_step(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
-    return None if found is None else _make_pose_fit(pose, found, places, outline)
+    found = _solve_step(edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    return None if found is None else _make_pose_fit(pose, found, edge_points, outline)
 
 
 def _edge_points_in_view(
     pose: RigidPose,
     outline: Outline,
-    reach_px: float,
+    profile_reach_px: float,
     shape: tuple[int, ...],
     camera: CameraModel,
-    mask: NDArray[np.uint8] | None,
+    hidden_mask: NDArray[np.uint8] | None,
 ) -> _EdgePoints:
     h, w = shape[:2]
-    X = np.column_stack([outline.points, np.zeros(len(outline.points))]) @ pose.R.T + pose.t
+    X = (
+        np.column_stack([outline.points, np.zeros(len(outline.points))]) @ pose.R_cam_drawing.T
+        + pose.t_cam_half_sides
+    )
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
-    near = np.flatnonzero(ahead & (np.hypot(*x.T) < make_lattice(camera).reach))
-    at = distort(x[near], camera)
-    room = reach_px + 1.0
+    near = np.flatnonzero(ahead & (np.hypot(*x.T) < make_lattice(camera).valid_radius_normalised))
+    at = distort_to_px(x[near], camera)
+    room = profile_reach_px + 1.0
     inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
     near, at = near[inside], at[inside]
     X, x = X[near], x[near]
@@ -616,7 +677,7 @@ def _edge_points_in_view(
     small = 1e-4
     D = np.stack(
         [
-            (distort(x + step, camera) - at) / small
+            (distort_to_px(x + step, camera) - at) / small
             for step in (np.array([small, 0.0]), np.array([0.0, small]))
         ],
         axis=2,
@@ -629,69 +690,82 @@ def _edge_points_in_view(
     A = D @ P
     across = outline.normal[near]
     along = np.stack([-across[:, 1], across[:, 0]], axis=1)
-    tangent = np.einsum("nij,nj->ni", A, along @ pose.R[:, :2].T)
-    towards = np.einsum("nij,nj->ni", A, across @ pose.R[:, :2].T)
+    tangent = np.einsum("nij,nj->ni", A, along @ pose.R_cam_drawing[:, :2].T)
+    towards = np.einsum("nij,nj->ni", A, across @ pose.R_cam_drawing[:, :2].T)
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
     px = (normal * towards).sum(axis=1)
     normal *= np.sign(px)[:, None]
     move = np.einsum("ni,nij->nj", normal, A)
-    turn = np.cross(X - pose.t, move)  # (w x r) . m = w . (r x m)
+    turn = np.cross(X - pose.t_cam_half_sides, move)  # (w x r) . m = w . (r x m)
     free = np.ones(len(near), dtype=np.bool_)
-    if mask is not None:
+    if hidden_mask is not None:
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            x_px, y_px = np.rint(at + fraction * reach_px * normal).astype(np.intp).T
-            free &= mask[y_px, x_px] == 0
+            x_px, y_px = np.rint(at + fraction * profile_reach_px * normal).astype(np.intp).T
+            free &= hidden_mask[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
     return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
 def _measure_offsets(
-    image: NDArray[np.uint8], places: _EdgePoints, half_px: Array
+    image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the offset of each point's edge along its normal, (n,) px, and whether an edge was
     found."""
-    half_px = np.maximum(half_px, _MIN_PROFILE_REACH_PX)
-    grey = sample_profiles(image, places.points[:, None], places.normal[:, None], half_px)[:, 0]
+    profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
+    grey = sample_profiles(
+        image,
+        edge_points.points[:, None],
+        edge_points.normal[:, None],
+        profile_half_lengths_px,
+    )[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
-    u = half_px[:, None] * GRADIENT_POSITIONS.astype(np.float64)
-    mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
+    u = profile_half_lengths_px[:, None] * GRADIENT_POSITIONS.astype(np.float64)
+    mass = gradient * np.exp(-0.5 * (u / (0.5 * profile_half_lengths_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
     least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
-    shows = (contrast > least) & (total > 0.25 * least)
-    offset_px = (mass * u).sum(axis=1) / np.where(shows, total, 1.0)
-    return np.clip(offset_px, -half_px, half_px), shows
+    is_edge_found = (contrast > least) & (total > 0.25 * least)
+    offset_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
+    return np.clip(offset_px, -profile_half_lengths_px, profile_half_lengths_px), is_edge_found
 
 
 def _solve_step(
-    places: _EdgePoints, offset_px: Array, shows: NDArray[np.bool_], total: Array
+    edge_points: _EdgePoints,
+    offset_px: Array,
+    is_edge_found: NDArray[np.bool_],
+    change_from_start: Array,
 ) -> _FitStep | None:
-    """Return a robust step, given the sum `total` (7,) of the previous steps."""
-    J, weight = places.J, shows.astype(np.float64)
+    """Return a robust step, given the sum `change_from_start` (7,) of the previous steps."""
+    J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
         error = offset_px - J @ step
         size = np.abs(error)
-        scale = max(1.4826 * float(np.median(size[shows])), _MIN_TUKEY_SCALE_PX)
-        weight = np.maximum(1.0 - (size / (_TUKEY_CUTOFF_SIGMAS * scale)) ** 2, 0.0) ** 2 * shows
+        scale = max(1.4826 * float(np.median(size[is_edge_found])), _MIN_TUKEY_SCALE_PX)
+        weight = (
+            np.maximum(1.0 - (size / (_TUKEY_CUTOFF_SIGMAS * scale)) ** 2, 0.0) ** 2 * is_edge_found
+        )
         mass = float(weight.sum())
         if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
         variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
         N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
-        step = inverse @ (J.T @ (weight * offset_px) / variance - _PREDICTION_INFORMATION * total)
+        step = inverse @ (
+            J.T @ (weight * offset_px) / variance - _PREDICTION_INFORMATION * change_from_start
+        )
     return step, inverse, weight, variance
 
 
 def _make_pose_fit(
-    pose: RigidPose, found: _FitStep, places: _EdgePoints, outline: Outline
+    pose: RigidPose, found: _FitStep, edge_points: _EdgePoints, outline: Outline
 ) -> PoseFit:
-    J, (_, inverse, w, variance) = places.J, found
-    line = outline.line_index[places.outline_index]
+    J, (_, inverse, w, variance) = edge_points.J, found
+    line = outline.line_index[edge_points.outline_index]
     common_px = np.hypot(
-        outline.print_sigma[places.outline_index] * places.px_per_unit, _LINE_SIGMA_PX
+        outline.print_sigma_half_sides[edge_points.outline_index] * edge_points.px_per_half_side,
+        _LINE_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
@@ -702,7 +776,9 @@ def _make_pose_fit(
         pose=pose,
         cov=cov[:6, :6],
         points_in_view=len(shown),
-        points_shown=int(np.count_nonzero(shown)),
-        small_points=int(np.count_nonzero(shown & outline.is_small_marker[places.outline_index])),
+        points_found=int(np.count_nonzero(shown)),
+        small_marker_points=int(
+            np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_index])
+        ),
         residual_px=math.sqrt(variance),
     )

@@ -22,10 +22,10 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
 from perchctl.values import replace
-from perchctl.vision.fields import interpolate_fields, interpolated_sigma_px
+from perchctl.vision.fields import interpolate_fields, interpolated_edge_sigma_px
 from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
 from perchctl.vision.markers.corners import (
-    DERIVED_CORNER_SIGMA_PX,
+    CORNER_SIGMA_FROM_OTHER_MARKER_PX,
     RefinedCorners,
     add_missing_marker,
     is_inside_picture,
@@ -35,7 +35,7 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.cut import (
     MAX_CUT_FIT_AGE_S,
-    can_be_whole,
+    can_whole_marker_be_in_view,
     fit_cut_markers,
     is_target_cut,
 )
@@ -46,7 +46,7 @@ from perchctl.vision.markers.detector import (
     is_hidden,
     make_hidden_mask,
 )
-from perchctl.vision.markers.edge_fit import refine_lines
+from perchctl.vision.markers.edge_fit import refine_corners_by_lines
 from perchctl.vision.markers.partial import (
     PICTURE_MARGIN_PX,
     IdentifiedBy,
@@ -75,7 +75,7 @@ from perchctl.vision.types import (
 
 _MIN_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
 # pictures for which a measured shift of all edges is valid, since light changes slowly
-_MAX_EDGE_SHIFT_AGE = 5
+_MAX_EDGE_SHIFT_AGE_FRAMES = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
 
 
@@ -87,34 +87,37 @@ class Prior:
     """Knowledge about the target before a frame is examined.
 
     Attributes:
-        expected: the markers' predicted corners, each (4, 2) px; empty if no target is expected.
-        expected_both: `expected`, with a missing marker derived from the other one.
+        expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
+            expected.
+        expected_both_corners_px: `expected_corners_px`, with a missing marker derived from the
+            other one.
         search_mode: the kinds of search for this frame.
-        blur_guess_index: its parity selects the first guess of the blur; None tries all.
-        was_recent: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; False without
-            edge fits.
-        was_cut: `was_recent`, and no marker can have been completely in that picture.
+        start_blur_index: its parity selects the first guess of the blur; None tries all.
+        was_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; False
+            without edge fits.
+        was_target_cut: `was_seen_recently`, and no marker can have been completely in that picture.
         edge_shift: the shift of all edges measured in the last frames; None measures it.
-        own: selects one of several targets if none is expected; None uses the picture alone.
+        own_target_offset_m: selects one of several targets if none is expected; None uses the
+            picture alone.
     """
 
-    expected: Mapping[MarkerName, Array]
-    expected_both: Mapping[MarkerName, Array]
+    expected_corners_px: Mapping[MarkerName, Array]
+    expected_both_corners_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    blur_guess_index: int | None
-    was_recent: bool
-    was_cut: bool
+    start_blur_index: int | None
+    was_seen_recently: bool
+    was_target_cut: bool
     edge_shift: EdgeShift | None
-    own: OwnTargetOffset | None
+    own_target_offset_m: OwnTargetOffset | None
 
 
 @dataclass(frozen=True, eq=False)
 class CornerFindings:
     """Results of the methods tried so far: the markers' `corners`, and the result of the last
-    `search`."""
+    `search_result`."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
-    search: FoundMarkers = field(default_factory=FoundMarkers)
+    search_result: FoundMarkers = field(default_factory=FoundMarkers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +127,7 @@ class CornerMethod:
     Attributes:
         name: its heading in ``docs/corners.md``.
         needs: its requirements.
-        cost: typical time for a picture of 640x480 on one core.
+        cost_text: typical time for a picture of 640x480 on one core.
         used_when: `is_used` in words.
         is_used: function that returns True if the method applies to the picture, the prior and the
             findings so far.
@@ -133,19 +136,24 @@ class CornerMethod:
 
     name: str
     needs: str
-    cost: str
+    cost_text: str
     used_when: str
     is_used: Callable[[Picture, Prior, CornerFindings], bool]
     find: Callable[[Picture, Prior, CornerFindings], CornerFindings]
 
 
 def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    return prior.search_mode != "fits" and bool(prior.expected_both) and picture.setup.fits_lines
+    return (
+        prior.search_mode != "fits"
+        and bool(prior.expected_both_corners_px)
+        and picture.setup.is_line_fit_enabled
+    )
 
 
 def _fit_edges(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     return replace(
-        found, corners=refine_expected_markers(picture, prior.expected_both, prior.edge_shift)
+        found,
+        corners=refine_expected_markers(picture, prior.expected_both_corners_px, prior.edge_shift),
     )
 
 
@@ -155,7 +163,7 @@ def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) ->
 
 def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     # If no side was found, a close target has usually moved further than a profile reaches.
-    searched = search_half_size(picture, prior.expected_both)
+    searched = search_half_size(picture, prior.expected_both_corners_px)
     if searched is None:
         return found
     corners = _refine_found(picture, searched)
@@ -163,11 +171,13 @@ def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> 
 
 
 def _is_half_size_search_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    return _is_target_expected(picture, prior, found) and not found.search.corners_px
+    return _is_target_expected(picture, prior, found) and not found.search_result.corners_px
 
 
 def _fit_visible_part(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    corners = add_partly_visible(picture, prior.expected_both, found.corners, prior.edge_shift)
+    corners = add_partly_visible(
+        picture, prior.expected_both_corners_px, found.corners, prior.edge_shift
+    )
     return replace(found, corners=corners)
 
 
@@ -179,55 +189,60 @@ def _needs_photometric_fit(picture: Picture, prior: Prior, found: CornerFindings
 
 
 def _fit_drawing(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    return replace(found, corners=improve_corners(picture, found.corners))
+    return replace(found, corners=refine_photometrically(picture, found.corners))
 
 
 def _can_be_cut(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    if found.corners or not prior.was_recent:
+    if found.corners or not prior.was_seen_recently:
         return False
-    return is_target_cut(prior.expected_both, picture.image.shape, picture.hidden)
+    return is_target_cut(prior.expected_both_corners_px, picture.image.shape, picture.hidden)
 
 
 def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    return replace(found, corners=fit_cut_markers(picture, prior.expected))
+    return replace(found, corners=fit_cut_markers(picture, prior.expected_corners_px))
 
 
 def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     if prior.search_mode in ("blurred", "fits"):
         return False
     if not found.corners and (
-        not prior.was_cut or can_be_whole(prior.expected_both, picture.image.shape)
+        not prior.was_target_cut
+        or can_whole_marker_be_in_view(prior.expected_both_corners_px, picture.image.shape)
     ):
         return True
-    return _is_marker_missing(picture, found.corners, prior.expected)
+    return _is_marker_missing(picture, found.corners, prior.expected_corners_px)
 
 
 def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    searched = search(picture, prior.expected, prior.search_mode, prior.own)
+    searched = search(
+        picture, prior.expected_corners_px, prior.search_mode, prior.own_target_offset_m
+    )
     if len(searched.corners_px) < len(found.corners):
-        return replace(found, search=searched)
+        return replace(found, search_result=searched)
     return CornerFindings(_refine_found(picture, searched), searched)
 
 
 def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     allowed = prior.search_mode not in ("sharp", "window")
-    return not found.corners and allowed and picture.setup.fits_lines
+    return not found.corners and allowed and picture.setup.is_line_fit_enabled
 
 
 def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     bare = replace(picture, hidden=None)
-    if prior.expected:
-        seen = find_expected_blurred(bare, prior.expected, prior.blur_guess_index)
+    if prior.expected_corners_px:
+        found_corners = find_expected_blurred(
+            bare, prior.expected_corners_px, prior.start_blur_index
+        )
     else:
-        seen = find_blurred(bare)
-    return replace(found, corners=improve_corners(bare, seen))
+        found_corners = find_blurred(bare)
+    return replace(found, corners=refine_photometrically(bare, found_corners))
 
 
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
         needs="an expected marker, whole, with cells of 2.5 px and straight sides",
-        cost="0.7 ms",
+        cost_text="0.7 ms",
         used_when="the target is expected; after a loss, in three of four pictures",
         is_used=_is_target_expected,
         find=_fit_edges,
@@ -235,7 +250,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Half-size search",
         needs="both markers expected, those in view with sides above 60 px",
-        cost="5 ms, with the measurement of what it finds",
+        cost_text="5 ms, with the measurement of what it finds",
         used_when="the edge fit was tried and found no marker",
         is_used=_is_edge_fit_empty,
         find=_search_half_size,
@@ -243,7 +258,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Partial-view fit",
         needs="an expected marker with cells of 4 px, 60 % of its cells and four of its edges",
-        cost="3 ms for each marker",
+        cost_text="3 ms for each marker",
         used_when="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
         is_used=_is_half_size_search_empty,
@@ -252,7 +267,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Photometric fit",
         needs="a whole marker with sides of 7 px, and corners to within 0.3 sides",
-        cost="1.3 ms for each marker",
+        cost_text="1.3 ms for each marker",
         used_when="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
         "than 6 px or than six times the blur; not if the half-size search found one",
         is_used=_needs_photometric_fit,
@@ -261,7 +276,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Cut-view fit",
         needs="a measurement at most 0.5 s old, and small-marker cells of 8 px",
-        cost="7 ms",
+        cost_text="7 ms",
         used_when="nothing was found, and each expected marker may be cut by the picture or hidden",
         is_used=_can_be_cut,
         find=_fit_cut_target,
@@ -269,7 +284,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Search",
         needs="a marker whose bits can be read",
-        cost="4 to 9 ms, with the measurement of what it finds",
+        cost_text="4 to 9 ms, with the measurement of what it finds",
         used_when="nothing was found, unless the target was cut and still is; or an expected "
         "marker with sides above 13 px is missing; after a loss, in three of four pictures",
         is_used=_should_search,
@@ -278,7 +293,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Blurred search",
         needs="a whole marker with sides of 7 px that resembles its drawing",
-        cost="5 to 10 ms",
+        cost_text="5 to 10 ms",
         used_when="nothing was found; after a loss, in one of four pictures",
         is_used=_can_be_blurred,
         find=_search_blurred,
@@ -305,19 +320,22 @@ def detect_markers(
     previous: Detections | None,
     setup: DetectorSetup,
     camera: CameraModel,
-    expected: Mapping[MarkerName, Array] | None = None,
+    expected_corners_px: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: OwnTargetOffset | None = None,
+    own_target_offset_m: OwnTargetOffset | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
-    The search starts at the corners (4, 2) px `expected` from the vehicle's motion, or otherwise
-    near the `previous` detections. `empty_frames`, the number of successive frames without markers,
-    alternates the kinds of search; None applies all kinds. If no target is expected, `own` selects
-    one of several. For a frame of two fields, the result is the mean of the fields.
+    The search starts at the corners (4, 2) px `expected_corners_px` from the vehicle's motion, or
+    otherwise near the `previous` detections. `empty_frames`, the number of successive frames
+    without markers, alternates the kinds of search; None applies all kinds. If no target is
+    expected, `own_target_offset_m` selects one of several. For a frame of two fields, the result is
+    the mean of the fields.
     """
-    prior = make_prior(frame, previous, setup, camera, expected, empty_frames, own)
-    if frame.fields == "woven":
+    prior = make_prior(
+        frame, previous, setup, camera, expected_corners_px, empty_frames, own_target_offset_m
+    )
+    if frame.picture_kind == "woven":
         first, second = (_detect(each, setup, camera, prior) for each in interpolate_fields(frame))
         return add_marker_flow(average_fields(first, second), previous)
     return add_marker_flow(_detect(frame, setup, camera, prior), previous)
@@ -328,60 +346,70 @@ def make_prior(
     previous: Detections | None,
     setup: DetectorSetup,
     camera: CameraModel,
-    expected: Mapping[MarkerName, Array] | None = None,
+    expected_corners_px: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: OwnTargetOffset | None = None,
+    own_target_offset_m: OwnTargetOffset | None = None,
 ) -> Prior:
     """Return the knowledge before the frame; arguments as in `detect_markers`."""
-    expected = dict(expected) if expected else extrapolate_corners(previous, frame.t_s)
-    search_mode = _choose_search_mode(empty_frames, bool(expected), setup.fits_lines)
-    blur_guess_index = None
+    expected_corners_px = (
+        dict(expected_corners_px)
+        if expected_corners_px
+        else extrapolate_corners(previous, frame.t_s)
+    )
+    search_mode = _choose_search_mode(
+        empty_frames, bool(expected_corners_px), setup.is_line_fit_enabled
+    )
+    start_blur_index = None
     if empty_frames is not None and search_mode in ("near", "fits"):
-        blur_guess_index = (empty_frames + 2) // 4
+        start_blur_index = (empty_frames + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_CUT_FIT_AGE_S
-    was_recent = was_recent and setup.fits_lines and bool(last)
+    was_recent = was_recent and setup.is_line_fit_enabled and bool(last)
     shift = None if previous is None else previous.edge_shift
     if shift is not None:
         age = shift.age_frames + 1
-        shift = replace(shift, age_frames=age) if age < _MAX_EDGE_SHIFT_AGE else None
+        shift = replace(shift, age_frames=age) if age < _MAX_EDGE_SHIFT_AGE_FRAMES else None
     return Prior(
-        expected=expected,
-        expected_both=add_missing_marker(expected, setup.ratio, camera),
+        expected_corners_px=expected_corners_px,
+        expected_both_corners_px=add_missing_marker(
+            expected_corners_px, setup.small_to_large_side, camera
+        ),
         search_mode=search_mode,
-        blur_guess_index=blur_guess_index,
-        was_recent=was_recent,
-        was_cut=was_recent and not can_be_whole(last, frame.image.shape),
+        start_blur_index=start_blur_index,
+        was_seen_recently=was_recent,
+        was_target_cut=was_recent and not can_whole_marker_be_in_view(last, frame.image.shape),
         edge_shift=shift,
-        own=own,
+        own_target_offset_m=own_target_offset_m,
     )
 
 
 def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prior) -> Detections:
-    hidden = make_hidden_mask(frame, setup.mask)
+    hidden = make_hidden_mask(frame, setup.hidden_mask)
     image = frame.image if hidden is None else fill_hidden_pixels(frame.image, hidden)
     found = find_corners(Picture(image, hidden, setup, camera), prior)
-    seen = found.corners
-    shifts = (r.edge_shift for r in seen.values())
+    found_corners = found.corners
+    shifts = (r.edge_shift for r in found_corners.values())
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
-        large=_make_detection("large", seen, frame.fields),
-        small=_make_detection("small", seen, frame.fields),
-        mirrored=found.search.mirrored and not seen,
-        target_count=found.search.target_count,
+        large=_make_detection("large", found_corners, frame.picture_kind),
+        small=_make_detection("small", found_corners, frame.picture_kind),
+        mirrored=found.search_result.mirrored and not found_corners,
+        target_count=found.search_result.target_count,
         edge_shift=next((each for each in shifts if each is not None), None),
     )
 
 
-def _choose_search_mode(empty_frames: int | None, expected: bool, fits_lines: bool) -> SearchMode:
+def _choose_search_mode(
+    empty_frames: int | None, is_target_expected: bool, is_line_fit_enabled: bool
+) -> SearchMode:
     """Return the kind of search for this frame. After a loss, the kinds alternate."""
     if empty_frames is None:
         return "all"
-    if not fits_lines or (expected and empty_frames % 2):
+    if not is_line_fit_enabled or (is_target_expected and empty_frames % 2):
         return "sharp"
-    if expected:
+    if is_target_expected:
         if empty_frames == 0:
             return "near"
         return "fits" if empty_frames % 4 else "window"
@@ -391,14 +419,14 @@ def _choose_search_mode(empty_frames: int | None, expected: bool, fits_lines: bo
 
 
 def _is_marker_missing(
-    picture: Picture, seen: _FoundCorners, expected: Mapping[MarkerName, Array]
+    picture: Picture, found_corners: _FoundCorners, expected_corners_px: Mapping[MarkerName, Array]
 ) -> bool:
     return any(
-        name not in seen
+        name not in found_corners
         and is_inside_picture(corners, picture.image.shape)
         and side_lengths_px(corners).min() > _MIN_SEARCHED_SIDE_PX
         and not is_hidden(picture.hidden, corners)
-        for name, corners in expected.items()
+        for name, corners in expected_corners_px.items()
     )
 
 
@@ -408,21 +436,22 @@ def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
     takes the picture's edge for a side. The photometric fit follows where edges do not suffice."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
-    lines = fit_lines(picture, raw) if setup.fits_lines else {}
-    seen = {
-        name: lines.get(name) or refine_subpix(image, corners, setup.patterns[name].rim.cells)
+    lines = fit_lines(picture, raw) if setup.is_line_fit_enabled else {}
+    found_corners = {
+        name: lines.get(name)
+        or refine_subpix(image, corners, setup.patterns[name].border_cells.cells_per_side)
         for name, corners in raw.items()
     }
-    if not setup.fits_lines:
-        return seen
-    fitted, small = dict(seen), seen.get("small")
-    for name, r in seen.items():
+    if not setup.is_line_fit_enabled:
+        return found_corners
+    fitted, small = dict(found_corners), found_corners.get("small")
+    for name, r in found_corners.items():
         if r.refined and is_fully_visible(picture, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
-            starts.insert(0, picture.other_corners(small.corners_px, "large"))
-        identified_by: IdentifiedBy = "other" if len(seen) == 2 else "bits"
+            starts.insert(0, picture.derive_from_other_marker(small.corners_px, "large"))
+        identified_by: IdentifiedBy = "other" if len(found_corners) == 2 else "bits"
         tried = (fit_partly_visible(picture, name, start, identified_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
@@ -431,25 +460,27 @@ def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
             picture.hidden, r.corners_px, 1.0
         ):
             del fitted[name]
-    return improve_corners(picture, fitted, searched=True)
+    return refine_photometrically(picture, fitted, is_from_search=True)
 
 
 def _make_detection(
-    name: MarkerName, seen: _FoundCorners, fields: PictureKind | None
+    name: MarkerName, found_corners: _FoundCorners, picture_kind: PictureKind | None
 ) -> Detection | None:
-    r = seen.get(name)
+    r = found_corners.get(name)
     if r is None:
         return None
-    interpolated = fields in ("top", "bottom")
+    interpolated = picture_kind in ("top", "bottom")
     return Detection(
         name,
         r.corners_px,
         r.sigma_px,
         r.refined,
-        r.shift_sigma_px,
+        r.edge_shift_sigma_px,
         cov_px2=r.cov_px2,
-        row_sigma_px=r.row_sigma_px,
-        horizontal_side_sigma_px=interpolated_sigma_px(r.min_blur_px) if interpolated else 0.0,
+        row_jitter_sigma_px=r.row_jitter_sigma_px,
+        horizontal_side_extra_sigma_px=interpolated_edge_sigma_px(r.sharpest_side_blur_px)
+        if interpolated
+        else 0.0,
     )
 
 
@@ -469,7 +500,7 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
     moves = 0.0 < gap_s <= _MAX_FLOW_AGE_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
-        flow = previous.flow_px_s.get(d.marker)
+        flow = previous.flow_pxps.get(d.marker)
         corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
@@ -486,39 +517,43 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     if not flow:
         return now
     mean = _MEAN_OF_FOUR @ next(iter(flow.values()))
-    return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
+    return replace(now, flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
 
 
 # --- Photometric fits for markers that the edge fit measured poorly or missed ---
 
 
-_MIN_ACCURATE_CELL_PX = 6.0  # from this size on, lines are as accurate as the drawing, and faster
+_MIN_ACCURATE_LINE_FIT_CELL_PX = (
+    6.0  # from this size on, lines are as accurate as the drawing, and faster
+)
 # the same limit as a ratio of a cell's width to the blur's standard deviation
-_MIN_ACCURATE_CELL_BLURS = 6.0
-_ALIGN_RANGE = 0.3  # share of the side
+_MIN_ACCURATE_LINE_FIT_CELL_BLURS = 6.0
+_MAX_ALIGN_MOTION_SIDES = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
-_MAX_UNTRACKED_SIGMA, _MAX_TRACKED_SIGMA = 0.06, 0.12  # share of the side
+_MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12  # share of the side
 _DEFAULT_BLUR_PX = 1.5  # initial guess if the blur is unknown
-_SIDE_BLUR_SIGMA_PX = 0.37
+_SAMPLING_BLUR_SIGMA_PX = 0.37
 """Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
 drawing, px."""
 _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
-def is_line_fit_sufficient(seen: RefinedCorners, pattern: Pattern) -> bool:
+def is_line_fit_sufficient(corners: RefinedCorners, pattern: Pattern) -> bool:
     """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
     least 6 px and 6 times the blur."""
-    cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
-    return seen.refined and cell_px >= max(
-        _MIN_ACCURATE_CELL_PX, _MIN_ACCURATE_CELL_BLURS * seen.blur_px
+    cell_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
+    return corners.refined and cell_px >= max(
+        _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_BLURS * corners.blur_px
     )
 
 
-def improve_corners(picture: Picture, seen: _FoundCorners, searched: bool = False) -> _FoundCorners:
-    """Return the `seen` markers, with a photometric fit of those whose edges do not suffice, and
-    any other visible marker derived from the first. If `searched`, a single marker is dropped
-    unless its edges suffice or the drawing confirms it."""
-    image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
+def refine_photometrically(
+    picture: Picture, found_corners: _FoundCorners, is_from_search: bool = False
+) -> _FoundCorners:
+    """Return the `found_corners` markers, with a photometric fit of those whose edges do not
+    suffice, and any other visible marker derived from the first. If `is_from_search`, a single
+    marker is dropped unless its edges suffice or the drawing confirms it."""
+    image, patterns, better = picture.image, picture.setup.patterns, dict(found_corners)
     if "small" in better and "large" not in better:
         large = find_large_around(picture, better["small"])
         if large is not None:
@@ -531,29 +566,43 @@ def improve_corners(picture: Picture, seen: _FoundCorners, searched: bool = Fals
             or is_hidden(picture.hidden, start)
         ):
             continue
-        alone = _OTHER_MARKER[name] not in better
-        max_sigma = _MAX_UNTRACKED_SIGMA if alone else _MAX_TRACKED_SIGMA
+        is_single = _OTHER_MARKER[name] not in better
+        max_corner_sigma_sides = (
+            _MAX_SINGLE_MARKER_SIGMA_SIDES if is_single else _MAX_SECOND_MARKER_SIGMA_SIDES
+        )
         blur_px = _blur_px(better.get(name))
-        exact = align_marker(picture, name, start, _ALIGN_RANGE, blur_px, max_sigma, alone)
+        exact = align_marker(
+            picture,
+            name,
+            start,
+            _MAX_ALIGN_MOTION_SIDES,
+            blur_px,
+            max_corner_sigma_sides,
+            is_single,
+        )
         if exact is not None:
             better[name] = exact
-        elif alone and searched:
+        elif is_single and is_from_search:
             better.pop(name, None)
         elif name not in better and is_correlated_with_pattern(image, start, patterns[name]):
-            better[name] = RefinedCorners(start, DERIVED_CORNER_SIGMA_PX, False)
+            better[name] = RefinedCorners(start, CORNER_SIGMA_FROM_OTHER_MARKER_PX, False)
     return better
 
 
-def _blur_px(seen: RefinedCorners | None) -> float:
+def _blur_px(corners: RefinedCorners | None) -> float:
     """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
     fitted."""
-    if seen is None or not seen.refined or seen.blur_px <= 0.0:
+    if corners is None or not corners.refined or corners.blur_px <= 0.0:
         return _DEFAULT_BLUR_PX
-    return min(math.sqrt(max(seen.blur_px**2 - _SIDE_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX)
+    return min(
+        math.sqrt(max(corners.blur_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX
+    )
 
 
-def _initial_corners(picture: Picture, name: MarkerName, seen: _FoundCorners) -> Array | None:
-    this, other = seen.get(name), seen.get(_OTHER_MARKER[name])
+def _initial_corners(
+    picture: Picture, name: MarkerName, found_corners: _FoundCorners
+) -> Array | None:
+    this, other = found_corners.get(name), found_corners.get(_OTHER_MARKER[name])
     if this is not None:
         if this.cov_px2 is not None:
             return None  # an obstacle in front of the marker would spoil the drawing, too
@@ -562,7 +611,7 @@ def _initial_corners(picture: Picture, name: MarkerName, seen: _FoundCorners) ->
         enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
-        return picture.other_corners(other.corners_px, "small")
+        return picture.derive_from_other_marker(other.corners_px, "small")
     return None
 
 
@@ -570,36 +619,39 @@ def _initial_corners(picture: Picture, name: MarkerName, seen: _FoundCorners) ->
 
 
 _MIN_LINE_CELL_PX = 2.5  # least cell size for line fits
-_MAX_CENTRE_OFFSET = 0.12  # share of the small marker's side
+_MAX_CENTRE_OFFSET_SIDES = 0.12  # share of the small marker's side
 
 
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _FoundCorners:
     """Return the markers near corners `places` (4, 2) px whose four sides are straight edges, by
-    `refine_lines`: all at once because they share the shift of all edges. The cells are not
-    examined. `shift` None measures the shift of all edges."""
+    `refine_corners_by_lines`: all at once because they share the shift of all edges. The cells are
+    not examined. `shift` None measures the shift of all edges."""
     if not places:
         return {}
-    rims = [picture.setup.patterns[name].rim for name in places]
+    rims = [picture.setup.patterns[name].border_cells for name in places]
     raw = np.array(list(places.values()))
-    fitted = refine_lines(picture.image, raw, rims, picture.camera, shift)
+    fitted = refine_corners_by_lines(picture.image, raw, rims, picture.camera, shift)
     return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
 
 
 def refine_expected_markers(
-    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+    picture: Picture,
+    expected_corners_px: Mapping[MarkerName, Array],
+    shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
     measured by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
     or hidden markers, and markers with cells below 2.5 px are omitted."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
-        name: expected[name]
+        name: expected_corners_px[name]
         for name in MARKERS
-        if name in expected
-        and is_inside_picture(expected[name], image.shape, PICTURE_MARGIN_PX)
-        and side_lengths_px(expected[name]).min() > _MIN_LINE_CELL_PX * patterns[name].rim.cells
+        if name in expected_corners_px
+        and is_inside_picture(expected_corners_px[name], image.shape, PICTURE_MARGIN_PX)
+        and side_lengths_px(expected_corners_px[name]).min()
+        > _MIN_LINE_CELL_PX * patterns[name].border_cells.cells_per_side
     }
     return {
         name: found
@@ -611,46 +663,50 @@ def refine_expected_markers(
 
 def add_partly_visible(
     picture: Picture,
-    expected: Mapping[MarkerName, Array],
-    seen: _FoundCorners,
+    expected_corners_px: Mapping[MarkerName, Array],
+    found_corners: _FoundCorners,
     shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the `seen` markers of `refine_expected_markers` plus those fitted to their visible
-    part.
+    """Return the `found_corners` markers of `refine_expected_markers` plus those fitted to their
+    visible part.
 
     If the small marker was seen, the large one is expected around it.
     """
-    places, seen = dict(expected), dict(seen)
-    if "small" in seen and "large" not in seen:
-        places["large"] = picture.other_corners(seen["small"].corners_px, "large")
+    places, found_corners = dict(expected_corners_px), dict(found_corners)
+    if "small" in found_corners and "large" not in found_corners:
+        places["large"] = picture.derive_from_other_marker(
+            found_corners["small"].corners_px, "large"
+        )
     for name in MARKERS:
-        if name in places and name not in seen:
+        if name in places and name not in found_corners:
             partly = fit_partly_visible(picture, name, places[name], "track", shift)
             if partly is not None:
-                seen[name] = partly
-    if "large" in seen and "small" not in seen:
+                found_corners[name] = partly
+    if "large" in found_corners and "small" not in found_corners:
         # Too small for lines, but its position follows from the large marker: a similar pattern is
         # enough.
-        small_px = picture.other_corners(seen["large"].corners_px, "small")
+        small_px = picture.derive_from_other_marker(found_corners["large"].corners_px, "small")
         if mean_side_px(small_px) > MIN_MARKER_SIDE_PX and is_correlated_with_pattern(
             picture.image, small_px, picture.setup.patterns["small"]
         ):
-            seen["small"] = RefinedCorners(small_px, DERIVED_CORNER_SIGMA_PX, False)
-    return seen
+            found_corners["small"] = RefinedCorners(
+                small_px, CORNER_SIGMA_FROM_OTHER_MARKER_PX, False
+            )
+    return found_corners
 
 
 def find_large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
     """Return the large marker around a detected small one; the large one may be partly covered or
     cut. None if the picture does not confirm it."""
     image, pattern = picture.image, picture.setup.patterns["large"]
-    start = picture.other_corners(small.corners_px, "large")
+    start = picture.derive_from_other_marker(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        centre = picture.other_corners(large.corners_px, "small")
+        centre = picture.derive_from_other_marker(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
-        return off_px <= max(_MAX_CENTRE_OFFSET * mean_side_px(small.corners_px), 1.0)
+        return off_px <= max(_MAX_CENTRE_OFFSET_SIDES * mean_side_px(small.corners_px), 1.0)
 
     if is_inside_picture(start, image.shape, PICTURE_MARGIN_PX):
         # A small marker yields a rough position only, so the fit is repeated from the first result.
@@ -705,8 +761,10 @@ def _average_detections(a: Detection, b: Detection) -> Detection:
         (a.corners_px + b.corners_px) / 2.0,
         half(a.sigma_px, b.sigma_px),
         a.refined and b.refined,
-        max(a.shift_sigma_px, b.shift_sigma_px),
+        max(a.edge_shift_sigma_px, b.edge_shift_sigma_px),
         cov_px2=cov_px2,
-        row_sigma_px=half(a.row_sigma_px, b.row_sigma_px),
-        horizontal_side_sigma_px=half(a.horizontal_side_sigma_px, b.horizontal_side_sigma_px),
+        row_jitter_sigma_px=half(a.row_jitter_sigma_px, b.row_jitter_sigma_px),
+        horizontal_side_extra_sigma_px=half(
+            a.horizontal_side_extra_sigma_px, b.horizontal_side_extra_sigma_px
+        ),
     )

@@ -20,39 +20,40 @@ from perchctl.vision.markers.corners import scale_square
 from perchctl.vision.markers.pattern import Pattern, make_border_cells, make_drawing, make_pattern
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
-MIRROR_INDEX = 1
+MIRRORED_MARKER_ID = 1
 """Index of the mirror image in a marker's dictionary."""
 # error of an edge: the errors of its hundreds of printed dots average out
 _PRINT_EDGE_SIGMA_M = 1e-6
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, at 640 px
 _LOOSE_PERIMETER_RATE = 0.05
-_LOOSE_ACCURACY_RATE = 0.1
+_LOOSE_POLYGON_ACCURACY_RATE = 0.1
 
 
-Thresholds = tuple[int, int]
+ThresholdWindowRange = tuple[int, int]
 """Smallest and largest window of the adaptive threshold, px; OpenCV tries windows in steps of
 10."""
-OPENCV_THRESHOLDS: Thresholds = (3, 23)
+OPENCV_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (3, 23)
 """OpenCV's default windows."""
 # sufficient if both markers were seen in the previous frame
-QUICK_THRESHOLDS: Thresholds = (13, 13)
-_LOOSE_THRESHOLDS: Thresholds = (15, 35)
+QUICK_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (13, 13)
+_LOOSE_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
 
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
     """Constants of `detect_markers`, made by `make_detector_setup`.
 
-    `dictionaries` are those of the large and the small marker; `ratio` is the small side over the
-    large side; `mask` marks the pixels covered by the vehicle. Without `fits_lines`, markers are
-    neither fitted nor tracked by fits.
+    `large_and_small_dictionaries` are those of the large and the small marker;
+    `small_to_large_side` is the small side over the large side; `hidden_mask` marks the pixels
+    covered by the vehicle. Without `is_line_fit_enabled`, markers are neither fitted nor tracked by
+    fits.
     """
 
-    dictionaries: tuple[Any, Any]
+    large_and_small_dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
-    ratio: float
-    fits_lines: bool
-    mask: HiddenMask | None = None
+    small_to_large_side: float
+    is_line_fit_enabled: bool
+    hidden_mask: HiddenMask | None = None
 
 
 def make_detector_setup(
@@ -62,7 +63,7 @@ def make_detector_setup(
     large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
-        dictionaries=(
+        large_and_small_dictionaries=(
             _make_dictionary(large_bits, config.correction_bits_large),
             _make_dictionary(small_bits, config.correction_bits_small),
         ),
@@ -80,35 +81,35 @@ def make_detector_setup(
                 make_drawing(small_bits),
             ),
         },
-        ratio=ratio,
-        fits_lines=config.refinement == "line",
-        mask=mask,
+        small_to_large_side=ratio,
+        is_line_fit_enabled=config.refinement == "line",
+        hidden_mask=mask,
     )
 
 
 def make_aruco_detector(
-    setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
+    setup: DetectorSetup, size_px: tuple[int, int], threshold_windows_px: ThresholdWindowRange
 ) -> Any:
     """Return OpenCV's marker detector for pictures of the size (width, height)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # makes maxCorrectionBits the limit itself
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = thresholds
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = threshold_windows_px
     parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
-    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
+    return cv2.aruco.ArucoDetector(list(setup.large_and_small_dictionaries), parameters)
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
     """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
-    parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
-    least_px, most_px = _LOOSE_THRESHOLDS
+    parameters.polygonalApproxAccuracyRate = _LOOSE_POLYGON_ACCURACY_RATE
+    least_px, most_px = _LOOSE_THRESHOLD_WINDOWS_PX
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
     parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
-    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
+    return cv2.aruco.ArucoDetector(list(setup.large_and_small_dictionaries), parameters)
 
 
 def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
@@ -135,19 +136,19 @@ def _make_dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
 
 
 HiddenMask = NDArray[np.bool_]
-WHITE_BORDER_HALF_SIDES = 1.25
+WHITE_BORDER_REACH_HALF_SIDES = 1.25
 """Half sides from a marker's centre within which any object disturbs the measurement of its
 sides."""
 _MASK_SPREAD_ROWS = 7  # rows of a field's picture to which a covered row contributes
 # reduction factor, and standard deviation of the fill in the reduced picture
 _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
-_MIN_FILL_WEIGHT = 1e-4
+_MEAN_GREY_FILL_WEIGHT = 1e-4
 
 
 def make_hidden_mask(frame: Frame, mask: HiddenMask | None) -> HiddenMask | None:
     """Return the mask (h, w) of the vehicle in a frame; widened for a single field because the
     missing rows are interpolated."""
-    if mask is None or frame.fields not in ("top", "bottom"):
+    if mask is None or frame.picture_kind not in ("top", "bottom"):
         return mask
     return cv2.dilate(mask.astype(np.uint8), np.ones((_MASK_SPREAD_ROWS, 1), np.uint8)) > 0
 
@@ -163,20 +164,24 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden: HiddenMask) -> NDArray[
         return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA), np.float32)
 
     mean = cv2.mean(image, (~hidden).astype(np.uint8))[0]
-    grey = (around(image * free) + _MIN_FILL_WEIGHT * mean) / (around(free) + _MIN_FILL_WEIGHT)
+    grey = (around(image * free) + _MEAN_GREY_FILL_WEIGHT * mean) / (
+        around(free) + _MEAN_GREY_FILL_WEIGHT
+    )
     smooth = cv2.resize(grey, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.where(hidden, np.rint(smooth).astype(np.uint8), image)
 
 
 def is_hidden(
-    hidden: HiddenMask | None, corners_px: Array, reach: float = WHITE_BORDER_HALF_SIDES
+    hidden: HiddenMask | None,
+    corners_px: Array,
+    reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if any pixel up to `reach` half sides from the marker's centre is hidden."""
+    """True if any pixel up to `reach_half_sides` half sides from the marker's centre is hidden."""
     if hidden is None:
         return False
     h, w = hidden.shape
     centre = corners_px.mean(axis=0)
-    wide = centre + reach * (corners_px - centre)
+    wide = centre + reach_half_sides * (corners_px - centre)
     if not np.isfinite(wide).all():
         return False
     low = np.clip(np.floor(wide.min(axis=0)), 0, (w - 1, h - 1)).astype(int)
@@ -199,8 +204,12 @@ class Picture:
     setup: DetectorSetup
     camera: CameraModel
 
-    def other_corners(self, corners_px: Array, name: MarkerName) -> Array:
+    def derive_from_other_marker(self, corners_px: Array, name: MarkerName) -> Array:
         """Return marker `name`'s corners (4, 2), derived from `corners_px` (4, 2) of the other
         marker."""
-        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
+        ratio = (
+            self.setup.small_to_large_side
+            if name == "small"
+            else 1.0 / self.setup.small_to_large_side
+        )
         return scale_square(corners_px, ratio, self.camera)

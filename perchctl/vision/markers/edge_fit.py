@@ -21,8 +21,9 @@ therefore determines d, and the lines are moved back.
 
 The result is wrong if light clips the white of some sides only, if a cell is only two or three
 blurs wide and its neighbours bend the sides, or if the sheet curls; the standard deviation includes
-the first two. `refine_lines` returns None if a corner moved by more than 0.6 cells, the points are
-0.6 px off their line, less than half of the profiles count, or the blur fills the window.
+the first two. `refine_corners_by_lines` returns None if a corner moved by more than 0.6 cells, the
+points are 0.6 px off their line, less than half of the profiles count, or the blur fills the
+window.
 
 Lengths are px in the picture; lines and points are in normalised image coordinates.
 """
@@ -38,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array, is_finite
-from perchctl.vision.lens import distort, undistort
+from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
     NEXT_CORNER,
     OUTWARD_NORMALS,
@@ -87,20 +88,20 @@ def profile_positions(lengths_px: Array) -> Array:
 
 
 def make_side_profiles(
-    starts: Array, ends: Array, shares: Array, camera: CameraModel
+    starts: Array, ends: Array, positions_along_side: Array, camera: CameraModel
 ) -> tuple[Array, Array]:
     """Return the points where profiles cross the sides, px, and the unit normals there, to the left
     of the direction from start to end in the picture (outwards for a marker with clockwise
     corners): each (rows, n, 2).
 
-    `starts`, `ends` (rows, 2) are the normalised ends of the sides; `shares` (rows, n) come from
-    `profile_positions`. The image of a side through the lens is smooth, so a few nodes define all
-    of it.
+    `starts`, `ends` (rows, 2) are the normalised ends of the sides; `positions_along_side` (rows,
+    n) come from `profile_positions`. The image of a side through the lens is smooth, so a few nodes
+    define all of it.
     """
-    first, last = shares[:, :1], shares[:, -1:]
+    first, last = positions_along_side[:, :1], positions_along_side[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
     points = starts[:, None] + at * (ends - starts)[:, None]
-    nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
+    nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
     origin = np.matmul(_NODES_TO_VALUES, nodes)
     # As complex numbers x + iy, a quarter turn is a single product.
     tangent = np.matmul(_NODES_TO_SLOPES, nodes).view(np.complex128)
@@ -146,47 +147,52 @@ _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
 # compensates the reduction of squared residuals and samples by the weights
-_LINE_VARIANCE_FACTOR = 1.7
+_ROBUST_LINE_VARIANCE_FACTOR = 1.7
 # bend of an edge by the next one, a cell away, in units of blur
 _NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
-_BLUR_ERROR_PER_PX2 = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
-CLIPPED_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
-CLIPPED_FRACTION = 0.05  # share of the profiles
+_EDGE_ERROR_PER_CUBED_BLUR_PX2 = (
+    0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
+)
+CLIPPED_CORNER_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
+MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
 # profiles cut off a wide edge that is not central
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
 _MAX_EDGE_OFFSET_PX = 4.0
-_MIN_ROW_JITTER_RATIO = 2.0  # ratio of variances of the sides that shows jittering rows
-_MIN_SLANT_VARIANCE = 0.05  # variance of the sides' slants (0 to 1) required to distinguish them
-_MIN_CONTRAST = 6.0  # grey levels between the flanks
-_MIN_SHIFT_SIGMA_PX = 0.01
-_MAX_SHIFT_PX = 1.0
+_MIN_ROW_JITTER_VARIANCE_RATIO = 2.0  # ratio of variances of the sides that shows jittering rows
+_MIN_SIDE_SLANT_VARIANCE = (
+    0.05  # variance of the sides' slants (0 to 1) required to distinguish them
+)
+_MIN_FLANK_CONTRAST_GREY = 6.0  # grey levels between the flanks
+_MIN_EDGE_SHIFT_SIGMA_PX = 0.01
+_MAX_EDGE_SHIFT_PX = 1.0
 _MAX_EDGE_BLUR_CELLS = 0.45  # beyond it, the two edges of a border merge
-_MIN_SIDE_WEIGHT = 3.0  # total weight required of a side
-_SHIFT_PRIOR_PX = 0.15  # standard deviation due to glare and gamma
-_CLIPPED_PRIOR_PX = 0.4  # standard deviation due to clipping
+_MIN_SIDE_WEIGHT_SUM = 3.0  # total weight required of a side
+_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # standard deviation due to glare and gamma
+_CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.4  # standard deviation due to clipping
 CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
-_ONES: Array = np.ones(PROFILES_PER_SIDE)
-_ONES32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
+_PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
+_PROFILE_ONES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
 _MEAN_OF_FOUR: Array = np.full(4, 0.25)
 _PARABOLA: Array = SIDE_POSITIONS**2 - (SIDE_POSITIONS**2).mean()
-_MIN_BOW_SIGMAS = 3.0  # standard deviations
+_MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
 
 
-def refine_lines(
+def refine_corners_by_lines(
     image: NDArray[np.uint8],
     raw_px: Array,
-    rims: Sequence[BorderCells],
+    border_cells: Sequence[BorderCells],
     camera: CameraModel,
-    known: EdgeShift | None = None,
+    known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers (m, 4, 2); None for corners without a marker's sides.
 
-    The shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
-    near the ends of the profiles, is fitted again with the profiles centred on its edges.
+    The shift of all edges is measured unless it is `known_edge_shift`. A marker with wide edges, or
+    with edges near the ends of the profiles, is fitted again with the profiles centred on its
+    edges.
     """
-    found = _refine_lines_once(image, raw_px, rims, camera, known)
+    found = _refine_lines_once(image, raw_px, border_cells, camera, known_edge_shift)
     centred = raw_px.copy()
     for i, each in enumerate(found):
         if each is None:
@@ -198,83 +204,99 @@ def refine_lines(
             centred[i] = each.corners_px
     if (centred == raw_px).all():
         return found
-    again = _refine_lines_once(image, centred, rims, camera, known)
+    again = _refine_lines_once(image, centred, border_cells, camera, known_edge_shift)
     return [second or first for first, second in zip(found, again, strict=True)]
 
 
 def _refine_lines_once(
     image: NDArray[np.uint8],
     raw_px: Array,
-    rims: Sequence[BorderCells],
+    border_cells: Sequence[BorderCells],
     camera: CameraModel,
-    known: EdgeShift | None,
+    known_edge_shift: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
     found: list[RefinedCorners | None] = [None] * len(raw_px)
-    markers = prepare_marker_sides(raw_px, rims, camera)
+    markers = prepare_marker_sides(raw_px, border_cells, camera)
     if markers is None:
         return found
-    sides, inner = measure_edges(image, markers, camera, with_inner=known is None)
-    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES_PER_SIDE
-    clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > CLIPPED_FRACTION
-    if known is not None and clipped.any():
+    outer_edges, inner_edges = measure_edges(
+        image, markers, camera, with_inner_edges=known_edge_shift is None
+    )
+    glaring = (
+        np.count_nonzero(outer_edges.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES_PER_SIDE
+    )
+    clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
+    if known_edge_shift is not None and clipped.any():
         # The edge shift due to clipping changes with the light.
-        return _refine_lines_once(image, raw_px, rims, camera, None)
-    lines, residual_px = _fit_lines(markers, sides)
-    shift = known
+        return _refine_lines_once(image, raw_px, border_cells, camera, None)
+    lines, residual_px = _fit_lines(markers, outer_edges)
+    shift = known_edge_shift
     if shift is None:
         corners = _intersect(lines)
         if not is_finite(corners):
             return found
-        shift = _measure_edge_shift(markers, sides, inner, lines, residual_px, corners)
-    applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
+        shift = _measure_edge_shift(markers, outer_edges, inner_edges, lines, residual_px, corners)
+    applied = shift or EdgeShift(
+        0.0, edge_shift_prior_sigma_px(float(outer_edges.grey[:, :, -1].mean()))
+    )
     if applied.shift_px != 0.0:
         lines = lines.copy()
-        lines[:, 2] += _outward_signs(markers, lines) * (applied.shift_px / markers.px_per_unit)
+        lines[:, 2] += _outward_signs(markers, lines) * (
+            applied.shift_px / markers.px_per_normalised
+        )
     corners = _intersect(lines)
     if not is_finite(corners):
         return found
-    corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
-    accepted = _is_accepted(markers, sides, residual_px, corners_px)
+    corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
+    accepted = _is_accepted(markers, outer_edges, residual_px, corners_px)
     # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
-    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    ends_px2 = (4.0 * _LINE_VARIANCE_FACTOR * residual_px * residual_px / independent).tolist()
-    blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
-    for i, rim in enumerate(rims):
+    independent = np.maximum(
+        np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
+    )
+    line_end_variances_px2 = (
+        4.0 * _ROBUST_LINE_VARIANCE_FACTOR * residual_px * residual_px / independent
+    ).tolist()
+    blurs_px, normals_x = outer_edges.blur_px.tolist(), lines[:, 0].tolist()
+    for i, rim in enumerate(border_cells):
         if not accepted[i]:
             continue
         four = slice(4 * i, 4 * i + 4)
-        ends, blurs = ends_px2[four], blurs_px[four]
+        ends, blurs = line_end_variances_px2[four], blurs_px[four]
         cell_px, blur_px = float(markers.cell_px[i]), sum(blurs) / 4.0
         found[i] = RefinedCorners(
             corners_px=corners_px[i],
             sigma_px=_corner_sigma_px(
-                cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.tolerance
+                cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.print_tolerance_cells
             ),
             refined=True,
-            shift_sigma_px=applied.sigma_px,
+            edge_shift_sigma_px=applied.sigma_px,
             blur_px=max(blurs),
             edge_shift=shift,
-            row_sigma_px=_row_jitter_sigma_px(normals_x[four], ends),
-            min_blur_px=min(blurs),
+            row_jitter_sigma_px=_row_jitter_sigma_px(normals_x[four], ends),
+            sharpest_side_blur_px=min(blurs),
         )
     return found
 
 
-def _fit_lines(markers: MarkerSides, sides: EdgeData) -> tuple[Array, Array]:
+def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Array]:
     """Return the normalised lines (4m, 3): nx, ny, c with n.x = c and |n| = 1; and the weighted RMS
     distance of the points from them, px (4m,)."""
-    w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
-    x, y = sides.points[..., 0], sides.points[..., 1]
-    cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
+    w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
+    x, y = outer_edges.points[..., 0], outer_edges.points[..., 1]
+    cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
-    sxx, sxy, syy = (wx * dx).dot(_ONES), (wx * dy).dot(_ONES), (w * dy * dy).dot(_ONES)
+    sxx, sxy, syy = (
+        (wx * dx).dot(_PROFILE_ONES),
+        (wx * dy).dot(_PROFILE_ONES),
+        (w * dy * dy).dot(_PROFILE_ONES),
+    )
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
     lines = np.empty((len(w), 3))
     lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
-    return lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit
+    return lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
 
 
 def _intersect(lines: Array) -> Array:
@@ -291,15 +313,19 @@ def _intersect(lines: Array) -> Array:
     return corners
 
 
-def shift_prior_px(white_grey: float) -> float:
+def edge_shift_prior_sigma_px(white_grey: float) -> float:
     """Return the standard deviation of an unmeasured edge shift, given white paper's grey level."""
-    return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
+    return (
+        _CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX
+        if white_grey > CLIPPED_GREY
+        else _EDGE_SHIFT_PRIOR_SIGMA_PX
+    )
 
 
 def _measure_edge_shift(
     markers: MarkerSides,
-    sides: EdgeData,
-    inner: EdgeData | None,
+    outer_edges: EdgeData,
+    inner_edges: EdgeData | None,
     lines: Array,
     residual_px: Array,
     corners: Array,
@@ -310,27 +336,36 @@ def _measure_edge_shift(
     Outer edges that moved in by d shrink the marker's own scale. The inner edges, at the share r of
     it, moved out by d and appear d (1 + r) too far out.
     """
-    if inner is None:
+    if inner_edges is None:
         return None
-    k, prior_px = markers.widest, shift_prior_px(float(sides.grey[:, :, -1].mean()))
-    rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
-    r = 1.0 - 2.0 / rim.cells
-    own = apply_homography(homography_to_unit_square(corners[k]), inner.points)
+    k, prior_px = (
+        markers.widest_marker_index,
+        edge_shift_prior_sigma_px(float(outer_edges.grey[:, :, -1].mean())),
+    )
+    rim, depth_px, cell_px = (
+        markers.border_cells[k],
+        markers.cell_width_across_side_px[k],
+        float(markers.cell_px[k]),
+    )
+    r = 1.0 - 2.0 / rim.cells_per_side
+    own = apply_homography(homography_to_unit_square(corners[k]), inner_edges.points)
     far = np.matmul(own, OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
-    w = inner.weight * (inner.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
-    w *= np.abs(far_px) < _MAX_SHIFT_PX
+    w = inner_edges.weight * (inner_edges.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
+    w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
     mass = w.sum(axis=1)
-    some = mass > _MIN_SIDE_WEIGHT
+    some = mass > _MIN_SIDE_WEIGHT_SUM
     if not some.any():
         return EdgeShift(0.0, prior_px)
     # A curled sheet moves outer edges further than inner ones, and ends further than middles.
-    bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
+    bent_px = (
+        8.0 * r / (3.0 * rim.cells_per_side) * _bow_px(markers, outer_edges, lines, residual_px)
+    )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
     mean = (share * far_px).sum(axis=1)
     scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
-    least = _MIN_SHIFT_SIGMA_PX**2 + bent_px**2
+    least = _MIN_EDGE_SHIFT_SIGMA_PX**2 + bent_px**2
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
@@ -338,7 +373,7 @@ def _measure_edge_shift(
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
-    variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.tolerance * cell_px) ** 2
+    variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.print_tolerance_cells * cell_px) ** 2
     prior = prior_px**2
     return EdgeShift(
         shift_px=shift * prior / (prior + variance),
@@ -346,70 +381,76 @@ def _measure_edge_shift(
     )
 
 
-def _bow_px(markers: MarkerSides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
+def _bow_px(markers: MarkerSides, outer_edges: EdgeData, lines: Array, residual_px: Array) -> float:
     """Return how far the ends of the widest marker's sides are further out than their middles,
     beyond the noise; 0 if noise explains it."""
-    four = slice(4 * markers.widest, 4 * markers.widest + 4)
-    away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
-    scale = _outward_signs(markers, lines)[four] * markers.px_per_unit[four]
-    mass = np.maximum(sides.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
-    bow_px = scale * ((sides.weight[four] * away) @ _PARABOLA) / mass
+    four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
+    away = np.matmul(outer_edges.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
+    scale = _outward_signs(markers, lines)[four] * markers.px_per_normalised[four]
+    mass = np.maximum(outer_edges.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
+    bow_px = scale * ((outer_edges.weight[four] * away) @ _PARABOLA) / mass
     mean_px = float(bow_px @ _MEAN_OF_FOUR)
     noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
-    return mean_px if abs(mean_px) > _MIN_BOW_SIGMAS * noise_px else 0.0
+    return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
 
 def _outward_signs(markers: MarkerSides, lines: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
-    corners = markers.corners
+    corners = markers.corners_normalised
     out = (corners - (_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
 
 
 def _is_accepted(
-    markers: MarkerSides, sides: EdgeData, residual_px: Array, corners_px: Array
+    markers: MarkerSides, outer_edges: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
-    inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
+    inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
-    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
+    contrast = np.abs(outer_edges.grey[:, :, -3] - outer_edges.grey[:, :, 2]).dot(_PROFILE_ONES_F32)
     lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
-    lines &= (contrast > _MIN_CONTRAST * PROFILES_PER_SIDE) & (
-        sides.blur_px < 0.9 * sides.window_half_px
+    lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
+        outer_edges.blur_px < 0.9 * outer_edges.window_half_px
     )
-    displacement = corners_px - markers.raw_px
+    displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
     good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
     return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
 
 
 def _corner_sigma_px(
-    cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
+    cell_px: float, blur_px: float, noise_px2: float, clipped: bool, print_tolerance_cells: float
 ) -> float:
     blur_px = max(blur_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = (
         _NEIGHBOUR_BEND * blur_px * math.exp(-cell_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
     )
-    reach_px = _BLUR_ERROR_PER_PX2 * blur_px**3
-    clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
+    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PX2 * blur_px**3
+    clipped_px = CLIPPED_CORNER_SIGMA_PX if clipped else 0.0
     # Printed edges deviate from their nominal positions.
-    print_px = tolerance * cell_px
+    print_px = print_tolerance_cells * cell_px
     noise_px = max(math.sqrt(noise_px2), MIN_LINE_SIGMA_PX)
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
-def _row_jitter_sigma_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
+def _row_jitter_sigma_px(
+    normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
+) -> float:
     """Return the standard deviation of corners due to jittering rows, which affects upright sides
     only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
-    if aspect <= _MIN_SLANT_VARIANCE:
+    if aspect <= _MIN_SIDE_SLANT_VARIANCE:
         return 0.0
-    both = zip(ends_px2, upright, strict=True)
+    both = zip(line_end_variances_px2, upright, strict=True)
     slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
-    still = sum(ends_px2) / 4.0 - slope * mean
-    return math.sqrt(slope) if slope > (_MIN_ROW_JITTER_RATIO - 1.0) * max(still, 0.0) else 0.0
+    still = sum(line_end_variances_px2) / 4.0 - slope * mean
+    return (
+        math.sqrt(slope)
+        if slope > (_MIN_ROW_JITTER_VARIANCE_RATIO - 1.0) * max(still, 0.0)
+        else 0.0
+    )
 
 
 # --- Measurement of the markers' sides: position of the edge on profiles across each side ---
@@ -422,21 +463,22 @@ _SIDE_INDICES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MarkerSides:
-    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the
-    cells next to each marker's border; the side lengths `sides_px` and the depths of the cells
-    behind them `depth_px` (m, 4); mean cell width `cell_px` (m,); index of the marker with the
-    `widest` cells; `winding` of the corners, +1 or -1 (m,); and pixels per normalised unit along
-    each side `px_per_unit` (4m,)."""
+    """Sides of m markers: corners `raw_corners_px` (m, 4, 2) and normalised, `corners_normalised`;
+    `border_cells`, the cells next to each marker's border; the side lengths `side_lengths_px` and
+    the depths of the cells behind them `cell_width_across_side_px` (m, 4); mean cell width
+    `cell_px` (m,); index of the marker with the `widest_marker_index` cells; `winding` of the
+    corners, +1 or -1 (m,); and pixels per normalised unit along each side `px_per_normalised`
+    (4m,)."""
 
-    raw_px: Array
-    rims: Sequence[BorderCells]
-    corners: Array
-    sides_px: Array
-    depth_px: Array
+    raw_corners_px: Array
+    border_cells: Sequence[BorderCells]
+    corners_normalised: Array
+    side_lengths_px: Array
+    cell_width_across_side_px: Array
     cell_px: Array
-    widest: int
+    widest_marker_index: int
     winding: Array
-    px_per_unit: Array
+    px_per_normalised: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,13 +495,13 @@ class EdgeData:
 
 
 def prepare_marker_sides(
-    raw_px: Array, rims: Sequence[BorderCells], camera: CameraModel
+    raw_px: Array, border_cells: Sequence[BorderCells], camera: CameraModel
 ) -> MarkerSides | None:
     """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
     quadrilateral."""
     sides_px = side_lengths_px(raw_px)
-    cells = np.array([rim.cells for rim in rims], dtype=np.float64)
-    corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
+    cells = np.array([rim.cells_per_side for rim in border_cells], dtype=np.float64)
+    corners = undistort_to_normalised(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
     turn = np.sign(signed_double_area(raw_px))
     is_square = turn.all() and sides_px.min() > 1e-6
     if not (is_square and is_finite(corners)):
@@ -468,33 +510,38 @@ def prepare_marker_sides(
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
     cell_px = sides_px @ _MEAN_OF_FOUR / cells
     return MarkerSides(
-        raw_px=raw_px,
-        rims=rims,
-        corners=corners,
-        sides_px=sides_px,
+        raw_corners_px=raw_px,
+        border_cells=border_cells,
+        corners_normalised=corners,
+        side_lengths_px=sides_px,
         # The inner row is one cell further in, along the neighbouring sides.
-        depth_px=0.5 * across_px / cells[:, None],
+        cell_width_across_side_px=0.5 * across_px / cells[:, None],
         cell_px=cell_px,
-        widest=int(cell_px.argmax()),
+        widest_marker_index=int(cell_px.argmax()),
         winding=turn,
-        px_per_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
+        px_per_normalised=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
 def measure_edges(
-    image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner: bool
+    image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner_edges: bool
 ) -> tuple[EdgeData, EdgeData | None]:
     """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
-    marker `markers.widest`; None without `with_inner`, or if the marker's cells are too narrow."""
-    starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
+    marker `markers.widest`; None without `with_inner_edges`, or if the marker's cells are too
+    narrow."""
+    starts, lengths_px, depth_px = (
+        markers.corners_normalised,
+        markers.side_lengths_px,
+        markers.cell_width_across_side_px,
+    )
     of = np.arange(len(starts)).repeat(4)
-    widest = markers.widest
-    rim = markers.rims[widest]
-    with_inner = with_inner and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
-    if with_inner:
-        r = 1.0 - 2.0 / rim.cells
+    widest = markers.widest_marker_index
+    rim = markers.border_cells[widest]
+    with_inner_edges = with_inner_edges and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
+    if with_inner_edges:
+        r = 1.0 - 2.0 / rim.cells_per_side
         inner = apply_homography(
-            homography_from_unit_square(markers.corners[widest]), r * UNIT_SQUARE
+            homography_from_unit_square(markers.corners_normalised[widest]), r * UNIT_SQUARE
         )[None]
         starts = np.concatenate([starts, inner])
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
@@ -502,28 +549,32 @@ def measure_edges(
         of = np.append(of, (widest, widest, widest, widest))
     # Normals point out of a marker with clockwise corners; dark must come first.
     sign = markers.winding[of]
-    if with_inner:
+    if with_inner_edges:
         sign[-4:] *= -1.0
     s = profile_positions(lengths_px.ravel())
     ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    window_half_px, half_px = (each[of] for each in profile_half_lengths_px(markers.cell_px))
+    window_half_px, half_px = (
+        each[of] for each in window_and_profile_half_lengths_px(markers.cell_px)
+    )
     grey = sample_profiles(image, origin, normal, half_px)
-    around = find_neighbour_edges(s, markers.rims, rim, depth_px.ravel())
+    around = find_neighbour_edges(s, markers.border_cells, rim, depth_px.ravel())
     offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
-    points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
+    points = undistort_to_normalised(
+        (origin + offset_px[..., None] * normal).reshape(-1, 2), camera
+    )
     points = points.reshape(-1, PROFILES_PER_SIDE, 2)
     points = points if is_finite(points) else np.nan_to_num(points)
-    n = 4 * len(markers.raw_px)
-    sides, inner_edges = (
+    n = 4 * len(markers.raw_corners_px)
+    outer_edges, inner_edges = (
         EdgeData(grey[part], window_half_px[part], points[part], weight[part], blur_px[part])
         for part in (slice(0, n), slice(n, None))
     )
-    return sides, inner_edges if with_inner else None
+    return outer_edges, inner_edges if with_inner_edges else None
 
 
-def profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
+def window_and_profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
     """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
     size."""
     window_half_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
@@ -531,24 +582,39 @@ def profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
 
 
 def find_neighbour_edges(
-    shares: Array, rims: Sequence[BorderCells], inner_rim: BorderCells, cell_depth_px: Array
+    positions_along_side: Array,
+    border_cells: Sequence[BorderCells],
+    inner_border_cells: BorderCells,
+    neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Return the neighbours of the edges at `shares` (rows, n) of sides: four rows per rim, then,
-    if given, four rows for the inner edges of `inner_rim`'s border. `cell_depth_px` (rows,) is the
-    size of a cell across the edge."""
-    inside, outside = np.zeros(shares.shape, np.float32), np.zeros(shares.shape, np.float32)
-    possible = np.ones(shares.shape, np.bool_)
-    for i, rim in enumerate(rims):
+    """Return the neighbours of the edges at `positions_along_side` (rows, n) of sides: four rows
+    per rim, then, if given, four rows for the inner edges of `inner_border_cells`'s border.
+    `neighbour_distance_px` (rows,) is the size of a cell across the edge."""
+    has_inner_neighbour, has_outer_neighbour = (
+        np.zeros(positions_along_side.shape, np.float32),
+        np.zeros(positions_along_side.shape, np.float32),
+    )
+    can_be_located = np.ones(positions_along_side.shape, np.bool_)
+    for i, rim in enumerate(border_cells):
         four = slice(4 * i, 4 * i + 4)
-        inside[four] = rim.white[_SIDE_INDICES, (shares[four] * rim.cells).astype(np.intp)]
-    if len(shares) > 4 * len(rims):
-        at = 1.0 + shares[-4:] * (inner_rim.cells - 2)  # in cells from the border's corner
+        has_inner_neighbour[four] = rim.is_white[
+            _SIDE_INDICES, (positions_along_side[four] * rim.cells_per_side).astype(np.intp)
+        ]
+    if len(positions_along_side) > 4 * len(border_cells):
+        at = 1.0 + positions_along_side[-4:] * (
+            inner_border_cells.cells_per_side - 2
+        )  # in cells from the border's corner
         # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
-        free = inner_rim.white_behind[_SIDE_INDICES, (at - 0.3).astype(np.intp)]
-        free = free * inner_rim.white_behind[_SIDE_INDICES, (at + 0.3).astype(np.intp)]
-        possible[-4:] = free > 0.0
-        outside[-4:] = 1.0
-    return NeighbourEdges(cell_depth_px, inside, outside, possible)
+        free = inner_border_cells.is_white_two_cells_deep[_SIDE_INDICES, (at - 0.3).astype(np.intp)]
+        free = (
+            free
+            * inner_border_cells.is_white_two_cells_deep[_SIDE_INDICES, (at + 0.3).astype(np.intp)]
+        )
+        can_be_located[-4:] = free > 0.0
+        has_outer_neighbour[-4:] = 1.0
+    return NeighbourEdges(
+        neighbour_distance_px, has_inner_neighbour, has_outer_neighbour, can_be_located
+    )
 
 
 # --- Edges between black and white to 0.01 px, on grey profiles across them ---
@@ -559,28 +625,32 @@ def find_neighbour_edges(
 _SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
-_MAX_NEIGHBOUR_FRACTION = 0.9  # share of the gradient that neighbouring edges may cause
+_MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9  # share of the gradient that neighbouring edges may cause
 # second moment of an edge: px^2, and in units of the window's variance
 _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
-_WINDOW_LENGTH_SIGMAS = 1.0 / 0.6
+_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
 _SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
-_MIN_GRADIENT_FRACTION = 0.3  # share of the row's mean gradient that a profile requires to count
+_MIN_FRACTION_OF_MEAN_GRADIENT = (
+    0.3  # share of the row's mean gradient that a profile requires to count
+)
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # for a scatter that counts as noise
-_MAX_ONE_ROUND_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
+_MAX_WIDE_WINDOW_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _CONVERGED_LINE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
 _OUT_OF_RANGE = 1e6
 _QUARTER_PROFILES = PROFILES_PER_SIDE // 4
 _QUARTER_ONES: Floats = np.ones(_QUARTER_PROFILES, dtype=np.float32)
 # The line through the values in the middles of both halves of the profiles, (2, n).
-_HALVES_SLOPE: Floats = _SIDE_POSITIONS_F32 * (
+_HALF_MIDMEANS_TO_SLOPE: Floats = _SIDE_POSITIONS_F32 * (
     0.5 / float(SIDE_POSITIONS[PROFILES_PER_SIDE // 2 :].mean())
 )
-_HALVES_BASIS: Floats = np.stack([0.5 - _HALVES_SLOPE, 0.5 + _HALVES_SLOPE])
-_ALTERNATING_OUT_OF_RANGE: Floats = np.where(
+_HALF_MIDMEANS_TO_LINE: Floats = np.stack(
+    [0.5 - _HALF_MIDMEANS_TO_SLOPE, 0.5 + _HALF_MIDMEANS_TO_SLOPE]
+)
+_MEDIAN_NEUTRAL_FILL: Floats = np.where(
     np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE, -_OUT_OF_RANGE
 ).astype(np.float32)
 
@@ -589,15 +659,15 @@ _ALTERNATING_OUT_OF_RANGE: Floats = np.where(
 class NeighbourEdges:
     """The neighbouring edges that blur into a measured edge.
 
-    depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 if another edge
-    with the same contrast is one cell further in or out, (rows, n). possible: False if no edge can
-    be found, (rows, n).
+    neighbour_distance_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 if
+    another edge with the same contrast is one cell further in or out, (rows, n). possible: False if
+    no edge can be found, (rows, n).
     """
 
-    depth_px: Array
-    inside: Floats
-    outside: Floats
-    possible: NDArray[np.bool_]
+    neighbour_distance_px: Array
+    has_inner_neighbour: Floats
+    has_outer_neighbour: Floats
+    can_be_located: NDArray[np.bool_]
 
 
 def locate_edges(
@@ -612,19 +682,25 @@ def locate_edges(
         half_px, window_half_px: half length of the profiles and of the windows, (rows,).
     """
     profiles = _Profiles(grey, half_px, window_half_px, neighbours)
-    edge, usable = profiles.wide()
-    blur2 = np.ones(len(window_half_px), dtype=np.float32)
-    line = weight = _fit_line_to_halves(edge, usable)
+    edge_offsets_px, usable = profiles.locate_in_wide_window()
+    blur_px2 = np.ones(len(window_half_px), dtype=np.float32)
+    line = weight = _fit_line_to_half_midmeans(edge_offsets_px, usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
-        if k == 1 and moved_px < _MAX_ONE_ROUND_ERROR_PX:
+        if k == 1 and moved_px < _MAX_WIDE_WINDOW_ERROR_PX:
             continue
-        edge, usable, blur2 = profiles.narrow(line, blur2)
-        centre, weight = _fit_robust_line(edge, usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1)
+        edge_offsets_px, usable, blur_px2 = profiles.locate_in_narrow_window(line, blur_px2)
+        centre, weight = _fit_robust_line(
+            edge_offsets_px, usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
+        )
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _CONVERGED_LINE_PX:
             break
-    return edge.astype(np.float64), weight.astype(np.float64), np.sqrt(blur2).astype(np.float64)
+    return (
+        edge_offsets_px.astype(np.float64),
+        weight.astype(np.float64),
+        np.sqrt(blur_px2).astype(np.float64),
+    )
 
 
 class _Profiles:
@@ -637,52 +713,61 @@ class _Profiles:
         self.u = half_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS  # position, (rows, steps)
         self.near, self.depth = (
             window_half_px.astype(np.float32),
-            around.depth_px.astype(np.float32),
+            around.neighbour_distance_px.astype(np.float32),
         )
         self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
         # Neighbouring edges on the flanks: number on both, and outside minus inside.
-        self.both, self.side = around.inside + around.outside, around.outside - around.inside
-        self.can = around.possible.astype(np.float32)
+        self.both, self.side = (
+            around.has_inner_neighbour + around.has_outer_neighbour,
+            around.has_outer_neighbour - around.has_inner_neighbour,
+        )
+        self.can = around.can_be_located.astype(np.float32)
         # Factor for the sum over a row's profiles: a share of the mean over the possible ones.
-        self.part = _MIN_GRADIENT_FRACTION / np.maximum(self.can.dot(_ONES32), 1.0)
+        self.part = _MIN_FRACTION_OF_MEAN_GRADIENT / np.maximum(
+            self.can.dot(_PROFILE_ONES_F32), 1.0
+        )
 
-    def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
+    def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the edges from one window around all middles, and which ones count."""
-        spread = self.u * (_WINDOW_LENGTH_SIGMAS / self.near)[:, None]
+        spread = self.u * (_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
         np.exp(-0.5 * spread, out=window[..., 0])
         np.multiply(window[..., 0], self.u, out=window[..., 1])
         moments: Floats = np.maximum(self.gradient, 0.0) @ window
         total = moments[..., 0] * self.can
-        usable = total > (total.dot(_ONES32) * self.part)[:, None]
+        usable = total > (total.dot(_PROFILE_ONES_F32) * self.part)[:, None]
         return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
 
-    def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    def locate_in_narrow_window(
+        self, line: Floats, blur_px2: Floats
+    ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Return the edges from a window around the row's line, which ones count, and blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
-            np.maximum(_WINDOW_VARIANCE_RATIO * blur2, _MIN_WINDOW_VARIANCE_PX2), self.most2
+            np.maximum(_WINDOW_VARIANCE_RATIO * blur_px2, _MIN_WINDOW_VARIANCE_PX2), self.most2
         )
         squared = relative * relative
         mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
         total = (mass @ _SAMPLE_ONES) * self.can
-        usable = total > np.maximum(total.dot(_ONES32) * self.part, 1e-9)[:, None]
+        usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
         # Share, position and spread of a neighbour seen through the window.
-        wide2 = w2 + blur2
+        wide2 = w2 + blur_px2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
-        share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_FRACTION)
+        share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
         total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
-        second = mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-        moment = (second * usable).dot(_ONES32)
-        moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
+        second = (
+            mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur_px2 / wide2)[:, None]
+        )
+        moment = (second * usable).dot(_PROFILE_ONES_F32)
+        moment /= np.maximum((total * usable).dot(_PROFILE_ONES_F32), 1e-9)
         moment = np.minimum(
             np.maximum(moment, _MIN_SECOND_MOMENT_PX2), _MAX_SECOND_MOMENT_RATIO * w2
         )
@@ -693,10 +778,12 @@ class _Profiles:
         return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
-def _fit_line_to_halves(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _fit_line_to_half_midmeans(edge_offsets_px: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return lines (rows, n) through the middle of each row's halves, robust to a bad quarter of
     either."""
-    halves = np.where(usable, edge, _ALTERNATING_OUT_OF_RANGE).reshape(-1, 2, 2 * _QUARTER_PROFILES)
+    halves = np.where(usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
+        -1, 2, 2 * _QUARTER_PROFILES
+    )
     halves.sort(axis=2)
     first = _QUARTER_PROFILES // 2
     middle = halves[:, :, first : first + _QUARTER_PROFILES]
@@ -704,14 +791,16 @@ def _fit_line_to_halves(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     shown = np.abs(middle) < _OUT_OF_RANGE
     count = shown @ _QUARTER_ONES
     mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
-    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALVES_BASIS)
+    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALF_MIDMEANS_TO_LINE)
 
 
-def _fit_robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
+def _fit_robust_line(
+    edge_offsets_px: Floats, usable: NDArray[np.bool_], rounds: int
+) -> tuple[Floats, Floats]:
     """Return straight lines (rows, n) fitted with Tukey's weights, and the weights."""
-    line = median_per_row(edge, usable)[:, None]
+    line = median_per_row(edge_offsets_px, usable)[:, None]
     for _ in range(rounds):
-        size = np.abs(edge - line)
+        size = np.abs(edge_offsets_px - line)
         size /= np.maximum(
             _TUKEY_CUTOFF_MEDIANS * median_per_row(size, usable), _MIN_TUKEY_CUTOFF_PX
         )[:, None]
@@ -720,7 +809,7 @@ def _fit_robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tu
         weight *= weight
         weight *= usable
         w = weight.dot(_SIDE_POWERS)
-        e = (weight * edge).dot(_SIDE_POWERS)
+        e = (weight * edge_offsets_px).dot(_SIDE_POWERS)
         w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
         slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, 1e-9)
@@ -731,7 +820,7 @@ def _fit_robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tu
 
 def median_per_row(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return each row's median over its usable values, (rows,); 0 if it has none."""
-    values = np.where(usable, values, _ALTERNATING_OUT_OF_RANGE)
+    values = np.where(usable, values, _MEDIAN_NEUTRAL_FILL)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
     return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE, found, 0.0))

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
+from perchctl.vision.lens import distort_to_px, pinhole_px, undistort_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
     NEXT_CORNER,
     OUTWARD_NORMALS,
@@ -36,10 +36,10 @@ from perchctl.vision.markers.corners import (
     RefinedCorners,
     apply_homography,
     homography_from_unit_square,
-    homography_jacobian,
     increment_homography,
     is_inside_picture,
     mean_side_px,
+    projected_corners_jacobian,
     side_lengths_px,
     signed_double_area,
 )
@@ -50,17 +50,17 @@ from perchctl.vision.markers.edge_fit import (
     SAMPLES_PER_PROFILE,
     Floats,
     NeighbourEdges,
+    edge_shift_prior_sigma_px,
     find_neighbour_edges,
     locate_edges,
     make_side_profiles,
-    profile_half_lengths_px,
     profile_positions,
     sample_profiles,
-    shift_prior_px,
+    window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    CELL_THRESHOLD_MARGIN,
-    MIN_CONTRAST,
+    CELL_MARGIN_PER_CONTRAST,
+    MIN_CONTRAST_GREY,
     MIN_MATCHING_CELL_FRACTION,
     Pattern,
 )
@@ -69,12 +69,14 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side contains no information
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
-_MAX_BLUR_FRACTION = 0.9  # share of the window
-_MAX_CORNER_SIGMA = 0.02  # share of the side: less certain corners are no measurement
+_MAX_BLUR_WINDOW_FRACTION = 0.9  # share of the window
+_MAX_CORNER_SIGMA_SIDES = 0.02  # share of the side: less certain corners are no measurement
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
-_MAX_STEP = 0.5
-_MAX_CORNER_MOTION_PX = 20.0  # from the start, three windows away: edges cannot move a fit further
+_MAX_HOMOGRAPHY_INCREMENT = 0.5
+_MAX_MOTION_FROM_START_PX = (
+    20.0  # from the start, three windows away: edges cannot move a fit further
+)
 
 
 def fit_partly_visible(
@@ -82,22 +84,22 @@ def fit_partly_visible(
     name: MarkerName,
     start_px: Array,
     identified_by: IdentifiedBy,
-    known: EdgeShift | None = None,
+    known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
     """Fit the whole marker near corners `start_px` (4, 2), which may be outside the picture.
 
-    `identified_by` says what identifies the marker; `known` is the shift of all edges, if measured
-    before. None if the visible part does not determine the corners, or if its cells are not the
-    marker's.
+    `identified_by` says what identifies the marker; `known_edge_shift` is the shift of all edges,
+    if measured before. None if the visible part does not determine the corners, or if its cells are
+    not the marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
-    if not mean_side_px(start_px) / pattern.rim.cells >= MIN_PARTIAL_CELL_PX:
+    if not mean_side_px(start_px) / pattern.border_cells.cells_per_side >= MIN_PARTIAL_CELL_PX:
         return None
     # Enough cells must be in the picture, wherever the fit may end.
     in_picture = _is_point_in_picture(
         _project_sample_points_px(start_px, pattern, camera),
         picture.image.shape,
-        _MAX_CORNER_MOTION_PX,
+        _MAX_MOTION_FROM_START_PX,
     )
     if not _has_enough_known_cells(_is_cell_known(in_picture, pattern), pattern, identified_by):
         return None
@@ -109,17 +111,22 @@ def fit_partly_visible(
         seen = find_visible_edges(picture, H, pattern)
         if seen is None:
             return None
-        A, N, g = _linearize_edges(seen, known or EdgeShift(0.0, shift_prior_px(seen.white_grey)))
+        A, N, g = _linearize_edges(
+            seen, known_edge_shift or EdgeShift(0.0, edge_shift_prior_sigma_px(seen.white_grey))
+        )
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
-        if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
+        if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_HOMOGRAPHY_INCREMENT):
             return None
         H = increment_homography(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _CONVERGED_PARTIAL_PX:
+        if (
+            k > 0
+            and float(np.abs(p[:6]).max() * seen.px_per_half_side.mean()) < _CONVERGED_PARTIAL_PX
+        ):
             break
     assert seen is not None
-    left_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
-    found = _make_refined_corners(H, seen, left_px, N, pattern, camera)
+    residual_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
+    found = _make_refined_corners(H, seen, residual_px, N, pattern, camera)
     if found is None or not _has_matching_visible_cells(
         picture, found.corners_px, pattern, identified_by
     ):
@@ -136,21 +143,23 @@ def is_fully_visible(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _linearize_edges(seen: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the derivatives (9, rows * n) of the edges by the terms of `homography_jacobian` and
-    by the shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
-    variance."""
+    """Return the derivatives (9, rows * n) of the edges by the terms of
+    `projected_corners_jacobian` and by the shift of all edges, px; and their normal equations (9,
+    9), (9,), per px^2 of an edge's variance."""
     u, v = seen.points[..., 0], seen.points[..., 1]
-    nx, ny = OUTWARD_NORMALS[seen.side_index].T[..., None] * seen.scale_px[:, None]
+    nx, ny = OUTWARD_NORMALS[seen.side_index].T[..., None] * seen.px_per_half_side[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the observed edge with the shift.
-    A[8] = np.where(seen.side_distance < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(seen.centre_distance_half_sides < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles closer to each other than a pixel measure the same edge.
-    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.side_distance / PROFILES_PER_SIDE)
+    worth = np.minimum(
+        1.0, 2.0 * seen.px_per_half_side * seen.centre_distance_half_sides / PROFILES_PER_SIDE
+    )
     weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.offset_px.ravel())
     # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
@@ -162,41 +171,49 @@ def _linearize_edges(seen: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array
 
 
 def _make_refined_corners(
-    H: Array, seen: VisibleEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
+    H: Array,
+    seen: VisibleEdges,
+    residual_px: Array,
+    normal_matrix: Array,
+    pattern: Pattern,
+    camera: CameraModel,
 ) -> RefinedCorners | None:
     """Return the corners of the square H (3, 3), with their covariance from the residuals of the
     edges, px (rows, n), and the normal matrix (9, 9); None if the corners are too uncertain."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
-    if not used.any() or (seen.blur[used] > _MAX_BLUR_FRACTION).any():
+    if not used.any() or (seen.blur_window_fraction[used] > _MAX_BLUR_WINDOW_FRACTION).any():
         return None
-    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
+    if float((w * residual_px**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
         return None
-    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
-    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
+    mean = (w * residual_px).sum(axis=1) / np.maximum(mass, 1e-9)
+    scatter = float((w * (residual_px - mean[:, None]) ** 2).sum() / w.sum())
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
     noise2 = max(_ROBUST_VARIANCE_FACTOR * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
     pinhole = apply_homography(H, UNIT_SQUARE)
-    corners_px = distort(apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
+    corners_px = distort_to_px(
+        apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera
+    )
     side_px = mean_side_px(pinhole)
-    cell_px = side_px / pattern.rim.cells
+    cell_px = side_px / pattern.border_cells.cells_per_side
     # The square alone; `shift_sigma_px` covers the uncertainty of the shift of all edges.
-    J = homography_jacobian(H)
-    cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
-    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
+    J = projected_corners_jacobian(H)
+    cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
+    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
-    if not (vaguest_px < _MAX_CORNER_SIGMA * side_px and np.isfinite(corners_px).all()):
+    if not (vaguest_px < _MAX_CORNER_SIGMA_SIDES * side_px and np.isfinite(corners_px).all()):
         return None
-    shift_sigma_px = math.sqrt(noise2 * float(np.linalg.inv(N)[8, 8]))
+    shift_sigma_px = math.sqrt(noise2 * float(np.linalg.inv(normal_matrix)[8, 8]))
     return RefinedCorners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
         refined=True,
-        shift_sigma_px=min(
-            max(shift_sigma_px, _MIN_EDGE_SHIFT_SIGMA_PX), shift_prior_px(seen.white_grey)
+        edge_shift_sigma_px=min(
+            max(shift_sigma_px, _MIN_EDGE_SHIFT_SIGMA_PX),
+            edge_shift_prior_sigma_px(seen.white_grey),
         ),
         cov_px2=cov_px2,
     )
@@ -212,7 +229,7 @@ _MIN_KNOWN_CELL_FRACTION = 0.6  # share of all cells
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0
 # other codewords differ in two bits
 _MAX_UNKNOWN_BITS: dict[IdentifiedBy, int] = {"bits": 1, "track": 4}
-_MAX_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse exists
+_MAX_LENS_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse exists
 
 
 def _has_matching_visible_cells(
@@ -228,22 +245,22 @@ def _has_matching_visible_cells(
     if hidden is not None:
         seen &= ~hidden[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_samples = pattern.is_white[pattern.sample_cells]
+    white_samples = pattern.is_white[pattern.sample_cell_index]
     if not ((seen & white_samples).any() and (seen & ~white_samples).any()):
         return False
     high = float(np.median(grey[seen & white_samples]))
     low = float(np.median(grey[seen & ~white_samples]))
     contrast = high - low
-    if contrast < MIN_CONTRAST:
+    if contrast < MIN_CONTRAST_GREY:
         return False
     seen &= grey <= high + _GLARE * contrast
     if high < _BRIGHTEST_GREY - _GLARE * contrast:
         seen &= grey < _BRIGHTEST_GREY
-    count = np.bincount(pattern.sample_cells, weights=seen)
-    means = np.bincount(pattern.sample_cells, weights=grey * seen) / np.maximum(count, 1.0)
+    count = np.bincount(pattern.sample_cell_index, weights=seen)
+    means = np.bincount(pattern.sample_cell_index, weights=grey * seen) / np.maximum(count, 1.0)
     known = _is_cell_known(seen, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_white, 1.0, -1.0)
-    wrong = np.count_nonzero(known & (share < CELL_THRESHOLD_MARGIN))
+    wrong = np.count_nonzero(known & (share < CELL_MARGIN_PER_CONTRAST))
     most_wrong = 0
     if identified_by == "other":
         most_wrong = math.floor(
@@ -255,31 +272,31 @@ def _has_matching_visible_cells(
 def _project_sample_points_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
     """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted picture; NaN
     outside the lens model. A marker that fills the picture is not a quadrilateral in it."""
-    rays = undistort(corners_px, camera)
+    rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points), 2), np.nan)
     undistorted = apply_homography(homography_from_unit_square(rays), pattern.sample_points)
-    at = distort(undistorted, camera)
+    at = distort_to_px(undistorted, camera)
     near = (
-        np.abs(undistort(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
-        < _MAX_INVERSION_ERROR_PX
+        np.abs(undistort_to_normalised(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
+        < _MAX_LENS_INVERSION_ERROR_PX
     )
     return np.where(near[:, None], at, np.nan)
 
 
 def _is_point_in_picture(
-    at_px: Array, shape: tuple[int, ...], margin_px: float
+    points_px: Array, shape: tuple[int, ...], margin_px: float
 ) -> NDArray[np.bool_]:
     """Return which points (n, 2) are in the picture, or at most `margin_px` outside."""
     h, w = shape[:2]
-    inside = (at_px >= -margin_px) & (at_px <= (w - 1 + margin_px, h - 1 + margin_px))
+    inside = (points_px >= -margin_px) & (points_px <= (w - 1 + margin_px, h - 1 + margin_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _is_cell_known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
     """Return which cells (cells,) show at least half of their sample points (n,)."""
     known: NDArray[np.bool_] = (
-        np.bincount(pattern.sample_cells, weights=seen) >= 0.5 * pattern.samples_per_cell
+        np.bincount(pattern.sample_cell_index, weights=seen) >= 0.5 * pattern.samples_per_cell
     )
     return known
 
@@ -302,10 +319,10 @@ PICTURE_MARGIN_PX = 2.0
 _MIN_INNER_EDGE_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
 _BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5  # shares of the contrast: black inside, white outside
 _MIN_PARTIAL_CONTRAST = 10.0
-_MIN_SIDE_WEIGHT = 3.0  # of a side's profiles
+_MIN_SIDE_WEIGHT_SUM = 3.0  # of a side's profiles
 _MIN_VISIBLE_EDGES = 4  # a square has eight unknowns, and an edge determines two
 _OUT_OF_RANGE_PX = 1e6
-_SEARCH_OFFSETS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[:, None]
+_WINDOW_SAMPLE_OFFSETS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,16 +339,20 @@ class VisibleEdges:
     offset_px: Array
     weight: Array
     side_index: NDArray[np.intp]
-    side_distance: Array
-    scale_px: Array
-    blur: Array
+    centre_distance_half_sides: Array
+    px_per_half_side: Array
+    blur_window_fraction: Array
     white_grey: float
 
 
 def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleEdges | None:
     """Return the edges near the square projected by H (3, 3) to pixels; None if too few are
     visible."""
-    camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT_SQUARE)
+    camera, cells, corners = (
+        picture.camera,
+        pattern.border_cells.cells_per_side,
+        apply_homography(H, UNIT_SQUARE),
+    )
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
@@ -350,26 +371,30 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     # White is outside the marker, and inside its border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
-    window_half_px, half_px = profile_half_lengths_px(np.full(len(at), cell_px))
+    window_half_px, half_px = window_and_profile_half_lengths_px(np.full(len(at), cell_px))
     depth_px = 2.0 * scale_px / cells
-    around = find_neighbour_edges(s, [pattern.rim], pattern.rim, depth_px)
-    free = around.possible & _is_profile_in_view(picture, origin, normal, window_half_px)
-    kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_SIDE_WEIGHT)
+    around = find_neighbour_edges(s, [pattern.border_cells], pattern.border_cells, depth_px)
+    is_unobstructed = around.can_be_located & _is_profile_in_view(
+        picture, origin, normal, window_half_px
+    )
+    kept = np.flatnonzero(np.count_nonzero(is_unobstructed, axis=1) >= _MIN_SIDE_WEIGHT_SUM)
     if len(kept) < _MIN_VISIBLE_EDGES:
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
-    origin, normal, free = origin[kept], normal[kept], free[kept]
+    origin, normal, is_unobstructed = origin[kept], normal[kept], is_unobstructed[kept]
     window_half_px, half_px = window_half_px[kept], half_px[kept]
     grey = sample_profiles(picture.image, origin, normal, half_px)
-    lit = _find_clean_profiles(grey, free, window_half_px, half_px)
+    lit = _find_clean_profiles(grey, is_unobstructed, window_half_px, half_px)
     if lit is None:
         return None
     good, white = lit
-    around = NeighbourEdges(depth_px[kept], around.inside[kept], around.outside[kept], good)
+    around = NeighbourEdges(
+        depth_px[kept], around.has_inner_neighbour[kept], around.has_outer_neighbour[kept], good
+    )
     offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
     weight = np.where(good, weight, 0.0)
-    weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT] = 0.0
-    found = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
+    weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT_SUM] = 0.0
+    found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = apply_homography(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(
         origin.shape
     )
@@ -381,9 +406,9 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         offset_px=far * scale_px[:, None],
         weight=weight,
         side_index=side,
-        side_distance=at,
-        scale_px=scale_px,
-        blur=blur_px / window_half_px,
+        centre_distance_half_sides=at,
+        px_per_half_side=scale_px,
+        blur_window_fraction=blur_px / window_half_px,
         white_grey=white,
     )
 
@@ -402,7 +427,7 @@ def _is_profile_in_view(
     if hidden is not None and seen.any():
         at = (
             origin[:, :, None]
-            + window_half_px[:, None, None, None] * _SEARCH_OFFSETS * normal[:, :, None]
+            + window_half_px[:, None, None, None] * _WINDOW_SAMPLE_OFFSETS * normal[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
         seen &= ~hidden[pixel[..., 1], pixel[..., 0]].any(axis=2)
@@ -410,7 +435,7 @@ def _is_profile_in_view(
 
 
 def _find_clean_profiles(
-    grey: Floats, free: NDArray[np.bool_], window_half_px: Array, half_px: Array
+    grey: Floats, is_unobstructed: NDArray[np.bool_], window_half_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return which profiles (rows, n) change from black to white, and the grey level of white
     paper."""
@@ -420,9 +445,9 @@ def _find_clean_profiles(
         grey[:, :, SAMPLES_PER_PROFILE // 2 - off],
         grey[:, :, SAMPLES_PER_PROFILE // 2 + off],
     )
-    black, white = (float(np.median(each[free])) for each in (dark, bright))
+    black, white = (float(np.median(each[is_unobstructed])) for each in (dark, bright))
     contrast = white - black
     if contrast < _MIN_PARTIAL_CONTRAST:
         return None
     good = (dark < black + _BLACK_MARGIN * contrast) & (bright > white - _WHITE_MARGIN * contrast)
-    return free & good, white
+    return is_unobstructed & good, white

@@ -19,12 +19,12 @@ from perchctl.vision.markers.corners import (
 )
 
 MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a blob
-MIN_CONTRAST = 10.0  # grey levels
-CELL_THRESHOLD_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
+MIN_CONTRAST_GREY = 10.0  # grey levels
+CELL_MARGIN_PER_CONTRAST = 0.1  # margin of a cell to the threshold, as a share of the contrast
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
-_CENTRAL_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
+_SMALL_MARKER_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
 _SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
 
 
@@ -32,18 +32,18 @@ _SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], 
 class BorderCells:
     """The cells next to a marker's border, along its four sides in the order of the corners.
 
-    white: (4, n), 1 for a white cell; the first and last ones belong to the border. white_behind:
-    (4, n), 1 if the cell behind it is white too. tolerance: print error of an edge's position, in
-    cells.
+    is_white: (4, n), 1 for a white cell; the first and last ones belong to the border.
+    white_behind: (4, n), 1 if the cell behind it is white too. tolerance: print error of an edge's
+    position, in cells.
     """
 
-    white: Array
-    white_behind: Array
-    tolerance: float = 0.0
+    is_white: Array
+    is_white_two_cells_deep: Array
+    print_tolerance_cells: float = 0.0
 
     @property
-    def cells(self) -> int:
-        return int(self.white.shape[1])
+    def cells_per_side(self) -> int:
+        return int(self.is_white.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,28 +51,28 @@ class Pattern:
     """The appearance of a marker.
 
     Attributes:
-        rim: cells inside the border.
+        border_cells: cells inside the border.
         drawing: all cells.
         sample_points: points (n, 2) at which cells are read, in the marker's coordinates (see
             `perchctl.vision.markers.corners`).
-        sample_cells: the cell (n,) of each sample point.
+        sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
         templates: expected grey (4, n) at the sample points with a blur of half a cell, zero-mean
             and of unit norm, for corners rolled by 0 to 3.
         is_white, is_inner: True for a white cell, for a cell within the border, (cells,).
     """
 
-    rim: BorderCells
+    border_cells: BorderCells
     drawing: Drawing
     sample_points: Array
-    sample_cells: NDArray[np.intp]
+    sample_cell_index: NDArray[np.intp]
     samples_per_cell: Array
     templates: Array
     is_white: NDArray[np.bool_]
     is_inner: NDArray[np.bool_]
 
 
-def make_border_cells(bits: NDArray[np.uint8], tolerance: float = 0.0) -> BorderCells:
+def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0) -> BorderCells:
     """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
     the border's edges."""
     n = len(bits)
@@ -87,19 +87,22 @@ def make_border_cells(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Border
 
     white = np.pad(ring(0), ((0, 0), (1, 1)))
     second = np.pad(ring(1), ((0, 0), (1, 1)))
-    return BorderCells(white, white * second, tolerance)
+    return BorderCells(white, white * second, print_tolerance_cells)
 
 
-def make_pattern(rim: BorderCells, drawing: Drawing) -> Pattern:
+def make_pattern(border_cells: BorderCells, drawing: Drawing) -> Pattern:
     """Return the pattern of a marker. It has sample points in all cells that no central marker
     hides."""
-    n = len(drawing.cells)
+    n = len(drawing.cell_whiteness)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
     sample_points = (centres[:, None] + _SAMPLE_OFFSETS * 2.0 / n).reshape(-1, 2)
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS))
-    free = np.abs(sample_points).max(axis=1) > _CENTRAL_COVER_HALF_SIDES * drawing.ratio
+    free = (
+        np.abs(sample_points).max(axis=1)
+        > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side
+    )
     kept = np.unique(owner[free])
     turns, at = [], sample_points[free]
     for _ in range(4):
@@ -109,13 +112,13 @@ def make_pattern(rim: BorderCells, drawing: Drawing) -> Pattern:
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
     own = np.searchsorted(kept, owner[free]).astype(np.intp)
     return Pattern(
-        rim=rim,
+        border_cells=border_cells,
         drawing=drawing,
         sample_points=np.ascontiguousarray(sample_points[free]),
-        sample_cells=own,
+        sample_cell_index=own,
         samples_per_cell=np.bincount(own).astype(np.float64),
         templates=np.stack(turns),
-        is_white=drawing.cells.ravel()[kept] > 0.5,
+        is_white=drawing.cell_whiteness.ravel()[kept] > 0.5,
         is_inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
 
@@ -130,9 +133,11 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), CELL_THRESHOLD_MARGIN * contrast
+    middle, margin = 0.5 * (high + low), CELL_MARGIN_PER_CONTRAST * contrast
     return bool(
-        contrast >= MIN_CONTRAST and white.min() > middle + margin and black.max() < middle - margin
+        contrast >= MIN_CONTRAST_GREY
+        and white.min() > middle + margin
+        and black.max() < middle - margin
     )
 
 
@@ -146,7 +151,7 @@ def has_mostly_matching_cells(
         return False
     high, low = np.median(means[pattern.is_white]), np.median(means[~pattern.is_white])
     right = (means > 0.5 * (high + low)) == pattern.is_white
-    return bool(high - low >= MIN_CONTRAST and right.mean() > MIN_MATCHING_CELL_FRACTION)
+    return bool(high - low >= MIN_CONTRAST_GREY and right.mean() > MIN_MATCHING_CELL_FRACTION)
 
 
 def is_correlated_with_pattern(
@@ -165,7 +170,7 @@ def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Patt
     grey -= grey.mean()
     spread = float(np.linalg.norm(grey))
     # If half of the samples are black and half are white, they differ by two standard deviations.
-    if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
+    if spread < 0.5 * MIN_CONTRAST_GREY * math.sqrt(len(grey)):
         return np.zeros(4)
     return np.asarray(pattern.templates @ grey / spread)
 
@@ -174,7 +179,9 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     grey = _read_samples(image, corners_px, pattern)
     if grey is None:
         return None
-    return np.asarray(np.bincount(pattern.sample_cells, weights=grey) / pattern.samples_per_cell)
+    return np.asarray(
+        np.bincount(pattern.sample_cell_index, weights=grey) / pattern.samples_per_cell
+    )
 
 
 def _read_samples(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
@@ -189,8 +196,8 @@ def _read_samples(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern)
 
 def _sample_blurred_drawing(drawing: Drawing, sample_points: Array) -> Array:
     """Return the whiteness of the drawing at the sample points, with a blur of half a cell."""
-    n, fine = len(drawing.cells), 8
-    sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
+    n, fine = len(drawing.cell_whiteness), 8
+    sharp = np.kron(np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine)))
     white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
     at = (((sample_points + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
     return np.asarray(white[at[:, 1], at[:, 0]])
@@ -199,100 +206,141 @@ def _sample_blurred_drawing(drawing: Drawing, sample_points: Array) -> Array:
 # --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_WHITE_MARGIN_CELLS = 0.6  # white around the border
+_COMPARED_WHITE_MARGIN_CELLS = 0.6  # white around the border
 BLUR_MARGIN_NODES = 12
 """Number of additional nodes on all sides, for the blur."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A marker's `cells` with its border, 1 = white, (n, n).
+    """A marker's `cell_whiteness` with its border, 1 = white, (n, n).
 
-    For the target's large marker, also the small marker's cells, `centre`, the `ratio` of the small
-    to the large side, and `sheet`, half the side of the paper in the marker's coordinates (None:
-    infinite).
+    For the target's large marker, also the small marker's cells, `small_cell_whiteness`, the
+    `small_to_large_side` of the small to the large side, and `paper_half_side`, half the side of
+    the paper in the marker's coordinates (None: infinite).
     """
 
-    cells: Array
-    centre: Array | None = None
-    ratio: float = 0.0
-    sheet: float | None = None
+    cell_whiteness: Array
+    small_cell_whiteness: Array | None = None
+    small_to_large_side: float = 0.0
+    paper_half_side: float | None = None
 
     @property
-    def reach(self) -> float:
+    def compared_half_side(self) -> float:
         """Half the side of the compared square, in the marker's own coordinates."""
-        return 1.0 + _WHITE_MARGIN_CELLS * 2.0 / len(self.cells)
+        return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
 def make_drawing(
-    bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
+    bits: NDArray[np.uint8],
+    small_marker_bits: NDArray[np.uint8] | None = None,
+    small_to_large_side: float = 0.0,
 ) -> Drawing:
-    """Return a marker's drawing from its inner bits, 1 = white; `centre` and `ratio` describe a
-    marker inside."""
+    """Return a marker's drawing from its inner bits, 1 = white; `small_marker_bits` and
+    `small_to_large_side` describe a marker inside."""
     cells = np.pad(bits.astype(np.float64), 1)
-    if centre is None:
+    if small_marker_bits is None:
         return Drawing(cells)
-    return Drawing(cells, np.pad(centre.astype(np.float64), 1), ratio, 1.0 + 2.0 / len(cells))
+    return Drawing(
+        cells,
+        np.pad(small_marker_bits.astype(np.float64), 1),
+        small_to_large_side,
+        1.0 + 2.0 / len(cells),
+    )
 
 
-def _cell_coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
+def _cell_coverage(
+    node_positions: Array, half_node_spacing: float, n_cells: int, square_half_side: float
+) -> Array:
     """Return the share of each cell in each node, (nodes, cells)."""
-    edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
-    low, high = axis[:, None] - half_node, axis[:, None] + half_node
+    edges = square_half_side * np.linspace(-1.0, 1.0, n_cells + 1)
+    low, high = (
+        node_positions[:, None] - half_node_spacing,
+        node_positions[:, None] + half_node_spacing,
+    )
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
-    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node))
+    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node_spacing))
 
 
-def _extend_axis(axis: Array, half_node: float) -> Array:
+def _add_margin_nodes(node_positions: Array, half_node_spacing: float) -> Array:
     """Return the axis with `BLUR_MARGIN_NODES` additional nodes at both ends."""
-    more = 2.0 * half_node * np.arange(1, BLUR_MARGIN_NODES + 1)
-    return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
+    more = 2.0 * half_node_spacing * np.arange(1, BLUR_MARGIN_NODES + 1)
+    return np.concatenate(
+        [node_positions[0] - more[::-1], node_positions, node_positions[-1] + more]
+    )
 
 
 @lru_cache(maxsize=64)
-def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
+def render_layers(drawing: Drawing, nodes_per_side: int) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing at n by n nodes.
 
     Returns the whiteness of the nodes, 0 to 1, and, if the paper around the marker ends inside the
     compared square, the share of each node that lies outside the paper.
     """
-    half_node = drawing.reach / n
-    axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
-    paper = render_cells(drawing, axis, half_node)
-    if drawing.sheet is None:
+    half_node_spacing = drawing.compared_half_side / nodes_per_side
+    node_positions: Array = half_node_spacing * (
+        2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
+    )
+    paper = render_cells(drawing, node_positions, half_node_spacing)
+    if drawing.paper_half_side is None:
         return (paper,)
-    on = _cell_coverage(_extend_axis(axis, half_node), half_node, 1, drawing.sheet)
+    on = _cell_coverage(
+        _add_margin_nodes(node_positions, half_node_spacing),
+        half_node_spacing,
+        1,
+        drawing.paper_half_side,
+    )
     return paper, (1.0 - on @ on.T).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
-def render_black_square(cells: int, n: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square with `cells` cells per side, at n by n nodes."""
-    return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
+def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
+    """Return the whiteness of a black square with `cells_per_side` cells per side, at n by n
+    nodes."""
+    return render_layers(Drawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side)[0]
 
 
-def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of the nodes at `axis` x `axis`, and of `BLUR_MARGIN_NODES` additional
-    nodes on all sides."""
-    wide = _extend_axis(axis, half_node)
-    C = _cell_coverage(wide, half_node, len(drawing.cells), 1.0)
-    black = C @ (1.0 - drawing.cells) @ C.T
-    if drawing.centre is not None:
-        C = _cell_coverage(wide, half_node, len(drawing.centre), drawing.ratio)
-        black += C @ (1.0 - drawing.centre) @ C.T
+def render_cells(
+    drawing: Drawing, node_positions: Array, half_node_spacing: float
+) -> NDArray[np.float32]:
+    """Return the whiteness of the nodes at `node_positions` x `node_positions`, and of
+    `BLUR_MARGIN_NODES` additional nodes on all sides."""
+    wide = _add_margin_nodes(node_positions, half_node_spacing)
+    C = _cell_coverage(wide, half_node_spacing, len(drawing.cell_whiteness), 1.0)
+    black = C @ (1.0 - drawing.cell_whiteness) @ C.T
+    if drawing.small_cell_whiteness is not None:
+        C = _cell_coverage(
+            wide, half_node_spacing, len(drawing.small_cell_whiteness), drawing.small_to_large_side
+        )
+        black += C @ (1.0 - drawing.small_cell_whiteness) @ C.T
     return (1.0 - black).astype(np.float32)
 
 
-def blurred_cell_coverage(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Return the share (n, cells) of each row of cells in each node, blurred by `sigma` nodes."""
-    wide = _cell_coverage(_extend_axis(axis, half_node), half_node, len(drawing.cells), 1.0)
-    soft = cv2.GaussianBlur(
-        wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
+def blurred_cell_coverage(
+    drawing: Drawing, node_positions: Array, half_node_spacing: float, blur_sigma_nodes: float
+) -> Array:
+    """Return the share (n, cells) of each row of cells in each node, blurred by `blur_sigma_nodes`
+    nodes."""
+    wide = _cell_coverage(
+        _add_margin_nodes(node_positions, half_node_spacing),
+        half_node_spacing,
+        len(drawing.cell_whiteness),
+        1.0,
     )
-    return np.asarray(soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(axis)], dtype=np.float64)
+    soft = cv2.GaussianBlur(
+        wide.astype(np.float32),
+        (1, 0),
+        sigmaX=1e-3,
+        sigmaY=blur_sigma_nodes,
+        borderType=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(
+        soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(node_positions)], dtype=np.float64
+    )
 
 
-def blur_nodes(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Return the nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
-    soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+def blur_nodes(sharp: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
+    """Return the nodes, with the margin around them, after a Gaussian blur of `blur_sigma_nodes`
+    nodes."""
+    soft = cv2.GaussianBlur(sharp, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

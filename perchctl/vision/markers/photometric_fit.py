@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.values import cached_property
-from perchctl.vision.lens import distort, undistort_px
+from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
     UNIT_SQUARE,
     apply_homography,
     homography_from_unit_square,
-    homography_jacobian,
     increment_homography,
+    projected_corners_jacobian,
 )
 from perchctl.vision.markers.pattern import (
     BLUR_MARGIN_NODES,
@@ -45,7 +45,7 @@ from perchctl.vision.markers.pattern import (
     blur_nodes,
     blurred_cell_coverage,
     render_black_square,
-    render_sheets,
+    render_layers,
 )
 from perchctl.vision.types import CameraModel
 
@@ -57,21 +57,23 @@ _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 `_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two rounds."""
 _CONVERGED_STEP_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
 _MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
-_MAX_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
+_MAX_HOMOGRAPHY_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
 # Standard deviations of the shape from its start, in half sides: rotations and scales; the
 # perspective.
 _SHAPE_SIGMA, _PERSPECTIVE_SIGMA = 0.2, 0.03
-_TONE_CURVE_SIGMA = 0.5  # of the tone curve, in units of the gain
+_TONE_CURVE_PRIOR_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_MAX_BLUR_STEP = 0.5  # per round, as a share of the blur's square; a node's square at least
+_MAX_BLUR_VARIANCE_STEP_FRACTION = (
+    0.5  # per round, as a share of the blur's square; a node's square at least
+)
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
 """Changes of the blur below both limits do not render the drawing again: as a share, and in
 cells."""
-_MIN_GAIN = 10.0  # grey levels from black to white
+_MIN_GAIN_GREY = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 # indices of the unknowns: increment, blur, light
 _SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
-_SHAPE_INFORMATION: Array = (
+_INCREMENT_PRIOR_INFORMATION: Array = (
     np.array(
         [
             _SHAPE_SIGMA,
@@ -97,11 +99,12 @@ class Alignment:
         fit_correlation: correlation of the picture with the drawing.
         pattern_correlation, pattern_contrast: correlation and contrast of the inner bits, beyond a
             black square of the same size; the contrast is relative to the border's.
-        cell_deviation: largest mean deviation of a cell, in units of the gain.
-        wrong_bit_degree, wrong_bit_sigma: how far the worst-fitting cell has the opposite colour, 0
-            (as drawn) to 1 (wrong bit), and the standard deviation of the least certain cell.
+        cell_deviation_per_contrast: largest mean deviation of a cell, in units of the gain.
+        bit_flip_fraction, bit_flip_fraction_sigma: how far the worst-fitting cell has the opposite
+            colour, 0 (as drawn) to 1 (wrong bit), and the standard deviation of the least certain
+            cell.
         blur_px: standard deviation of the blur.
-        motion_px: largest distance of a corner from its start.
+        motion_from_start_px: largest distance of a corner from its start.
     """
 
     corners_px: Array
@@ -109,11 +112,11 @@ class Alignment:
     fit_correlation: float
     pattern_correlation: float
     pattern_contrast: float
-    cell_deviation: float
-    wrong_bit_degree: float
-    wrong_bit_sigma: float
+    cell_deviation_per_contrast: float
+    bit_flip_fraction: float
+    bit_flip_fraction_sigma: float
     blur_px: float
-    motion_px: float
+    motion_from_start_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +126,9 @@ class _Equations:
     of the next increment, per unit of noise."""
 
     gain: float
-    error: Array
+    grey_residual: Array
     J: Array
-    noise: float
+    noise_variance_grey2: float
     N: Array
     g: Array
 
@@ -145,142 +148,160 @@ def align_drawing(
     if not np.isfinite(start).all():
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
-    side_px, reach = float(sides.mean()), drawing.reach
+    side_px, reach = float(sides.mean()), drawing.compared_half_side
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
     n = int(
         np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
     )
-    node_px, cell_px = reach * side_px / n, side_px / len(drawing.cells)
+    node_px, cell_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
     grid, H = make_grid(n, reach), homography_from_unit_square(start)
-    lens_px = lens_shift_px(grid, H, camera)
-    patch = _extract_patch(image, grid, H, lens_px)
+    node_shift_px = lens_shift_px(grid, H, camera)
+    patch = _extract_patch(image, grid, H, node_shift_px)
     if patch is None:
         return None
     around, first = patch
 
     def drawn(blur_px: float) -> RenderedDrawing:
-        return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_STEP))
+        return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_TABLE_STEP))
 
     def limit_blur_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
 
     seen = drawn(limit_blur_px(blur_px))
-    offset_px, since_lens_px, total = lens_px - first, 0.0, np.zeros(8)
+    offset_px, since_lens_px, increment_from_start = node_shift_px - first, 0.0, np.zeros(8)
     for k in range(_MAX_ITERATIONS):
         if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
             offset_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
         grey = _sample_patch(around, grid, H, offset_px)
-        equations = _linearize_greys(grey, seen, total)
+        equations = _linearize_greys(grey, seen, increment_from_start)
         if equations is None:
             return None
         if (
             k == _EARLY_CHECK_ITERATIONS
-            and fit_correlation(grey, equations.error) < _MIN_EARLY_CORRELATION
+            and fit_correlation(grey, equations.grey_residual) < _MIN_EARLY_CORRELATION
         ):
             return None
         step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
         p = step[_SHAPE_SLICE]
-        if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
+        if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT):
             return None
-        H, total = increment_homography(H, p), total + p
+        H, increment_from_start = increment_homography(H, p), increment_from_start + p
         motion_px = 0.5 * side_px * float(np.abs(p[:6]).max())
         since_lens_px += motion_px
-        sigma2 = seen.sigma**2
-        most = max(1.0, _MAX_BLUR_STEP * sigma2)
+        sigma2 = seen.blur_sigma_nodes**2
+        most = max(1.0, _MAX_BLUR_VARIANCE_STEP_FRACTION * sigma2)
         squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
         wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
-        drawn_px = seen.sigma * node_px
+        drawn_px = seen.blur_sigma_nodes * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
             seen = drawn(wanted_px)
         elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_LENS_REUSE_MOTION_PX:
             break
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
-    gain, error = equations.gain, equations.error
+    gain, grey_residual = equations.gain, equations.grey_residual
     corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
-    pattern_correlation, pattern_contrast = _measure_inner_pattern(seen, grey, gain)
-    redundancy = _count_redundant_nodes(error.reshape(n, n))
-    inverse = np.asarray(np.linalg.inv(equations.N))
-    wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, redundancy)
-    J = homography_jacobian(H)
-    variance = float(np.trace(J @ (inverse[_SHAPE_SLICE, _SHAPE_SLICE] * redundancy) @ J.T)) / 8.0
+    pattern_correlation, pattern_contrast = _measure_inner_pattern_match(seen, grey, gain)
+    correlated_nodes = _estimate_correlated_nodes(grey_residual.reshape(n, n))
+    inverse_normal_matrix = np.asarray(np.linalg.inv(equations.N))
+    bit_flip_fraction, bit_flip_fraction_sigma = _measure_bit_flip_fraction(
+        seen, equations, inverse_normal_matrix, correlated_nodes
+    )
+    J = projected_corners_jacobian(H)
+    variance = (
+        float(
+            np.trace(
+                J @ (inverse_normal_matrix[_SHAPE_SLICE, _SHAPE_SLICE] * correlated_nodes) @ J.T
+            )
+        )
+        / 8.0
+    )
     return Alignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
-        fit_correlation=fit_correlation(grey, error),
+        fit_correlation=fit_correlation(grey, grey_residual),
         pattern_correlation=pattern_correlation,
         pattern_contrast=pattern_contrast,
-        cell_deviation=_cell_deviation(error / gain, grid, len(drawing.cells)),
-        wrong_bit_degree=wrong_bit_degree,
-        wrong_bit_sigma=wrong_bit_sigma,
-        blur_px=seen.sigma * node_px,
-        motion_px=float(np.abs(corners_px - start_px).max()),
+        cell_deviation_per_contrast=_cell_deviation(
+            grey_residual / gain, grid, len(drawing.cell_whiteness)
+        ),
+        bit_flip_fraction=bit_flip_fraction,
+        bit_flip_fraction_sigma=bit_flip_fraction_sigma,
+        blur_px=seen.blur_sigma_nodes * node_px,
+        motion_from_start_px=float(np.abs(corners_px - start_px).max()),
     )
 
 
-def _linearize_greys(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
-    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
-    the increments so far."""
+def _linearize_greys(
+    grey: Array, seen: RenderedDrawing, increment_from_start: Array
+) -> _Equations | None:
+    """Return the equations of the next increment; None without contrast. `increment_from_start`
+    (8,) is the sum of the increments so far."""
     rows, products = seen.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
-    light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
-    gain = float(light[GAIN])
-    if gain < _MIN_GAIN:
+    illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
+    gain = float(illumination[GAIN])
+    if gain < _MIN_GAIN_GREY:
         return None
-    error = grey - np.einsum("kn,k->n", rows, light)
-    J = np.concatenate([_illuminated_jacobian(seen, light), rows, error[None]])
-    noise = max(float((error**2).mean()), 1.0)
+    grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
+    J = np.concatenate([_illuminated_jacobian(seen, illumination), rows, grey_residual[None]])
+    noise = max(float((grey_residual**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT_INDEX + BEND
     N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # about a node's width per round
-    N[bend, bend] += (_TONE_CURVE_SIGMA * gain) ** -2.0
-    g[bend] -= light[BEND] * (_TONE_CURVE_SIGMA * gain) ** -2.0
+    N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * gain) ** -2.0
+    g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * gain) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
-    N[range(8), range(8)] += _SHAPE_INFORMATION
-    g[_SHAPE_SLICE] -= _SHAPE_INFORMATION * total
-    return _Equations(gain, error, J, noise, N, g)
+    N[range(8), range(8)] += _INCREMENT_PRIOR_INFORMATION
+    g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * increment_from_start
+    return _Equations(gain, grey_residual, J, noise, N, g)
 
 
 # --- How well the picture matches a fitted drawing ---
 
 
-def fit_correlation(grey: Array, error: Array) -> float:
-    """Return the correlation of grey values (k,) with their fit, whose residual is `error` (k,)."""
+def fit_correlation(grey: Array, grey_residual: Array) -> float:
+    """Return the correlation of grey values (k,) with their fit, whose residual is `grey_residual`
+    (k,)."""
     spread = grey - grey.mean()
-    explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
+    explained = 1.0 - float((grey_residual**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
 
 
-def _measure_wrong_bits(
-    seen: RenderedDrawing, equations: _Equations, inverse: Array, redundancy: float
+def _measure_bit_flip_fraction(
+    seen: RenderedDrawing,
+    equations: _Equations,
+    inverse_normal_matrix: Array,
+    correlated_nodes: float,
 ) -> tuple[float, float]:
     """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped one. `inverse` is the inverse of the normal matrix N of `equations`, and
-    `redundancy` the number of neighbouring nodes that share the same information.
+    1 for a flipped one. `inverse_normal_matrix` is the inverse of the normal matrix N of
+    `equations`, and `correlated_nodes` the number of neighbouring nodes that share the same
+    information.
     """
-    soft, noise, gain = seen.blurred_cell_coverage, equations.noise, equations.gain
+    soft, noise, gain = seen.blurred_cell_coverage, equations.noise_variance_grey2, equations.gain
     n, m = soft.shape
-    found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
+    found = gain * (soft.T @ equations.grey_residual.reshape(n, n) @ soft).ravel()
     shared = gain * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
     squared = (soft**2).sum(axis=0)
     energy = gain**2 * np.outer(squared, squared).ravel()
-    taken = np.einsum("ij,ij->j", shared, (inverse / noise).dot(shared))
+    taken = np.einsum("ij,ij->j", shared, (inverse_normal_matrix / noise).dot(shared))
     own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
-    flips = np.where(seen.drawing.cells.ravel() > 0.5, -1.0, 1.0) * found / own
-    return float(flips.max()), math.sqrt(redundancy * noise / float(own.min()))
+    flips = np.where(seen.drawing.cell_whiteness.ravel() > 0.5, -1.0, 1.0) * found / own
+    return float(flips.max()), math.sqrt(correlated_nodes * noise / float(own.min()))
 
 
-def _measure_inner_pattern(
+def _measure_inner_pattern_match(
     drawing: RenderedDrawing, grey: Array, gain: float
 ) -> tuple[float, float]:
     """Return the correlation and the contrast of the inner pattern in `grey` (n * n,)."""
-    rows, products = drawing.square_illumination_basis
+    rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.illumination_basis[0][GAIN], grey
     b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
@@ -293,19 +314,22 @@ def _measure_inner_pattern(
     return product / scale, product / max(energy, 1e-9) / gain
 
 
-def _count_redundant_nodes(error: Array) -> float:
+def _estimate_correlated_nodes(grey_residual: Array) -> float:
     """Return the number of neighbouring nodes with the same information."""
-    energy = max(float((error * error).mean()), 1e-9)
+    energy = max(float((grey_residual * grey_residual).mean()), 1e-9)
     factor = 1.0
-    for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
+    for a, b in (
+        (grey_residual[1:], grey_residual[:-1]),
+        (grey_residual[:, 1:], grey_residual[:, :-1]),
+    ):
         r = min(max(float((a * b).mean()) / energy, 0.0), 0.9)
         factor *= (1.0 + r) / (1.0 - r)
     return factor
 
 
-def _cell_deviation(error: Array, grid: Grid, n_cells: int) -> float:
+def _cell_deviation(relative_residual: Array, grid: Grid, n_cells: int) -> float:
     index, count = _assign_nodes_to_cells(grid, n_cells)
-    total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
+    total = np.bincount(index, weights=relative_residual, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
 
 
@@ -325,15 +349,15 @@ def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], 
 # edges.
 
 
-def _illuminated_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
+def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
     """Return the derivatives (9, n * n) of grey by the increment and the blur's square."""
-    gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
-    (white, changes), *others = drawing.sheets
-    bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
-    slope = gain + light[GAIN_U] * u + light[GAIN_V] * v
+    gain, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
+    (white, changes), *others = drawing.blurred_layers
+    bend = min(max(float(illumination[BEND]) / gain, -0.9), 0.9)
+    slope = gain + illumination[GAIN_U] * u + illumination[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
-    for (_, more), height in zip(others, light[BEYOND:], strict=True):
+    for (_, more), height in zip(others, illumination[BEYOND:], strict=True):
         change += more * height
     return change
 
@@ -346,24 +370,24 @@ _CHEBYSHEV_NODES = 9  # per side
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, at `axis` (n,) in both directions; `uv1` (3, n * n) is (u, v, 1) of each
-    node."""
+    """n by n nodes, at `node_positions` (n,) in both directions; `uv1` (3, n * n) is (u, v, 1) of
+    each node."""
 
-    n: int
-    axis: Array
+    nodes_per_side: int
+    node_positions: Array
     uv1: Array
 
 
 @lru_cache(maxsize=64)
-def make_grid(n: int, reach: float) -> Grid:
+def make_grid(nodes_per_side: int, half_side: float) -> Grid:
     """Return the nodes in the middle of n by n parts of a square from -reach to reach."""
-    axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
-    return Grid(n, axis, _grid_coordinates(axis))
+    node_positions = half_side * ((2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0)
+    return Grid(nodes_per_side, node_positions, _grid_coordinates(node_positions))
 
 
-def _grid_coordinates(axis: Array) -> Array:
+def _grid_coordinates(node_positions: Array) -> Array:
     """Return u, v and 1 at the crossings of the grid's lines, (3, n * n)."""
-    u, v = np.meshgrid(axis, axis)
+    u, v = np.meshgrid(node_positions, node_positions)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
@@ -373,13 +397,13 @@ def project_nodes(H: Array, uv1: Array) -> Array:
     return np.asarray(q[:2] / q[2])
 
 
-def distort_px(pin_px: Array, camera: CameraModel) -> Array:
+def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
     """Convert pinhole pixels (2, n) to pixels of the lens."""
     K = camera.K
-    rays = np.empty((pin_px.shape[1], 2))
-    rays[:, 1] = (pin_px[1] - K[1, 2]) / K[1, 1]
-    rays[:, 0] = (pin_px[0] - K[0, 2] - K[0, 1] * rays[:, 1]) / K[0, 0]
-    return distort(rays, camera).T
+    rays = np.empty((pinhole_px.shape[1], 2))
+    rays[:, 1] = (pinhole_px[1] - K[1, 2]) / K[1, 1]
+    rays[:, 0] = (pinhole_px[0] - K[0, 2] - K[0, 1] * rays[:, 1]) / K[0, 0]
+    return distort_to_px(rays, camera).T
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
@@ -394,19 +418,21 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
     """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES^2), and the weights (n,
     _CHEBYSHEV_NODES) for the grid's own nodes."""
-    reach = float(grid.axis[-1])
+    reach = float(grid.node_positions[-1])
     x = chebyshev.chebpts2(_CHEBYSHEV_NODES)
     degree = _CHEBYSHEV_NODES - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
-    return _grid_coordinates(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
+    return _grid_coordinates(reach * x), chebyshev.chebvander(
+        grid.node_positions / reach, degree
+    ) @ through
 
 
 def _extract_patch(
-    image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
+    image: NDArray[np.uint8], grid: Grid, H: Array, node_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the required part of the picture, and its first pixel (2, 1)."""
     h, w = image.shape
-    x, y = project_nodes(H, grid.uv1) + lens_px
+    x, y = project_nodes(H, grid.uv1) + node_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
@@ -420,7 +446,7 @@ def _extract_patch(
 def _sample_patch(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
     """Return the grey values (n * n,) at the nodes of a patch, shifted by the lens (2, n * n)."""
     at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
-    x, y = at.reshape(2, grid.n, grid.n)
+    x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
 
@@ -445,41 +471,48 @@ def gram_matrix(rows: Array) -> Array:
 # --- A marker's drawing at the nodes of a grid, blurred ---
 
 
-_LOG_BLUR_STEP = 0.02  # relative step of the blur
+_LOG_BLUR_TABLE_STEP = 0.02  # relative step of the blur
 # Rows of the light: offset and its slopes, gain and its slopes, bend, grey beyond the sheet.
 OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A marker's drawing, rendered at the nodes of a grid with a Gaussian blur of `sigma` nodes."""
+    """A marker's drawing, rendered at the nodes of a grid with a Gaussian blur of
+    `blur_sigma_nodes` nodes."""
 
     drawing: Drawing
     grid: Grid
-    sigma: float
+    blur_sigma_nodes: float
 
     @cached_property
-    def sheets(self) -> tuple[tuple[Array, Array], ...]:
+    def blurred_layers(self) -> tuple[tuple[Array, Array], ...]:
         """Each sheet at the nodes (n * n,), and its derivatives (9, n * n) by the eight terms of a
         homography's increment and by the blur's square."""
-        sharp = render_sheets(self.drawing, self.grid.n)
-        return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
+        sharp = render_layers(self.drawing, self.grid.nodes_per_side)
+        return tuple(
+            _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions)
+            for each in sharp
+        )
 
     @cached_property
     def illumination_basis(self) -> tuple[Array, Array]:
         """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), the eighth if
         the sheet ends, and their Gram matrix."""
         u, v, one = self.grid.uv1
-        (white, _), *others = self.sheets
+        (white, _), *others = self.blurred_layers
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
         return stacked, gram_matrix(stacked)
 
     @cached_property
-    def square_illumination_basis(self) -> tuple[Array, Array]:
+    def black_square_illumination_basis(self) -> tuple[Array, Array]:
         """Basis of a black square's grey values under any light except slopes of the gain and bend:
         rows (4 or 5, n * n), and their Gram matrix."""
-        soft = blur_nodes(render_black_square(len(self.drawing.cells), self.grid.n), self.sigma)
+        soft = blur_nodes(
+            render_black_square(len(self.drawing.cell_whiteness), self.grid.nodes_per_side),
+            self.blur_sigma_nodes,
+        )
         black = soft[
             BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES, BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES
         ].reshape(1, -1)
@@ -490,30 +523,36 @@ class RenderedDrawing:
     @cached_property
     def blurred_cell_coverage(self) -> Array:
         """Share of each row (or column) of cells in each node, (n, cells)."""
-        half_node = self.drawing.reach / self.grid.n
-        return blurred_cell_coverage(self.drawing, self.grid.axis, half_node, self.sigma)
+        half_node = self.drawing.compared_half_side / self.grid.nodes_per_side
+        return blurred_cell_coverage(
+            self.drawing, self.grid.node_positions, half_node, self.blur_sigma_nodes
+        )
 
 
 @lru_cache(maxsize=16)
-def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_LOG_BLUR_STEP * step)``
-    nodes."""
-    return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_LOG_BLUR_STEP * step))
+def render_blurred(drawing: Drawing, nodes_per_side: int, blur_table_index: int) -> RenderedDrawing:
+    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_LOG_BLUR_TABLE_STEP *
+    step)`` nodes."""
+    return RenderedDrawing(
+        drawing,
+        make_grid(nodes_per_side, drawing.compared_half_side),
+        math.exp(_LOG_BLUR_TABLE_STEP * blur_table_index),
+    )
 
 
-def _blurred_with_slope(
-    sharp: NDArray[np.float32], sigma: float, axis: Array
+def _blur_with_jacobian(
+    sharp: NDArray[np.float32], blur_sigma_nodes: float, node_positions: Array
 ) -> tuple[Array, Array]:
-    soft = blur_nodes(sharp, sigma)
-    step = float(axis[1] - axis[0])
-    e, n = BLUR_MARGIN_NODES, len(axis)
+    soft = blur_nodes(sharp, blur_sigma_nodes)
+    step = float(node_positions[1] - node_positions[0])
+    e, n = BLUR_MARGIN_NODES, len(node_positions)
     middle = slice(e, e + n)
     left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
     up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]
     value = soft[middle, middle]
     du, dv = np.float32(0.5 / step) * (right - left), np.float32(0.5 / step) * (down - up)
     laplace = left + right + up + down - 4.0 * value
-    u, v = axis.astype(np.float32), axis.astype(np.float32)[:, None]
+    u, v = node_positions.astype(np.float32), node_positions.astype(np.float32)[:, None]
     along = u * du + v * dv
     changes = np.empty((9, n, n))
     for part, one, other in (

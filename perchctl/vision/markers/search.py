@@ -22,11 +22,11 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import is_inside_picture, mean_side_px, scale_square
 from perchctl.vision.markers.detector import (
-    MIRROR_INDEX,
-    OPENCV_THRESHOLDS,
-    QUICK_THRESHOLDS,
+    MIRRORED_MARKER_ID,
+    OPENCV_THRESHOLD_WINDOWS_PX,
+    QUICK_THRESHOLD_WINDOWS_PX,
     Picture,
-    Thresholds,
+    ThresholdWindowRange,
     make_aruco_detector,
 )
 from perchctl.vision.target_selection import OwnTargetOffset
@@ -36,14 +36,14 @@ SearchMode = Literal["near", "window", "fits", "sharp", "blurred", "all"]
 """Kinds of search: near the expected position by a search ("window"), by fits to a blurred target
 ("fits"), or by both ("near"); in the whole picture for a "sharp" or a "blurred" target; or
 "all"."""
-_WINDOW_MARGIN = 0.25  # share of the target's size in the picture, on each side
+_WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
 _MAX_WINDOW_FRACTION = 0.8  # share of the picture
 _MIN_HALVED_SIDE_PX = 60.0
 """Side above which markers are found in a picture of half the size, in a quarter of the time,
 px."""
-_CENTRE_TOLERANCE = 0.35  # share of the small marker's side
+_CENTRE_TOLERANCE_SIDES = 0.35  # share of the small marker's side
 
 
 Window = tuple[slice, slice]
@@ -62,65 +62,92 @@ class FoundMarkers:
 
 def search(
     picture: Picture,
-    expected: Mapping[MarkerName, Array],
+    expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
-    own: OwnTargetOffset | None = None,
+    own_target_offset_m: OwnTargetOffset | None = None,
 ) -> FoundMarkers:
     """Search the window around the expected markers, then the whole picture if the window shows too
     little.
 
     With `search_mode` "near" or "window", only the window is searched; with "sharp", only the whole
-    picture. `own` selects one of several targets if none is expected.
+    picture. `own_target_offset_m` selects one of several targets if none is expected.
     """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
-    if setup.fits_lines and expected and search_mode != "sharp":
-        quickly = search_half_size(picture, expected, own)
+    if setup.is_line_fit_enabled and expected_corners_px and search_mode != "sharp":
+        quickly = search_half_size(picture, expected_corners_px, own_target_offset_m)
         if quickly is not None:
             return quickly
-        window = search_window(expected, setup.ratio, shape) or whole
+        window = make_search_window(expected_corners_px, setup.small_to_large_side, shape) or whole
         found = FoundMarkers()
-        if len(expected) == 2:
-            found = _search_once(picture, window, expected, QUICK_THRESHOLDS, own)
+        if len(expected_corners_px) == 2:
+            found = _search_once(
+                picture,
+                window,
+                expected_corners_px,
+                QUICK_THRESHOLD_WINDOWS_PX,
+                own_target_offset_m,
+            )
         if len(found.corners_px) < 2 and window != whole:
-            found = _search_once(picture, window, expected, OPENCV_THRESHOLDS, own)
+            found = _search_once(
+                picture,
+                window,
+                expected_corners_px,
+                OPENCV_THRESHOLD_WINDOWS_PX,
+                own_target_offset_m,
+            )
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             search_mode in ("near", "window") and window != whole
         ):
             return found
-    return _search_once(picture, whole, expected, OPENCV_THRESHOLDS, own)
+    return _search_once(
+        picture, whole, expected_corners_px, OPENCV_THRESHOLD_WINDOWS_PX, own_target_offset_m
+    )
 
 
 def search_half_size(
-    picture: Picture, expected: Mapping[MarkerName, Array], own: OwnTargetOffset | None = None
+    picture: Picture,
+    expected_corners_px: Mapping[MarkerName, Array],
+    own_target_offset_m: OwnTargetOffset | None = None,
 ) -> FoundMarkers | None:
     """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
     shape = picture.image.shape
-    in_view = [quad for quad in expected.values() if is_inside_picture(quad, shape)]
-    if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _MIN_HALVED_SIDE_PX:
+    in_view = [quad for quad in expected_corners_px.values() if is_inside_picture(quad, shape)]
+    if (
+        len(expected_corners_px) < 2
+        or not in_view
+        or min(map(mean_side_px, in_view)) <= _MIN_HALVED_SIDE_PX
+    ):
         return None
-    window = search_window(expected, picture.setup.ratio, shape)
+    window = make_search_window(expected_corners_px, picture.setup.small_to_large_side, shape)
     window = window or (slice(0, shape[0]), slice(0, shape[1]))
-    found = _search_once(picture, window, expected, QUICK_THRESHOLDS, own, halved=True)
+    found = _search_once(
+        picture,
+        window,
+        expected_corners_px,
+        QUICK_THRESHOLD_WINDOWS_PX,
+        own_target_offset_m,
+        halved=True,
+    )
     return found if len(found.corners_px) >= len(in_view) else None
 
 
-def search_window(
-    expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
+def make_search_window(
+    expected_corners_px: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
     """Return the part of the picture to search; None if a window would save little time. The window
     contains the whole large marker if that may be in the picture."""
     h, w = shape[:2]
-    if "large" in expected:
-        corners = expected["large"]
+    if "large" in expected_corners_px:
+        corners = expected_corners_px["large"]
     else:
-        small = expected["small"]
+        small = expected_corners_px["small"]
         centre = small.mean(axis=0)
         whole = centre + (small - centre) / ratio
         inside = (whole >= 0).all() and (whole < (w, h)).all()
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = np.maximum(_WINDOW_MARGIN * (high - low).max(), _WINDOW_MARGIN_PX)
+    margin = np.maximum(_WINDOW_MARGIN_FRACTION * (high - low).max(), _WINDOW_MARGIN_PX)
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
     width, height = int(right - left), int(bottom - top)
@@ -132,15 +159,15 @@ def search_window(
 def _search_once(
     picture: Picture,
     window: Window,
-    expected: Mapping[MarkerName, Array],
-    thresholds: Thresholds,
-    own: OwnTargetOffset | None,
+    expected_corners_px: Mapping[MarkerName, Array],
+    threshold_windows_px: ThresholdWindowRange,
+    own_target_offset_m: OwnTargetOffset | None,
     halved: bool = False,
 ) -> FoundMarkers:
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), thresholds)
+    detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), threshold_windows_px)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
         return FoundMarkers()
@@ -149,54 +176,56 @@ def _search_once(
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
     mirrored = False
     for quad, index, dictionary in zip(corners, ids.ravel(), which.ravel(), strict=True):
-        if index == MIRROR_INDEX:
+        if index == MIRRORED_MARKER_ID:
             mirrored = True
             continue
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
         # The centre of a pixel at half size is between two pixels.
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
-    targets = len(_pair_markers(candidates, setup.ratio))
-    chosen = choose_markers(candidates, expected, setup.ratio, own)
+    targets = len(_pair_markers(candidates, setup.small_to_large_side))
+    chosen = choose_markers(
+        candidates, expected_corners_px, setup.small_to_large_side, own_target_offset_m
+    )
     return FoundMarkers(chosen, mirrored, targets)
 
 
 def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
-    expected: Mapping[MarkerName, Array],
+    expected_corners_px: Mapping[MarkerName, Array],
     ratio: float,
-    own: OwnTargetOffset | None = None,
+    own_target_offset_m: OwnTargetOffset | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
     A small marker in the centre of a large one, with the right size and rotation, verifies both.
     Markers at expected positions take precedence over a pair elsewhere; among single markers, the
-    closest by `own` is chosen.
+    closest by `own_target_offset_m` is chosen.
     """
-    if own is not None and not expected:
-        candidates = _sort_by_distance(candidates, own)
+    if own_target_offset_m is not None and not expected_corners_px:
+        candidates = _sort_by_distance(candidates, own_target_offset_m)
     large, small = candidates["large"], candidates["small"]
     wholes = _pair_markers(candidates, ratio)
-    near_large = _nearest_candidate("large", large, expected, ratio)
-    near_small = _nearest_candidate("small", small, expected, ratio)
+    near_large = _nearest_candidate("large", large, expected_corners_px, ratio)
+    near_small = _nearest_candidate("small", small, expected_corners_px, ratio)
     if wholes:
         _, i, j = wholes[0]
-        if expected:
-            centre = next(iter(expected.values())).mean(axis=0)
+        if expected_corners_px:
+            centre = next(iter(expected_corners_px.values())).mean(axis=0)
             distances_px = [
                 float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes
             ]
             _, i, j = wholes[int(np.argmin(distances_px))]
-        elif own is not None:
+        elif own_target_offset_m is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
-        elsewhere = _nearest_candidate("large", [large[i]], expected, ratio) is None
+        elsewhere = _nearest_candidate("large", [large[i]], expected_corners_px, ratio) is None
         if not (elsewhere and (near_large is not None or near_small is not None)):
             return {"large": large[i], "small": small[j]}
     if near_large is not None:
         return {"large": near_large}
     if near_small is not None:
         return {"small": near_small}
-    if own is not None and not expected:
+    if own_target_offset_m is not None and not expected_corners_px:
         large, small = large[:1], small[:1]
     # A small marker next to a complete large one does not belong to the target.
     if len(large) == 1:
@@ -207,7 +236,7 @@ def choose_markers(
 
 
 def _sort_by_distance(
-    candidates: Mapping[MarkerName, list[Array]], own: OwnTargetOffset
+    candidates: Mapping[MarkerName, list[Array]], own_target_offset_m: OwnTargetOffset
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates sorted by their distance, without those that are too far away.
 
@@ -217,7 +246,7 @@ def _sort_by_distance(
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
     for name, quads in candidates.items():
-        distances_m = [own(name, quad) for quad in quads]
+        distances_m = [own_target_offset_m(name, quad) for quad in quads]
         order = np.argsort(distances_m, kind="stable").tolist()
         kept[name] = [quads[k] for k in order if math.isfinite(distances_m[k])]
     return kept if any(kept.values()) else candidates
@@ -243,19 +272,22 @@ def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
     tolerance."""
     mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
-    allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
+    allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
     return float(np.linalg.norm(mapped - small_px, axis=1).max()) / allowed_px
 
 
 def _nearest_candidate(
-    name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
+    name: MarkerName,
+    quads: list[Array],
+    expected_corners_px: Mapping[MarkerName, Array],
+    ratio: float,
 ) -> Array | None:
-    if not expected or not quads:
+    if not expected_corners_px or not quads:
         return None
-    if name in expected:
-        guess = expected[name]
+    if name in expected_corners_px:
+        guess = expected_corners_px[name]
     else:
-        other = next(iter(expected.values()))
+        other = next(iter(expected_corners_px.values()))
         centre = other.mean(axis=0)
         guess = centre + (ratio if name == "small" else 1.0 / ratio) * (other - centre)
     side_px = max(mean_side_px(guess), 1e-6)

@@ -21,7 +21,7 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.lens import distort, undistort, undistort_px
+from perchctl.vision.lens import distort_to_px, undistort_px, undistort_to_normalised
 from perchctl.vision.markers.corners import is_inside_picture
 from perchctl.vision.markers.cut import (
     MAX_CUT_FIT_AGE_S,
@@ -166,7 +166,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
     found = fit_pose(image, _pose("line"), outline, plain)
-    assert found.points_shown == found.points_in_view
+    assert found.points_found == found.points_in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert fit_cut_markers(Picture(image, None, SETUP, plain), expected) == {}
     assert nothing(search_mode("width", waved(picture("width")))), "nor do edges that fit badly"
@@ -198,7 +198,7 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
     fit = fit_pose(image, _pose("height"), outline, CAMERA, own)
-    assert fit.points_shown == fit.points_in_view
+    assert fit.points_found == fit.points_in_view
     found = fit_cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
@@ -228,10 +228,10 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     """Of the large marker alone in view, and its far corners where the lens model has no
     inverse."""
     image, outline = picture("corner"), make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
-    x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
+    x = undistort_to_normalised(distort_to_px(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fit_pose(image, _pose("corner"), outline, CAMERA)
-    assert found.small_points == 0
+    assert found.small_marker_points == 0
     assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
 

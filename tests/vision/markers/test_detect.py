@@ -55,7 +55,10 @@ def test_a_decoy_of_either_marker_is_dropped() -> None:
     paste(image, "DICT_ARUCO_ORIGINAL", 5, (450, 300), 60)
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
-    assert nesting_error(found.large.corners_px, found.small.corners_px, SETUP.ratio) < 0.5
+    assert (
+        nesting_error(found.large.corners_px, found.small.corners_px, SETUP.small_to_large_side)
+        < 0.5
+    )
 
 
 def test_one_wrong_cell_of_the_small_marker_is_corrected_and_no_more() -> None:

@@ -15,7 +15,7 @@ from perchctl.vision.markers.corners import (
     SUBPIX_CORNER_SIGMA_PX,
     refine_subpix,
 )
-from perchctl.vision.markers.edge_fit import refine_lines
+from perchctl.vision.markers.edge_fit import refine_corners_by_lines
 from perchctl.vision.markers.pattern import has_matching_cells, make_border_cells
 from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
@@ -52,7 +52,7 @@ def errors(noise: float, blur_px: float, cells: int, side_m: float) -> Array:
         image = render(rvec, tvec, noise=noise, blur_px=blur_px, seed=index)
         true = true_corners(rvec, tvec, side_m)
         raw = inwards(true, 0.5) + np.random.default_rng(index).normal(0.0, 0.3, (4, 2))
-        result = refine_lines(image, raw[None], [RIMS[cells]], CAMERA)[0]
+        result = refine_corners_by_lines(image, raw[None], [RIMS[cells]], CAMERA)[0]
         assert result.refined
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -89,7 +89,7 @@ def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float)
         true = true_corners(rvec, tvec, 0.150)
         turn = rng.uniform(-np.pi, np.pi)
         raw = true + off_px * np.array([np.cos(turn), np.sin(turn)])
-        result = refine_lines(image, raw[None], [RIMS[6]], CAMERA)[0]
+        result = refine_corners_by_lines(image, raw[None], [RIMS[6]], CAMERA)[0]
         if result is not None:
             fitted += 1
             assert np.abs(result.corners_px - true).max() < 0.1
@@ -109,7 +109,7 @@ def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
     squared = (way**2).sum(axis=2, keepdims=True) / reach_px**2
     at = (centre + way * (1.0 - curl * squared)).astype(np.float32)
     curled = np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC), np.uint8)
-    found = refine_lines(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA)[1]
+    found = refine_corners_by_lines(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA)[1]
     out = (small - centre) / np.linalg.norm(small - centre, axis=1, keepdims=True)
     assert found.refined
     assert abs(float(((found.corners_px - small) * out).sum(axis=1).mean())) < 0.08
@@ -125,7 +125,10 @@ def spoilt(image: Array, light: str) -> Array:
 def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
     """White that grows over black: the border's width shows by how much."""
     biases, raw_biases = [], []
-    closed = {n: replace(r, white_behind=np.zeros_like(r.white_behind)) for n, r in RIMS.items()}
+    closed = {
+        n: replace(r, is_white_two_cells_deep=np.zeros_like(r.is_white_two_cells_deep))
+        for n, r in RIMS.items()
+    }
     for values in POSES:
         rvec, tvec = pose_of(*values)
         image = spoilt(render(rvec, tvec, blur_px=0.9), light)
@@ -133,10 +136,10 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         for rims, rows in ((RIMS, biases), (closed, raw_biases)):
-            result = refine_lines(image, true[None], [rims[6]], CAMERA)[0]
+            result = refine_corners_by_lines(image, true[None], [rims[6]], CAMERA)[0]
             assert result.refined
             rows.append(((result.corners_px - true) * out).sum(axis=1).mean())
-            assert abs(rows[-1]) < 4.0 * np.hypot(result.shift_sigma_px, result.sigma_px)
+            assert abs(rows[-1]) < 4.0 * np.hypot(result.edge_shift_sigma_px, result.sigma_px)
     assert abs(np.mean(raw_biases)) > 0.12
     assert abs(np.mean(biases)) < 0.03
 
@@ -145,13 +148,13 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
     raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
     for image, most_px in ((noise, 6.5), (np.full_like(noise, 128), 1e-5)):
-        assert refine_lines(image, raw[None], [RIMS[6]], CAMERA) == [None]
+        assert refine_corners_by_lines(image, raw[None], [RIMS[6]], CAMERA) == [None]
         result = refine_subpix(image, raw, 6)
         assert not result.refined
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
         assert result.sigma_px in (DETECTOR_CORNER_SIGMA_PX, SUBPIX_CORNER_SIGMA_PX)
     waves = waved(render(*POSE, noise=2.0))
-    assert refine_lines(waves, corners("large")[None], [RIMS[6]], CAMERA) == [None]
+    assert refine_corners_by_lines(waves, corners("large")[None], [RIMS[6]], CAMERA) == [None]
 
 
 # --- Cells -------------------------------------------------------------------------------------

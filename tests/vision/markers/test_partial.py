@@ -176,7 +176,7 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.is_inner & ~LARGE.is_white)[0]
     spots = apply_homography(
-        homography_from_unit_square(true), LARGE.sample_points[LARGE.sample_cells == black]
+        homography_from_unit_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
     )
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
@@ -249,7 +249,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     ]
     whole, rest = (edges.weight.sum() for edges in seen)
     assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
-    setup, found = replace(SETUP, mask=covered), []
+    setup, found = replace(SETUP, hidden_mask=covered), []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
         before: Detections | None = None
@@ -267,10 +267,10 @@ def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
         field = interpolate_field(image, first_row)
-        hidden = make_hidden_mask(Frame(0, 0.0, field, fields=name), covered)
+        hidden = make_hidden_mask(Frame(0, 0.0, field, picture_kind=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()
-    whole = make_hidden_mask(Frame(0, 0.0, image, fields="whole"), covered)
+    whole = make_hidden_mask(Frame(0, 0.0, image, picture_kind="whole"), covered)
     assert whole is not None
     assert np.array_equal(whole, covered)
 
@@ -292,11 +292,13 @@ def profile_with(folder: Path, image: Grey | str | None, **camera: object) -> Pr
 def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     drawn = np.zeros((H, W), np.uint8)
     drawn[:40, :70] = 255
-    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.mask
+    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.hidden_mask
     assert np.array_equal(mask, drawn > 0)
-    turned = make_pipeline(profile_with(tmp_path, drawn, mirrored="true"), CAMERA).detector.mask
+    turned = make_pipeline(
+        profile_with(tmp_path, drawn, mirrored="true"), CAMERA
+    ).detector.hidden_mask
     assert np.array_equal(turned, drawn[:, ::-1] > 0)
-    assert make_pipeline(Profile(), CAMERA).detector.mask is None
+    assert make_pipeline(Profile(), CAMERA).detector.hidden_mask is None
 
 
 WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)

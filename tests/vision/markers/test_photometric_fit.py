@@ -16,8 +16,8 @@ from perchctl.vision import CameraModel, project, square_corners
 from perchctl.vision.markers.blurred import (
     find_blurred,
     find_expected_blurred,
-    is_distinctive,
-    is_verified,
+    has_distinctive_bits,
+    has_matching_drawing,
 )
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
@@ -73,7 +73,7 @@ def test_corners_of_small_and_blurred_markers(
     for seed in range(6):
         image, true = view(name, side_px, seed, blur_px=blur_px, noise=3.0)
         found = align_drawing(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
-        assert is_verified(found)
+        assert has_matching_drawing(found)
         error = found.corners_px - true
         squares.append((error**2).mean())
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
@@ -116,7 +116,7 @@ def test_other_markers_are_not_verified(
     true = project(square_corners(SIDES[name]), *pose, CAMERA)
     for k in range(4):
         found = align_drawing(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
-        assert found is None or not is_verified(found)
+        assert found is None or not has_matching_drawing(found)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_impossible_starts_and_flat_pictures_give_nothing(corners: Array) -> Non
 PINHOLE = CameraModel(
     (160, 120), np.array([[200.0, 0, 80], [0, 200.0, 60], [0, 0, 1]]), np.zeros(5)
 )
-CELLS: Array = SETUP.patterns["small"].drawing.cells
+CELLS: Array = SETUP.patterns["small"].drawing.cell_whiteness
 DOTS = 12
 
 
@@ -178,7 +178,7 @@ def picture(
 def test_the_marker_itself_is_told_apart(
     cell_px: float, blurs: float, noise: float, seed: int
 ) -> None:
-    assert is_distinctive(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
+    assert has_distinctive_bits(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
 
 
 @pytest.mark.parametrize(

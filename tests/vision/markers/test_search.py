@@ -13,7 +13,7 @@ from perchctl.vision.markers.search import choose_markers
 from tests.helpers.markers import SETUP, box
 from tests.helpers.target_picture import pose_of, render
 
-RATIO = SETUP.ratio
+RATIO = SETUP.small_to_large_side
 Build = Callable[..., Pipeline]
 
 
