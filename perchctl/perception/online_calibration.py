@@ -90,7 +90,11 @@ def update_calibration(
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
-    is_measured = pose.cov is not None and is_finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
+    is_measured = (
+        pose.xyz_yaw_cov is not None
+        and is_finite(pose.xyz_yaw_cov)
+        and pose.tvec_m[2] >= LEAST_RANGE_M
+    )
     if is_measured and before is not None and after is not None:
         velocity_mps = velocity_at(history, t_s - delay_s)
         moment = consistency_rows(pose, before, after, velocity_mps, delay_s, setup)
@@ -210,7 +214,7 @@ def consistency_rows(
     `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
     time minus `delay_s`, the likely delay; `velocity_mps` is the vehicle's velocity at that time.
     """
-    assert pose.cov is not None
+    assert pose.xyz_yaw_cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
     x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # vector from the camera, body axes
@@ -225,7 +229,7 @@ def consistency_rows(
         for p, q, v in zip(R0, R1, velocity_mps, strict=False)
     ]
     moves = _above(math.hypot(*speeds), math.hypot(NOISE_MPS, NOISE_RADPS * z))
-    aside_m2 = 0.5 * float(pose.cov[0, 0] + pose.cov[1, 1])
+    aside_m2 = 0.5 * float(pose.xyz_yaw_cov[0, 0] + pose.xyz_yaw_cov[1, 1])
     for i in (X, Y):
         at = before.position_m[i] + after.position_m[i] + _dot(R0[i], place) + _dot(R1[i], place)
         speed = moves * speeds[i]
@@ -237,7 +241,9 @@ def consistency_rows(
     rate = turned / (2.0 * ATTITUDE_STEP_S)
     rate *= _above(abs(rate), NOISE_RADPS)
     rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
-    noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (PICTURE_JITTER_S * rate) ** 2)
+    noise.append(
+        float(pose.xyz_yaw_cov[3, 3]) + LEAST_SIGMA_RAD**2 + (PICTURE_JITTER_S * rate) ** 2
+    )
     return np.array(rows), np.array(noise), z
 
 

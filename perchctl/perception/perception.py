@@ -98,7 +98,7 @@ class Perception:
                 self._mirrored += 1
             elif output.detections.markers:
                 self._mirrored = 0
-            if output.refused:
+            if output.is_foreign_target:
                 self.refused = output.lock_note
             self._calibrate(output, used_s)
             yield picture, output
@@ -113,7 +113,7 @@ class Perception:
         sighting. Without `spread`, the standard deviations remain those of the newest frame."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
-        return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
+        return estimate(self.state, t_s, attitude, self.pipeline, with_sigma=spread)
 
     @property
     def latency_sigma_s(self) -> float:

@@ -35,22 +35,22 @@ MAX_PREDICTION_S = 1.0
 
 _IDENTITY_3: Array = np.eye(3)
 _IDENTITY_8: Array = np.eye(8)
-_RATE_TO_VALUE: Array = np.eye(8, k=1)
-_RATE_TO_VALUE[RATES] = 0.0
+_RATE_TO_VALUE_MATRIX: Array = np.eye(8, k=1)
+_RATE_TO_VALUE_MATRIX[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_PUBLISHED_UNITS = np.array(
+_SI_PER_PAPER_UNIT = np.array(
     [_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM]
 )  # units of the paper, per state
 
-_ACCELERATION_DURATION_S = 0.1
+_ACCELERATION_CORRELATION_TIME_S = 0.1
 """Duration of an acceleration, s: the density of the white noise is its square times this,
 (m/s^2)^2 s."""
-_ESTIMATE_RANDOM_WALK = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+_ESTIMATE_WALK_VARIANCE_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
 m^2)."""
-_HEADING_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
+_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
 _RESTART_NIS = 25.0
 """Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
 5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
@@ -60,27 +60,30 @@ velocity. Smaller: noise restarts the track."""
 @dataclass(frozen=True)
 class ProcessNoise:
     """Standard deviations of accelerations: of the target along each axis, of its heading, and of
-    the rotation of the level frame (`turn_radps2`). `is_drifting` is True if the tracks are in the
-    world frame."""
+    the rotation of the level frame (`frame_rotation_sigma_radps2`). `is_frame_drifting` is True if
+    the tracks are in the world frame."""
 
-    acceleration_mps2: float
-    heading_radps2: float
-    turn_radps2: float = 0.0
-    is_drifting: bool = False
+    acceleration_sigma_mps2: float
+    heading_acceleration_sigma_radps2: float
+    frame_rotation_sigma_radps2: float = 0.0
+    is_frame_drifting: bool = False
 
     @cached_property
-    def rate_variance(self) -> Array:
+    def rate_noise_cov_per_s(self) -> Array:
         """Covariance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
-        push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
-        return np.diag(push * push) * _ACCELERATION_DURATION_S
+        push = np.array(
+            [self.heading_acceleration_sigma_radps2, *3 * [self.acceleration_sigma_mps2]]
+        )
+        return np.diag(push * push) * _ACCELERATION_CORRELATION_TIME_S
 
 
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
     """The constants of a filter: R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper
-    (cm^2, deg^2), converted to SI. P0 (8, 8) is the covariance after the first measurement. `alpha`
-    and `n_max` are those of the profile. If `process` is not None, it replaces Q, and the
-    covariance of each pose replaces R.
+    (cm^2, deg^2), converted to SI. P0 (8, 8) is the covariance after the first measurement.
+    `rate_factor_per_unseen_frame` and `max_unseen_frames` are those of the profile. If
+    `process_noise` is not None, it replaces Q, and the covariance of each pose replaces
+    R.
 
     A measurement z with the innovation v = z - H x and its covariance S = H P H^T + R restarts the
     track if v^T S^-1 v (NIS) exceeds `restart_nis`. The model does not explain such a measurement,
@@ -92,27 +95,27 @@ class FilterSetup:
     R: Array
     Q: Array
     P0: Array
-    alpha: float
-    n_max: int
-    process: ProcessNoise | None = None
+    rate_factor_per_unseen_frame: float
+    max_unseen_frames: int
+    process_noise: ProcessNoise | None = None
     tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
-    drift_mps: float = math.inf  # largest speed of the target in its frame without measurements
+    max_drift_mps: float = math.inf  # largest speed of the target in its frame without measurements
     restart_nis: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
-    means the setup's R. `bias` (4, 4) is the shift of z by one standard deviation of each constant
-    error, or None."""
+    means the setup's R. `constant_error_shifts` (4, 4) is the shift of z by one standard deviation
+    of each constant error, or None."""
 
     z: Array
     R: Array | None = None
-    bias: Array | None = None
+    constant_error_shifts: Array | None = None
 
 
 @cache
-def _load_predict() -> Callable[..., tuple[Array, Array]]:
+def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
     """Load filterpy's prediction. It loads much of scipy, which takes a second on a small computer:
     too long for a command's first word, and for a frame in flight."""
     from filterpy.kalman import predict
@@ -121,33 +124,35 @@ def _load_predict() -> Callable[..., tuple[Array, Array]]:
     return loaded
 
 
-def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
+def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
     """Return the filter's constants. The initial standard deviation of the velocity is 5 cm/s in
     the world frame, and 30 cm/s in the level frame, or 1 m/s with measured noise."""
-    _load_predict()  # now, so that no frame waits for it
+    _import_filterpy_predict()  # now, so that no frame waits for it
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
-    first[RATES] = (5.0 if in_world else level_rate) ** 2  # cm/s and deg/s
-    squares = _PUBLISHED_UNITS**2
-    process = None
+    first[RATES] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
+    squares = _SI_PER_PAPER_UNIT**2
+    process_noise = None
     if measured:
-        process = (
-            ProcessNoise(config.drift_mps2, _HEADING_SIGMA_RADPS2, is_drifting=True)
-            if in_world
+        process_noise = (
+            ProcessNoise(
+                config.drift_mps2, _HEADING_ACCELERATION_SIGMA_RADPS2, is_frame_drifting=True
+            )
+            if is_world_frame
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
         )
     return FilterSetup(
         R=np.diag(config.k1 * squares[MEASURED]),
         Q=np.diag(config.k2 * squares),
         P0=np.diag(first * squares),
-        alpha=config.alpha,
-        n_max=config.n_max,
-        process=process,
+        rate_factor_per_unseen_frame=config.alpha,
+        max_unseen_frames=config.n_max,
+        process_noise=process_noise,
         tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
-        drift_mps=config.drift_mps if in_world else math.inf,
+        max_drift_mps=config.drift_mps if is_world_frame else math.inf,
         # In flight, the gate detects jumps of the state estimate (`perchctl.vision.tracks`).
-        restart_nis=_RESTART_NIS if measured and not in_world else math.inf,
+        restart_nis=_RESTART_NIS if measured and not is_world_frame else math.inf,
     )
 
 
@@ -159,31 +164,31 @@ def tilt_jacobian(vector_m: Array) -> Array:
 
 def transition_matrix(dt_s: float) -> Array:
     """Return the state transition matrix F (8, 8) of the paper's equation 1 over `dt_s`."""
-    return _IDENTITY_8 + dt_s * _RATE_TO_VALUE
+    return _IDENTITY_8 + dt_s * _RATE_TO_VALUE_MATRIX
 
 
-def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
+def process_noise_covariance(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     """Return the process noise Q (8, 8) over `dt_s` for a target at `position_m` (3,) in its
     frame."""
-    noise = setup.process
+    noise = setup.process_noise
     if noise is None:
         return setup.Q
     pushed = _acceleration_covariance(noise, position_m) * dt_s
     # A value and its rate are adjacent in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
-    if noise.is_drifting:
-        Q[MEASURED, MEASURED] += _ESTIMATE_RANDOM_WALK * dt_s
+    if noise.is_frame_drifting:
+        Q[MEASURED, MEASURED] += _ESTIMATE_WALK_VARIANCE_PER_S * dt_s
     return Q
 
 
 def _acceleration_covariance(noise: ProcessNoise, position_m: Array) -> Array:
     """Return the covariance (4, 4) that one second adds to the rates of yaw, x, y and z."""
-    if noise.turn_radps2 == 0.0:
-        return noise.rate_variance
-    turned2 = noise.turn_radps2**2 * _ACCELERATION_DURATION_S
+    if noise.frame_rotation_sigma_radps2 == 0.0:
+        return noise.rate_noise_cov_per_s
+    turned2 = noise.frame_rotation_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
     x, y, z = position_m.tolist()
-    density = noise.rate_variance.copy()
+    density = noise.rate_noise_cov_per_s.copy()
     density[1:, 1:] += turned2 * (
         (x * x + y * y + z * z) * _IDENTITY_3 - np.outer(position_m, position_m)
     )
@@ -198,10 +203,12 @@ def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> Marker
     P = setup.P0.copy()
     if measured.R is not None:
         P[MEASURED, MEASURED] = measured.R
-    bias = np.zeros((8, 4))
-    if measured.bias is not None:
-        bias[MEASURED] = measured.bias
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
+    constant_error_shifts = np.zeros((8, 4))
+    if measured.constant_error_shifts is not None:
+        constant_error_shifts[MEASURED] = measured.constant_error_shifts
+    return MarkerTrack(
+        t_s=t_s, x=x, P=P, unseen_frames=0, constant_error_shifts=constant_error_shifts
+    )
 
 
 def step_track(
@@ -234,13 +241,13 @@ def step_track(
     if dt_s <= 0.0:
         return track
     if measured is None:
-        if track.unseen >= setup.n_max:
+        if track.unseen_frames >= setup.max_unseen_frames:
             return None
         x = track.x.copy()
-        x[RATES] *= setup.alpha  # equation 3
-        return _predict_from_state(track, x, dt_s, t_s, track.unseen + 1, setup)
-    F, Q = transition_matrix(dt_s), process_noise(dt_s, track.x[POSITION], setup)
-    x, P = _load_predict()(track.x, track.P, F=F, Q=Q)
+        x[RATES] *= setup.rate_factor_per_unseen_frame  # equation 3
+        return _predict_from_state(track, x, dt_s, t_s, track.unseen_frames + 1, setup)
+    F, Q = transition_matrix(dt_s), process_noise_covariance(dt_s, track.x[POSITION], setup)
+    x, P = _import_filterpy_predict()(track.x, track.P, F=F, Q=Q)
     R = setup.R if measured.R is None else measured.R
     if setup.restart_nis < math.inf:
         off, S = _innovation(x, measured.z), P[MEASURED, MEASURED] + R
@@ -250,10 +257,14 @@ def step_track(
             begun.P[MEASURED, MEASURED] += np.outer(off, off)
             return begun
     x, P, gain = _kalman_update(x, P, measured.z, R)
-    bias = F.dot(track.bias)
-    if measured.bias is not None:
-        bias += gain.dot(measured.bias - bias[MEASURED])
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
+    constant_error_shifts = F.dot(track.constant_error_shifts)
+    if measured.constant_error_shifts is not None:
+        constant_error_shifts += gain.dot(
+            measured.constant_error_shifts - constant_error_shifts[MEASURED]
+        )
+    return MarkerTrack(
+        t_s=t_s, x=x, P=P, unseen_frames=0, constant_error_shifts=constant_error_shifts
+    )
 
 
 def _innovation(x: Array, z: Array) -> Array:
@@ -285,28 +296,36 @@ def predict_track(
     if dt_s <= 0.0:
         return track
     if with_cov:
-        return _predict_from_state(track, track.x, dt_s, t_s, track.unseen, setup)
-    x = transition_matrix(dt_s).dot(_limit_drift_speed(track.x, setup))
+        return _predict_from_state(track, track.x, dt_s, t_s, track.unseen_frames, setup)
+    x = transition_matrix(dt_s).dot(_limit_target_speed(track.x, setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return replace(track, t_s=t_s, x=x)
 
 
-def _limit_drift_speed(x: Array, setup: FilterSetup) -> Array:
+def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
     """Return the state with its speed limited to the drift of its frame."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
-    if speed_mps <= setup.drift_mps:
+    if speed_mps <= setup.max_drift_mps:
         return x
     x = x.copy()
-    x[VELOCITY] *= setup.drift_mps / speed_mps
+    x[VELOCITY] *= setup.max_drift_mps / speed_mps
     return x
 
 
 def _predict_from_state(
-    track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
+    track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen_frames: int, setup: FilterSetup
 ) -> MarkerTrack:
     """Return the track predicted from the state `x` to `t_s`, without a measurement."""
-    x = _limit_drift_speed(x, setup)
+    x = _limit_target_speed(x, setup)
     F = transition_matrix(dt_s)
-    x, P = _load_predict()(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
+    x, P = _import_filterpy_predict()(
+        x, track.P, F=F, Q=process_noise_covariance(dt_s, x[POSITION], setup)
+    )
     x[YAW] = wrap_rad(float(x[YAW]))
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=unseen, bias=F @ track.bias)
+    return MarkerTrack(
+        t_s=t_s,
+        x=x,
+        P=P,
+        unseen_frames=unseen_frames,
+        constant_error_shifts=F @ track.constant_error_shifts,
+    )

@@ -15,7 +15,7 @@ import numpy as np
 from perchctl.geometry import Array, circular_mean, wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
 from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
-from perchctl.vision.pose import PoseCandidate, PoseSetup, estimate_pose, level_rotation
+from perchctl.vision.pose import PoseCandidate, PoseSetup, R_level_body_of, estimate_pose
 from perchctl.vision.types import (
     Attitude,
     Detection,
@@ -35,94 +35,98 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
     """The target in the tracks' frame: `xyz_yaw` (x, y, z, yaw), velocity (3,), covariance (3, 3)
-    of the position, variance of the yaw, number of frames `unseen`, and the stage of the newest
-    frame.
+    of the position, variance of the yaw, number of frames `unseen_frames`, and the stage of the
+    newest frame.
 
-    `bias_m` (3, 4) is the shift of the position by one standard deviation of each constant error.
+    `constant_error_shifts_m` (3, 4) is the shift of the position by one standard deviation of each
+    constant error.
     """
 
     xyz_yaw: Array
     velocity_mps: Array
     cov_m2: Array
-    bias_m: Array
+    constant_error_shifts_m: Array
     var_yaw_rad2: float
-    unseen: int
+    unseen_frames: int
     stage: Stage
 
 
 def measure_markers(
     detections: Detections,
     attitude: Attitude | None,
-    near: PoseCandidate | None,
-    normal_cam: Array | None,
+    start_pose: PoseCandidate | None,
+    previous_normal_cam: Array | None,
     config: MergeConfig,
     setup: PoseSetup,
 ) -> MeasuredMarkers:
     """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
-    `near` is the last pose of the target, moved by the vehicle's motion since. `normal_cam` (3,) is
-    the target's normal in the last pose, in the camera's axes at that time.
+    `start_pose` is the last pose of the target, moved by the vehicle's motion since.
+    `previous_normal_cam` (3,) is the target's normal in the last pose, in the camera's axes at that
+    time.
     """
     seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
     joint = None
     if config.method == "joint" and len(seen) == 2:
-        joint = estimate_pose(seen, t_s, attitude, setup, normal_cam, near)
+        joint = estimate_pose(seen, t_s, attitude, setup, previous_normal_cam, start_pose)
     clear = joint is not None and joint.chi2 < MAX_CONSISTENT_CHI2
     enough = clear and config.stages == "seen"
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
     singles: dict[str, MarkerPose] = {}
     if not enough or setup.config.each_marker:
-        start = near if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
+        start = start_pose if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
         for each in seen:
-            pose = estimate_pose([each], t_s, attitude, setup, normal_cam, start)
+            pose = estimate_pose([each], t_s, attitude, setup, previous_normal_cam, start)
             if pose is not None:
                 singles[each.marker] = pose
     poses |= singles
     if joint is not None and enough:
         return MeasuredMarkers(poses, {"joint": joint})
-    contradicting = False
+    are_markers_contradicting = False
     if not clear and len(singles) == 2:
-        contradicting = is_pair_inconsistent(
+        are_markers_contradicting = is_pair_inconsistent(
             singles["large"], singles["small"], config.disagreement_m
         )
-    used_poses, one = dict(singles), joint
+    poses_by_track, one = dict(singles), joint
     if len(singles) == 2:
         better = choose_better_conditioned(singles["large"], singles["small"])
         one = joint or better
-        if contradicting:
-            used_poses = {better.source: better}
+        if are_markers_contradicting:
+            poses_by_track = {better.source: better}
         elif config.stages == "range":
             # By the distance from the camera to the target's plane (equations 4, 6 and 11).
-            offset = level_rotation(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
+            offset = R_level_body_of(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
             z_m = float(better.e_m[2] + offset[2])
             if not config.z3_m < z_m <= config.z2_m:
-                del used_poses["small" if z_m > config.z2_m else "large"]
+                del poses_by_track["small" if z_m > config.z2_m else "large"]
     if config.method == "joint":
-        one = next(iter(used_poses.values())) if len(used_poses) == 1 else one
-        used_poses = {} if one is None else {"joint": one}
-    return MeasuredMarkers(poses, used_poses, contradicting)
+        one = next(iter(poses_by_track.values())) if len(poses_by_track) == 1 else one
+        poses_by_track = {} if one is None else {"joint": one}
+    return MeasuredMarkers(poses, poses_by_track, are_markers_contradicting)
 
 
 def merge_tracks(
-    tracks: Mapping[str, MarkerTrack], used_poses: Mapping[str, MarkerPose], weights: WeightsConfig
+    tracks: Mapping[str, MarkerTrack],
+    poses_by_track: Mapping[str, MarkerPose],
+    weights: WeightsConfig,
 ) -> MergedTarget | None:
     """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    `used_poses` update, or otherwise from the tracks measured last; None without tracks."""
+    `poses_by_track` update, or otherwise from the tracks measured last; None without tracks."""
     if not tracks:
         return None
-    least = min(track.unseen for track in tracks.values())
-    used = {name: track for name, track in tracks.items() if track.unseen == least}
-    used = {name: track for name, track in used.items() if name in used_poses} or used
+    least = min(track.unseen_frames for track in tracks.values())
+    used = {name: track for name, track in tracks.items() if track.unseen_frames == least}
+    used = {name: track for name, track in used.items() if name in poses_by_track} or used
     if len(used) == 1:
         ((name, track),) = used.items()
         return MergedTarget(
             xyz_yaw=track.x[_POSITION_AND_YAW],
             velocity_mps=track.x[VELOCITY],
             cov_m2=track.P[POSITION, POSITION],
-            bias_m=track.bias[POSITION],
+            constant_error_shifts_m=track.constant_error_shifts[POSITION],
             var_yaw_rad2=float(track.P[YAW, YAW]),
-            unseen=least,
-            stage=_STAGE_OF[used_poses[name].source] if name in used_poses else Stage.NONE,
+            unseen_frames=least,
+            stage=_STAGE_OF[poses_by_track[name].source] if name in poses_by_track else Stage.NONE,
         )
     large, small = used["large"], used["small"]
     order = _POSITION_AND_YAW
@@ -131,20 +135,22 @@ def merge_tracks(
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
     return MergedTarget(
-        xyz_yaw=merge_pair(large.x[order], small.x[order], weights),
+        xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
         velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
         cov_m2=np.diag(variance[:3]),
-        bias_m=w[:, None] * large.bias[POSITION] + (1.0 - w[:, None]) * small.bias[POSITION],
+        constant_error_shifts_m=w[:, None] * large.constant_error_shifts[POSITION]
+        + (1.0 - w[:, None]) * small.constant_error_shifts[POSITION],
         var_yaw_rad2=float(variance[3]),
-        unseen=least,
-        stage=Stage.BOTH if used_poses else Stage.NONE,
+        unseen_frames=least,
+        stage=Stage.BOTH if poses_by_track else Stage.NONE,
     )
 
 
-def widen_covariance(merged: MergedTarget, rival: Array) -> MergedTarget:
+def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Return the target with a covariance that covers a second possible position: the state (8,) of
-    a contradicting `rival`. With the difference d between both, the covariance grows by d d^T."""
-    off = rival[_POSITION_AND_YAW] - merged.xyz_yaw
+    a contradicting `rival_state`. With the difference d between both, the covariance grows by d
+    d^T."""
+    off = rival_state[_POSITION_AND_YAW] - merged.xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
@@ -207,11 +213,11 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 # --- Merge the two markers into one target pose (paper, section II-A.2) ---
 
 
-def detected_stage(large: bool, small: bool) -> Stage:
+def detected_stage(is_large_detected: bool, is_small_detected: bool) -> Stage:
     """Return the stage of a frame from whether its large and its small marker were detected."""
-    if large:
-        return Stage.BOTH if small else Stage.LARGE
-    return Stage.SMALL if small else Stage.NONE
+    if is_large_detected:
+        return Stage.BOTH if is_small_detected else Stage.LARGE
+    return Stage.SMALL if is_small_detected else Stage.NONE
 
 
 def make_weight_matrix(weights: WeightsConfig) -> Array:
@@ -223,7 +229,7 @@ def make_weight_matrix(weights: WeightsConfig) -> Array:
     return W
 
 
-def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
+def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
     """Merge (x, y, z, yaw) of both markers, each (4,), by the paper's equation 8. The yaws are
     merged as angles."""
     W = make_weight_matrix(weights)
@@ -237,7 +243,8 @@ def is_pair_inconsistent(large: MarkerPose, small: MarkerPose, limit_m: float) -
     Errors of the print shift both markers alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
-        np.maximum(p.sigma_m**2 - (p.print_shift_m**2).sum(axis=1), 0.0) for p in (large, small)
+        np.maximum(p.sigma_m**2 - (p.print_error_shifts_m**2).sum(axis=1), 0.0)
+        for p in (large, small)
     ]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])
     return bool((gap > np.maximum(limit_m, vague)).any())

@@ -37,8 +37,8 @@ from perchctl.vision.merge import (
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPosition,
+    gear_to_target_error_shifts_m,
     marker_offset_m,
-    relative_bias_m,
     to_level,
     to_world,
 )
@@ -92,7 +92,7 @@ class Pipeline:
     detector: DetectorSetup
     pose: PoseSetup
     merge: MergeConfig
-    tracks: TrackSetup
+    track_setup: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
     custom_detector: Detector | None = None
@@ -100,12 +100,12 @@ class Pipeline:
 
 
 def make_pipeline(
-    profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
+    profile: Profile, camera: CameraModel, hidden_mask: NDArray[np.bool_] | None = None
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera; several streams may share it.
 
-    `covered` marks the pixels (h, w) that the vehicle covers in the camera's pictures; None reads
-    `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
+    `hidden_mask` marks the pixels (h, w) that the vehicle covers in the camera's pictures; None
+    reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
     """
     pose = PoseSetup(
         config=profile.pose,
@@ -117,7 +117,9 @@ def make_pipeline(
     )
     mask = None
     if profile.camera.mask is not None:
-        mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
+        mask = (
+            read_mask(profile.camera.mask, camera.size_px) if hidden_mask is None else hidden_mask
+        )
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
     detector = make_detector_setup(profile.detector, profile.target, mask)
     if detector.is_line_fit_enabled:
@@ -131,9 +133,9 @@ def make_pipeline(
         detector=detector,
         pose=pose,
         merge=profile.merge,
-        tracks=TrackSetup(
-            level_filter=make_filter(profile.kalman, in_world=False),
-            world_filter=make_filter(profile.kalman, in_world=True),
+        track_setup=TrackSetup(
+            level_filter=make_filter(profile.kalman, is_world_frame=False),
+            world_filter=make_filter(profile.kalman, is_world_frame=True),
             pose=pose,
             has_gate=profile.kalman.gate,
             own_target=own,
@@ -180,27 +182,31 @@ def step(
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
     frame = classify_fields(_grey_frame(frame, pipeline.camera))
-    expected, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
+    expected_corners_px, start_pose = expected_corners(
+        state.last_pose, frame.t_s, attitude, pipeline.pose
+    )
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
         # The first picture is searched by all methods.
         first = state.last_detections is None and state.rival is None and state.empty_frames == 0
         empty = None if first else state.empty_frames
-        place = pipeline.tracks.own_target
-        own = partial(marker_offset_m, place, frame.t_s, attitude, pipeline.pose)
+        own_target = pipeline.track_setup.own_target
+        own_target_offset_m = partial(
+            marker_offset_m, own_target, frame.t_s, attitude, pipeline.pose
+        )
         with nullcontext() if state.last_detections is None else one_thread():
             detections = detect_markers(
                 frame,
                 state.last_detections,
                 pipeline.detector,
                 pipeline.camera,
-                expected,
+                expected_corners_px,
                 empty,
-                own,
+                own_target_offset_m,
             )
     return step_detections(
-        state, detections, attitude, pipeline, near, frame.picture_kind or "whole"
+        state, detections, attitude, pipeline, start_pose, frame.picture_kind or "whole"
     )
 
 
@@ -242,45 +248,51 @@ def step_detections(
     detections: Detections,
     attitude: Attitude | None,
     pipeline: Pipeline,
-    near: PoseCandidate | None = None,
-    fields: PictureKind = "whole",
+    start_pose: PoseCandidate | None = None,
+    picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` after the detection. `near` is the expected pose of the target,
-    `fields` the kind of the picture."""
+    """Run the part of `step` after the detection. `start_pose` is the expected pose of the target,
+    `picture_kind` the kind of the picture."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
-    measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
+    measured = measure_markers(
+        detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose
+    )
 
-    in_world = pipeline.kalman.frame == "world" and attitude is not None
-    followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
-    measured, verdict = followed.measured, followed.verdict
+    is_in_world_frame = pipeline.kalman.frame == "world" and attitude is not None
+    tracked_frame = update_tracks(
+        state, measured, t_s, attitude, is_in_world_frame, pipeline.track_setup
+    )
+    measured, verdict = tracked_frame.measured, tracked_frame.verdict
 
     stage = detected_stage(detections.large is not None, detections.small is not None)
     anything = stage is not Stage.NONE
     disagreeing = state.disagreeing_frames
     if stage is Stage.BOTH and verdict.accepted:
-        disagreeing = disagreeing + 1 if measured.contradicting else 0
+        disagreeing = disagreeing + 1 if measured.are_markers_contradicting else 0
     most_certain_pose = measured.most_certain_pose
     sees = most_certain_pose is not None and verdict.accepted
     if most_certain_pose is not None and sees:
         last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose)
-    target = _estimate_at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
+    target = _estimate_at_frame(
+        tracked_frame, state.target, t_s, attitude, is_in_world_frame, pipeline
+    )
     last = state.last_detections
     if anything and verdict.accepted:
         last = detections
     elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
         last = None
     new = PipelineState(
-        tracks=followed.tracks,
-        in_world=in_world,
+        tracks=tracked_frame.tracks,
+        are_tracks_in_world_frame=is_in_world_frame,
         measured=measured,
         target=target or state.target,
         last_detections=last,
-        last_pose=last_pose if sees or followed.tracks else None,
+        last_pose=last_pose if sees or tracked_frame.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
-        lock=followed.lock,
-        rival=followed.rival,
+        lock=tracked_frame.lock,
+        rival=tracked_frame.rival,
         field_state=state.field_state,
     )
     output = PipelineOutput(
@@ -290,8 +302,8 @@ def step_detections(
         stage=stage,
         disagreeing_frames=disagreeing,
         lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
-        picture_kind=fields,
-        refused=verdict.is_foreign_target,
+        picture_kind=picture_kind,
+        is_foreign_target=verdict.is_foreign_target,
     )
     return new, output
 
@@ -301,26 +313,28 @@ def estimate(
     t_s: float,
     attitude: Attitude | None,
     pipeline: Pipeline,
-    spread: bool = True,
+    with_sigma: bool = True,
 ) -> TargetEstimate | None:
     """Return the target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
 
     A tracked target is predicted by its filter and by the vehicle's motion. A target that is no
     longer tracked stays at its last position in the world. Returns None before the first
-    measurement. Without `spread`, the standard deviations stay those of the newest frame.
+    measurement. Without `with_sigma`, the standard deviations stay those of the newest frame.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:
         return target
-    if state.tracks and state.in_world:
-        world = pipeline.tracks.world_filter
-        tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
-        merged = merge_tracks(tracks, state.measured.used_poses, pipeline.merge.weights)
+    if state.tracks and state.are_tracks_in_world_frame:
+        world = pipeline.track_setup.world_filter
+        tracks = {n: predict_track(t, t_s, world, with_sigma) for n, t in state.tracks.items()}
+        merged = merge_tracks(tracks, state.measured.poses_by_track, pipeline.merge.weights)
         assert merged is not None
         rival = predict_rival_state(state.lock, state.rival, True, t_s, world)
         merged = merged if rival is None else widen_covariance(merged, rival)
         return replace(
-            target, t_s=t_s, **_convert_to_frames(merged, attitude, True, pipeline, spread)
+            target,
+            t_s=t_s,
+            **_express_in_level_and_world(merged, attitude, True, pipeline, with_sigma),
         )
     if not state.tracks:
         nothing = np.zeros(3)
@@ -342,61 +356,73 @@ def estimate(
 
 
 def _estimate_at_frame(
-    followed: TrackedFrame,
-    before: TargetEstimate | None,
+    tracked_frame: TrackedFrame,
+    previous_estimate: TargetEstimate | None,
     t_s: float,
     attitude: Attitude | None,
-    in_world: bool,
+    is_in_world_frame: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    used_poses, tracks = followed.measured.used_poses, followed.tracks
-    merged = merge_tracks(tracks, used_poses, pipeline.merge.weights)
+    poses_by_track, tracks = tracked_frame.measured.poses_by_track, tracked_frame.tracks
+    merged = merge_tracks(tracks, poses_by_track, pipeline.merge.weights)
     if merged is None:
         return None
-    constants = pipeline.tracks.select_filter(in_world)
-    rival = predict_rival_state(followed.lock, followed.rival, in_world, t_s, constants)
+    filter_setup = pipeline.track_setup.select_filter(is_in_world_frame)
+    rival = predict_rival_state(
+        tracked_frame.lock, tracked_frame.rival, is_in_world_frame, t_s, filter_setup
+    )
     merged = merged if rival is None else widen_covariance(merged, rival)
-    measured = any(n in tracks and tracks[n].t_s == t_s for n in used_poses)
+    measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_track)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     return TargetEstimate(
         t_s=t_s,
-        measured_s=t_s if measured else never if before is None else before.measured_s,
-        small_measured_s=t_s if small else never if before is None else before.small_measured_s,
+        measured_s=t_s
+        if measured
+        else never
+        if previous_estimate is None
+        else previous_estimate.measured_s,
+        small_measured_s=t_s
+        if small
+        else never
+        if previous_estimate is None
+        else previous_estimate.small_measured_s,
         stage=merged.stage,
         measured=measured,
         tracked=True,
-        unseen=merged.unseen,
-        **_convert_to_frames(merged, attitude, in_world, pipeline),
+        unseen=merged.unseen_frames,
+        **_express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline),
     )
 
 
-def _convert_to_frames(
+def _express_in_level_and_world(
     merged: MergedTarget,
     attitude: Attitude | None,
-    in_world: bool,
+    is_in_world_frame: bool,
     pipeline: Pipeline,
-    spread: bool = True,
+    with_sigma: bool = True,
 ) -> dict[str, Any]:
     place_m, yaw_rad = merged.xyz_yaw[:3], float(merged.xyz_yaw[3])
-    cov_m2, bias_m = merged.cov_m2, merged.bias_m
+    cov_m2, error_shifts_m = merged.cov_m2, merged.constant_error_shifts_m
     seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}
-    if attitude is not None and in_world:
+    if attitude is not None and is_in_world_frame:
         turn = attitude.R_world_level.T
         seen["world_m"], seen["world_yaw_rad"] = place_m, yaw_rad
         seen["e_m"], seen["e_yaw_rad"] = to_level(place_m, yaw_rad, attitude, pipeline.pose)
         seen["velocity_mps"] = turn.dot(merged.velocity_mps)
         seen["world_velocity_mps"] = merged.velocity_mps
-        if spread:
+        if with_sigma:
             cov_m2 = turn.dot(cov_m2).dot(turn.T)
-            bias_m = relative_bias_m(bias_m, attitude, pipeline.tracks.world_filter, pipeline.pose)
+            error_shifts_m = gear_to_target_error_shifts_m(
+                error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose
+            )
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
         if attitude is not None:
             world = to_world(place_m, yaw_rad, attitude, pipeline.pose)
             seen["world_m"], seen["world_yaw_rad"] = world
-    if spread:
-        variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
+    if with_sigma:
+        variance = cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)
         seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
         seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
     return seen

@@ -22,10 +22,10 @@ from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 
-_ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
-_PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
+_ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
+_PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
 _MIN_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
-_MAX_CURL_RESIDUAL_FRACTION = 0.5  # share that may remain if the curl of the sheet is the cause
+_MAX_CHI2_FRACTION_WITH_CURL = 0.5  # share that may remain if the curl of the sheet is the cause
 _Source = Literal["large", "small", "joint"]
 
 
@@ -62,7 +62,7 @@ def square_corners(side_m: float) -> Array:
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
-def level_rotation(attitude: Attitude | None) -> Array:
+def R_level_body_of(attitude: Attitude | None) -> Array:
     """Return ``R_level_body`` (3, 3); without an attitude, the vehicle is assumed level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
@@ -88,17 +88,17 @@ def estimate_pose(
         return None  # the lens model cannot image these corners
     K, lift = setup.camera.K, setup.curl_lift_m[source]
     points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
-    R_level_body = level_rotation(attitude)
+    R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
-        prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_RAD)
+        prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_SIGMA_RAD)
     else:
-        prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
-    most_px = setup.config.max_reprojection_px
-    solution = _refine_from_start(points, start, prior, most_px) or solve_pose(points, prior)
-    if solution is None or not solution.rms_px <= most_px:
+        prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_SIGMA_RAD)
+    max_rms_px = setup.config.max_reprojection_px
+    solution = _refine_from_start(points, start, prior, max_rms_px) or solve_pose(points, prior)
+    if solution is None or not solution.rms_px <= max_rms_px:
         return None
-    pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
+    pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
     if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
     if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
@@ -106,28 +106,29 @@ def estimate_pose(
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
     points = replace(points, is_curled=True)
-    settled = _refine_from_start(points, solution, prior, most_px)
+    settled = _refine_from_start(points, solution, prior, max_rms_px)
     if settled is None:
         return pose
-    bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
+    bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
     return (
         replace(bent, chi2=pose.chi2)
-        if bent.chi2 < _MAX_CURL_RESIDUAL_FRACTION * pose.chi2
+        if bent.chi2 < _MAX_CHI2_FRACTION_WITH_CURL * pose.chi2
         else pose
     )
 
 
 def _refine_from_start(
-    points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
+    points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, max_rms_px: float
 ) -> ScoredPose | None:
-    """Return the solution refined from `start` if its RMS error is at most `most_px`, else None."""
+    """Return the solution refined from `start` if its RMS error is at most `max_rms_px`, else
+    None."""
     solution = None if start is None else refine_pose(points, start)
-    if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
+    if solution is None or not solution.rms_px <= max_rms_px or prior.contradicts(solution):
         return None
     return solution
 
 
-def _level_pose(
+def _make_marker_pose(
     source: _Source,
     t_s: float,
     solution: ScoredPose,
@@ -140,10 +141,10 @@ def _level_pose(
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
     cov, chi2, curl = pose_covariance(points, solution)
     e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
-    heading = R_level_cam.dot(R).dot(R_MARKER_TARGET)
+    R_level_target = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # derivative of (e, e_yaw) by (rvec, tvec)
     G[:3, 3:] = R_level_cam
-    G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
+    G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR)
     cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by some share is further away by the same share of the distance.
     print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
@@ -156,26 +157,26 @@ def _level_pose(
         rvec_rad=solution.rvec,
         tvec_m=solution.tvec,
         e_m=e_m,
-        e_yaw_rad=yaw_of(heading),
+        e_yaw_rad=yaw_of(R_level_target),
         sigma_m=sigma[:3],
         sigma_yaw_rad=float(sigma[3]),
         reprojection_px=solution.rms_px,
         chi2=chi2,
-        cov=cov_e,
-        print_shift_m=print_shift_m,
-        camera_cov=cov,
+        xyz_yaw_cov=cov_e,
+        print_error_shifts_m=print_shift_m,
+        rvec_tvec_cov=cov,
     )
 
 
 def camera_covariance(pose: MarkerPose) -> Array:
     """Return a pose's covariance (6, 6) as small rotations (rad) about and translations (m) along
     the camera's x, y, z, without the errors of the print."""
-    assert pose.camera_cov is not None
+    assert pose.rvec_tvec_cov is not None
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
     turns = dR.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
     J = np.eye(6)
     J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
-    return np.asarray(J @ pose.camera_cov @ J.T)
+    return np.asarray(J @ pose.rvec_tvec_cov @ J.T)
 
 
 def rotation_matrix(rvec: Array) -> Array:
@@ -193,10 +194,10 @@ def normal_cam(pose: MarkerPose) -> Array:
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
-def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
+def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR: Array) -> Array:
     """Return the derivative (3,) of atan2(h[1, 0], h[0, 0]) by rvec through ``dR/drvec`` (3, 9)."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
-    hx, hy = float(heading[0, 0]), float(heading[1, 0])
+    hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
 
@@ -207,11 +208,11 @@ _MIN_FLIP_RAD = math.radians(2.0)  # solutions closer than this are the same
 _MIN_SCORE_SIGMA_PX = 0.05  # lens and print limit the information in smaller residuals
 _MAX_STEPS = 8
 # weight of the claimed spread against the residuals, in degrees of freedom
-_CLAIMED_SPREAD_DOF = 8.0
+_CLAIMED_SIGMA_DOF = 8.0
 
 _MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # rad and m
 # The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
-_MAX_LINEAR_MOTION_PX = 0.3
+_MAX_LINEARISED_MOTION_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,14 +243,14 @@ class TiltPrior:
     deviation."""
 
     normal_cam: Array | None
-    spread_rad: float
+    sigma_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
         """True if the candidate's normal differs from a known `normal_cam` by more than
         `spread_rad`."""
         return (
             self.normal_cam is not None
-            and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
+            and tilt_rad(candidate.rvec, self.normal_cam) > self.sigma_rad
         )
 
 
@@ -277,7 +278,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
         if points.is_curled:
-            weight = curl_weight(_whiten_curl(points, scored))
+            weight = curl_weight_matrix(_whitened_curl_effect(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -291,7 +292,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         # reduction of the cost by the step, in squared standard deviations
         gain = float(step.dot(g))
         moved_px = scored.jacobian.dot(step).reshape(-1, 2)
-        small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEAR_MOTION_PX
+        small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
         if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
             # Errors are linear in a step of this size.
             error_px = scored.error_px - moved_px
@@ -318,16 +319,16 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
-    curl = _whiten_curl(points, scored)
-    weight = curl_weight(curl) if points.is_curled else None
+    curl = _whitened_curl_effect(points, scored)
+    weight = curl_weight_matrix(curl) if points.is_curled else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
         return np.full((6, 6), np.inf), math.inf, np.zeros(6)
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
-    growth = max((_CLAIMED_SPREAD_DOF + chi2) / (_CLAIMED_SPREAD_DOF + freedom), 0.7)
-    common = gain.dot(points.shift)
+    growth = max((_CLAIMED_SIGMA_DOF + chi2) / (_CLAIMED_SIGMA_DOF + freedom), 0.7)
+    common = gain.dot(points.whitened_error_shifts)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
     curled, twisted = gain.dot(curl).T
@@ -336,7 +337,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     return cov, chi2 / freedom, curled
 
 
-def _whiten_curl(points: WeightedCorners, scored: ScoredPose) -> Array:
+def _whitened_curl_effect(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the effect of each mode of curl on the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane appears where a target moved along its normal would show it.
@@ -344,11 +345,11 @@ def _whiten_curl(points: WeightedCorners, scored: ScoredPose) -> Array:
     return np.asarray(points.whitening.dot(moved))
 
 
-def tilt_rad(rvec: Array, expected_cam: Array) -> float:
-    """Return the angle between a marker's normal at rotation `rvec` and the normal `expected_cam`,
-    rad."""
+def tilt_rad(rvec: Array, expected_normal_cam: Array) -> float:
+    """Return the angle between a marker's normal at rotation `rvec` and the normal
+    `expected_normal_cam`, rad."""
     normal = rotation_matrix(rvec)[:, 2]
-    return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
+    return math.acos(max(-1.0, min(1.0, float(normal @ expected_normal_cam))))
 
 
 def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
@@ -411,7 +412,7 @@ def _choose_likeliest(
     def cost(s: ScoredPose) -> float:
         total = float(((s.error_px / sigma) ** 2).sum())
         if prior.normal_cam is not None:
-            total += (tilt_rad(s.rvec, prior.normal_cam) / prior.spread_rad) ** 2
+            total += (tilt_rad(s.rvec, prior.normal_cam) / prior.sigma_rad) ** 2
         return total
 
     return min(scored, key=cost)
@@ -429,11 +430,11 @@ def curl_lift(object_m: Array, curl_per_m: float) -> Array:
     return lift.repeat(2, axis=0)
 
 
-def curl_weight(curl: Array) -> Array:
+def curl_weight_matrix(whitened_curl: Array) -> Array:
     """Return the weights ``(I + curl curl^T)^-1`` (2n, 2n) of errors; curl is (2n, k), one column
     per mode."""
-    inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
-    weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
+    inner = np.linalg.inv(np.eye(whitened_curl.shape[1]) + whitened_curl.T @ whitened_curl)
+    weight: Array = np.eye(len(whitened_curl)) - whitened_curl @ inner @ whitened_curl.T
     return weight
 
 
@@ -446,16 +447,18 @@ def curl_weight(curl: Array) -> Array:
 
 
 _IDENTITY_8 = np.eye(8)
-_LINE_TILT_SCALE = np.array(1.0 / math.sqrt(3.0))
+_TILT_WHITENING_FACTOR = np.array(1.0 / math.sqrt(3.0))
 _PREVIOUS_CORNER = np.array([3, 0, 1, 2])
 _SIDE_START = np.arange(4)  # side k runs from corner k ...
 _SIDE_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
-_SIDE_MATRIX_ROWS = np.concatenate([2 * np.tile(_SIDE_START, 4), 2 * np.tile(_SIDE_START, 4) + 1])
-_SIDE_MATRIX_COLUMNS = np.concatenate(
+_SIDE_WHITENING_ROWS = np.concatenate(
+    [2 * np.tile(_SIDE_START, 4), 2 * np.tile(_SIDE_START, 4) + 1]
+)
+_SIDE_WHITENING_COLUMNS = np.concatenate(
     [2 * _SIDE_START, 2 * _SIDE_START + 1, 2 * _SIDE_END, 2 * _SIDE_END + 1] * 2
 )
 # indices into a flattened (8, 8) matrix
-_SIDE_MATRIX_INDICES = 8 * _SIDE_MATRIX_ROWS + _SIDE_MATRIX_COLUMNS
+_SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMNS
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,7 +474,7 @@ class WeightedCorners:
     image_px: Array
     sigma_px: Array
     whitening: Array
-    shift: Array
+    whitened_error_shifts: Array
     K: Array
     curl_lift_m: Array
     is_curled: bool = False
@@ -482,18 +485,19 @@ def weigh_corners(
     object_m: Array,
     image_px: Array,
     K: Array,
-    lift: Array,
+    curl_lift_m: Array,
 ) -> WeightedCorners:
-    """Weigh the detections' corners: `image_px` in a pinhole camera K, `lift` from `curl_lift`."""
+    """Weigh the detections' corners: `image_px` in a pinhole camera K, `curl_lift_m` from
+    `curl_lift`."""
     n, m = len(image_px), len(detections)
-    W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
+    W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
     # A shift of all edges by one pixel moves a corner along the normals of both of its sides.
     moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
-        shift[rows, 0] = d.edge_shift_sigma_px * moved[i]
+        error_shifts[rows, 0] = d.edge_shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
@@ -506,21 +510,21 @@ def weigh_corners(
                 else _side_sigma_px(d, corners)
             )
             own = np.zeros(64)
-            own[_SIDE_MATRIX_INDICES] = _whitening_of_lines(normals[i], spread_px)
+            own[_SIDE_WHITENING_FLAT_INDICES] = _whitening_of_lines(normals[i], spread_px)
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
         if d.common_error_shift_px is not None:
-            shift[rows, 1] = d.common_error_shift_px.ravel()
+            error_shifts[rows, 1] = d.common_error_shift_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
             # As for a line: half to all of its rows shift alike, and they slant.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)
-            shift[along_x, 2 + 2 * i] = 0.5 * d.row_jitter_sigma_px
-            shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
+            error_shifts[along_x, 2 + 2 * i] = 0.5 * d.row_jitter_sigma_px
+            error_shifts[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
-    return WeightedCorners(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
+    return WeightedCorners(object_m, image_px, sigma_px, W, W.dot(error_shifts), K, curl_lift_m)
 
 
 def _outward_normals(corners: Array) -> Array:
@@ -535,19 +539,22 @@ def _outward_normals(corners: Array) -> Array:
     return normals
 
 
-def _side_sigma_px(d: Detection, corners: Array) -> Array:
+def _side_sigma_px(detection: Detection, corners: Array) -> Array:
     """Return the standard deviation of each side, (4,): larger for a side along the rows."""
     sides = corners.take(_SIDE_END, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])
     return np.asarray(
-        np.hypot(d.sigma_px, d.horizontal_side_extra_sigma_px * lying / np.hypot(1.0, rows))
+        np.hypot(
+            detection.sigma_px,
+            detection.horizontal_side_extra_sigma_px * lying / np.hypot(1.0, rows),
+        )
     )
 
 
 def _whitening_of_lines(normals: Array, sigma_px: float | Array) -> Array:
     """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
-    `_SIDE_MATRIX_INDICES`; `sigma_px` is a scalar for all lines, or (4,)."""
+    `_SIDE_WHITENING_FLAT_INDICES`; `sigma_px` is a scalar for all lines, or (4,)."""
     across = (normals.T / sigma_px).ravel()
-    tilt = across * _LINE_TILT_SCALE
+    tilt = across * _TILT_WHITENING_FACTOR
     return np.concatenate([across, across, -tilt, tilt])

@@ -42,7 +42,7 @@ but not refused."""
 
 
 def marker_offset_m(
-    place: OwnTargetPosition,
+    own_target: OwnTargetPosition,
     t_s: float,
     attitude: Attitude | None,
     setup: PoseSetup,
@@ -50,38 +50,40 @@ def marker_offset_m(
     corners_px: Array,
 ) -> float:
     """Return `target_offset_m` for a marker's corners (4, 2) px; infinite beyond
-    `place.max_distance_m`."""
+    `own_target.max_distance_m`."""
     seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    offset_m = _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, place, setup)
-    is_bounded = attitude is not None and math.isfinite(place.max_distance_m)
-    return offset_m if not is_bounded or offset_m <= place.max_distance_m else math.inf
+    offset_m = (
+        _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, own_target, setup)
+    )
+    is_bounded = attitude is not None and math.isfinite(own_target.max_distance_m)
+    return offset_m if not is_bounded or offset_m <= own_target.max_distance_m else math.inf
 
 
 def target_offset_m(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPosition, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
     """Return a target's horizontal distance from the own target's position; from the gear if
     unknown."""
-    if place.xy_m is None or attitude is None:
+    if own_target.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
-    return math.hypot(seen_m[0] - place.xy_m[0], seen_m[1] - place.xy_m[1])
+    return math.hypot(seen_m[0] - own_target.xy_m[0], seen_m[1] - own_target.xy_m[1])
 
 
 def refusal_text(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPosition, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
     """Return the message that a pose is another vehicle's target; None if it may be the own
     target."""
-    if attitude is None or place.xy_m is None:
+    if attitude is None or own_target.xy_m is None:
         return None
-    offset_m = target_offset_m(pose, attitude, place, setup)
-    if offset_m <= place.max_distance_m:
+    offset_m = target_offset_m(pose, attitude, own_target, setup)
+    if offset_m <= own_target.max_distance_m:
         return None
     return (
         f"a target {offset_m:.2f} m from target.expected_xy_m is ignored "
-        f"(target.expected_within_m is {place.max_distance_m:g} m)"
+        f"(target.expected_within_m is {own_target.max_distance_m:g} m)"
     )
 
 
@@ -117,45 +119,46 @@ def to_level(
 def track_measurement(
     pose: MarkerPose,
     attitude: Attitude | None,
-    in_world: bool,
-    constants: FilterSetup,
+    is_in_world_frame: bool,
+    filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
     """Return a pose as a measurement for the filter, in the world or the level frame."""
     z, lever_m = np.empty(4), pose.e_m  # an error of the tilt turns the lever
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
-    if in_world:
+    if is_in_world_frame:
         assert attitude is not None
         lever_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
         z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
-    if constants.process is None or pose.cov is None:
+    if filter_setup.process_noise is None or pose.xyz_yaw_cov is None:
         return Measurement(z)
-    noise = pose.cov.copy()
-    noise[:3, :3] -= pose.print_shift_m.dot(pose.print_shift_m.T)
-    bias = np.zeros((4, 4))
-    bias[1:, PRINT] = pose.print_shift_m
+    noise = pose.xyz_yaw_cov.copy()
+    noise[:3, :3] -= pose.print_error_shifts_m.dot(pose.print_error_shifts_m.T)
+    constant_error_shifts = np.zeros((4, 4))
+    constant_error_shifts[1:, PRINT] = pose.print_error_shifts_m
     if attitude is not None:
-        bias[1:, TILTS] = tilt_jacobian(lever_m) * constants.tilt_sigma_rad
-    if in_world and attitude is not None:
+        constant_error_shifts[1:, TILTS] = tilt_jacobian(lever_m) * filter_setup.tilt_sigma_rad
+    if is_in_world_frame and attitude is not None:
         turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
-        bias[1:] = attitude.R_world_level.dot(bias[1:])
+        constant_error_shifts[1:] = attitude.R_world_level.dot(constant_error_shifts[1:])
     R = (
         np.asarray(noise[_YAW_FIRST_INDICES] + _MIN_MEASUREMENT_COVARIANCE)
         if is_finite(noise)
         else None
     )
-    return Measurement(z, R, bias)
+    return Measurement(z, R, constant_error_shifts)
 
 
-def relative_bias_m(
-    bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
+def gear_to_target_error_shifts_m(
+    target_error_shifts_m: Array, attitude: Attitude, filter_setup: FilterSetup, setup: PoseSetup
 ) -> Array:
     """Return the effect (3, 4) of constant errors on the vector from gear to target in level axes:
-    `bias_m` (3, 4) of the target minus the effect of roll and pitch errors on the gear."""
+    `target_error_shifts_m` (3, 4) of the target minus the effect of roll and pitch errors on the
+    gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
-    moved = attitude.R_world_level.T.dot(bias_m)
-    moved[:, TILTS] -= tilt_jacobian(gear_level) * constants.tilt_sigma_rad
+    moved = attitude.R_world_level.T.dot(target_error_shifts_m)
+    moved[:, TILTS] -= tilt_jacobian(gear_level) * filter_setup.tilt_sigma_rad
     return np.asarray(moved)

@@ -26,13 +26,13 @@ from perchctl.vision.target_selection import OwnTargetPosition, refusal_text, tr
 from perchctl.vision.types import (
     Attitude,
     LastPose,
-    Lock,
     MarkerName,
     MarkerPose,
     MarkerTrack,
     MeasuredMarkers,
     PipelineState,
     RivalTrack,
+    TargetLock,
 )
 
 
@@ -47,9 +47,9 @@ class TrackSetup:
     has_gate: bool
     own_target: OwnTargetPosition
 
-    def select_filter(self, in_world: bool) -> FilterSetup:
+    def select_filter(self, is_in_world_frame: bool) -> FilterSetup:
         """Return the filters' constants in the world or the level frame."""
-        return self.world_filter if in_world else self.level_filter
+        return self.world_filter if is_in_world_frame else self.level_filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class TrackedFrame:
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
     verdict: GateVerdict
-    lock: Lock | None = None
+    lock: TargetLock | None = None
     rival: RivalTrack | None = None
 
 
@@ -69,51 +69,58 @@ def update_tracks(
     measured: MeasuredMarkers,
     t_s: float,
     attitude: Attitude | None,
-    in_world: bool,
+    is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
     """Return the tracks after a frame, updated with the poses that the gate accepts."""
-    constants = setup.select_filter(in_world)
-    used_poses = {
-        name: track_measurement(pose, attitude, in_world, constants, setup.pose)
-        for name, pose in measured.used_poses.items()
+    filter_setup = setup.select_filter(is_in_world_frame)
+    measurements = {
+        name: track_measurement(pose, attitude, is_in_world_frame, filter_setup, setup.pose)
+        for name, pose in measured.poses_by_track.items()
     }
-    old = state.tracks if state.in_world == in_world else {}
-    sight, verdict = None, GateVerdict(accepted=True, rival=state.rival)
+    old = state.tracks if state.are_tracks_in_world_frame == is_in_world_frame else {}
+    frame_pose, verdict = None, GateVerdict(accepted=True, rival=state.rival)
     pose = measured.most_certain_pose
-    if used_poses and pose is not None:
-        name = next(n for n, each in measured.used_poses.items() if each is pose)
-        whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-        sight = FramePose(
-            t_s, pose, used_poses[name], in_world, whole, is_camera_alone=attitude is None
+    if measurements and pose is not None:
+        name = next(n for n, each in measured.poses_by_track.items() if each is pose)
+        whole = pose.source == "joint" or (
+            len(measured.poses) > 1 and not measured.are_markers_contradicting
+        )
+        frame_pose = FramePose(
+            t_s,
+            pose,
+            measurements[name],
+            is_in_world_frame,
+            whole,
+            is_attitude_unknown=attitude is None,
         )
         if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
-            looks = not in_world or is_in_view(place_m, attitude, setup.pose)
-            sight = replace(sight, is_lock_in_view=looks)
+            looks = not is_in_world_frame or is_in_view(place_m, attitude, setup.pose)
+            frame_pose = replace(frame_pose, is_lock_in_view=looks)
         if setup.has_gate:
-            verdict = judge_pose(state.lock, state.rival, sight, constants)
+            verdict = judge_pose(state.lock, state.rival, frame_pose, filter_setup)
         # A locked target stays locked, however far the estimate's world frame has drifted
         # meanwhile.
-        goes_on = not verdict.restarts_track or verdict.same_target
+        goes_on = not verdict.restarts_track or verdict.is_same_target
         goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
         another = None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose)
         if another is not None and verdict.accepted:
             verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
     if not verdict.accepted:
-        measured, used_poses = replace(measured, used_poses={}), {}
+        measured, measurements = replace(measured, poses_by_track={}), {}
     begun = {} if verdict.restarts_track else old
     stepped = {
-        n: step_track(begun.get(n), used_poses.get(n), t_s, constants)
-        for n in {**begun, **used_poses}
+        n: step_track(begun.get(n), measurements.get(n), t_s, filter_setup)
+        for n in {**begun, **measurements}
     }
     tracks = {n: track for n, track in stepped.items() if track is not None}
     if not setup.has_gate:
         return TrackedFrame(measured, tracks, verdict)
     lock, rival = drop_expired(state.lock, verdict.rival, t_s)
-    if sight is not None and verdict.accepted and tracks:
-        most_certain = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
-        lock = update_lock(lock, most_certain, sight, verdict)
+    if frame_pose is not None and verdict.accepted and tracks:
+        most_certain = min(tracks.values(), key=lambda t: (t.unseen_frames, float(np.trace(t.P))))
+        lock = update_lock(lock, most_certain, frame_pose, verdict)
     return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 
@@ -165,7 +172,7 @@ _MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
 _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
 _POSITION_AXES: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-_MIN_REPORTED_ROTATION_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
+_MIN_ROTATION_TO_REPORT_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # largest share of the squared misfit that the better of two explanations may leave
@@ -181,10 +188,10 @@ class FramePose:
     t_s: float
     pose: MarkerPose
     measured: Measurement
-    in_world: bool
+    is_in_world_frame: bool
     has_both_markers: bool
     is_lock_in_view: bool = True
-    is_camera_alone: bool = False
+    is_attitude_unknown: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,48 +204,56 @@ class GateVerdict:
 
     accepted: bool
     restarts_track: bool = False
-    same_target: bool = False
+    is_same_target: bool = False
     rival: RivalTrack | None = None
     text: str = ""
     is_foreign_target: bool = False  # another vehicle's target, by its position
 
 
 def judge_pose(
-    lock: Lock | None, rival: RivalTrack | None, sight: FramePose, constants: FilterSetup
+    lock: TargetLock | None,
+    rival: RivalTrack | None,
+    frame_pose: FramePose,
+    filter_setup: FilterSetup,
 ) -> GateVerdict:
-    """Return the gate's verdict on a frame's pose `sight`, given the lock and the rival, if any."""
-    lock, rival = drop_expired(lock, rival, sight.t_s)
-    if rival is not None and rival.in_world != sight.in_world:
+    """Return the gate's verdict on a frame's pose `frame_pose`, given the lock and the rival, if
+    any."""
+    lock, rival = drop_expired(lock, rival, frame_pose.t_s)
+    if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
-    if lock is None or lock.in_world != sight.in_world:
+    if lock is None or lock.is_in_world_frame != frame_pose.is_in_world_frame:
         return GateVerdict(accepted=True)
-    if sight.t_s <= lock.track.t_s:  # the tracks are newer
+    if frame_pose.t_s <= lock.track.t_s:  # the tracks are newer
         return GateVerdict(accepted=False, rival=rival)
-    if rival is None and _is_clearly_consistent(lock.track, sight, constants):
+    if rival is None and _is_clearly_consistent(lock.track, frame_pose, filter_setup):
         return GateVerdict(accepted=True)
-    fit = _compute_misfit(lock.track, sight, constants)
-    other = None if rival is None else _compute_misfit(rival.track, sight, constants)
-    theirs = other is not None and other.squared <= _GATE_CHI2
-    if fit.squared <= _GATE_CHI2 and not (theirs and other is not None and other.cost < fit.cost):
+    misfit = _compute_misfit(lock.track, frame_pose, filter_setup)
+    rival_misfit = None if rival is None else _compute_misfit(rival.track, frame_pose, filter_setup)
+    theirs = rival_misfit is not None and rival_misfit.squared_mahalanobis <= _GATE_CHI2
+    if misfit.squared_mahalanobis <= _GATE_CHI2 and not (
+        theirs
+        and rival_misfit is not None
+        and rival_misfit.log_likelihood_cost < misfit.log_likelihood_cost
+    ):
         return GateVerdict(accepted=True, rival=rival)
-    if not theirs and _matches_last_view(lock, sight, fit.residual):
+    if not theirs and _matches_last_view(lock, frame_pose, misfit.residual):
         return GateVerdict(
-            accepted=True, restarts_track=True, same_target=True, text=_ESTIMATE_JUMPED_TEXT
+            accepted=True, restarts_track=True, is_same_target=True, text=_ESTIMATE_JUMPED_TEXT
         )
-    if not theirs and _matches_previous_track(lock, sight, fit.residual, constants):
+    if not theirs and _matches_previous_track(lock, frame_pose, misfit.residual, filter_setup):
         return GateVerdict(
-            accepted=True, restarts_track=True, same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
+            accepted=True, restarts_track=True, is_same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
         )
-    seen = _update_rival(rival if theirs else None, sight, fit, constants)
-    if _is_rival_accepted(lock, seen, sight):
-        text = f"target reacquired {fit.distance_m:.2f} m from its expected position"
+    seen = _update_rival(rival if theirs else None, frame_pose, misfit, filter_setup)
+    if _is_rival_accepted(lock, seen, frame_pose):
+        text = f"target reacquired {misfit.distance_m:.2f} m from its expected position"
         return GateVerdict(accepted=True, restarts_track=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
 
 def drop_expired(
-    lock: Lock | None, rival: RivalTrack | None, t_s: float
-) -> tuple[Lock | None, RivalTrack | None]:
+    lock: TargetLock | None, rival: RivalTrack | None, t_s: float
+) -> tuple[TargetLock | None, RivalTrack | None]:
     """Return the lock and the rival, with None for each that has expired at `t_s`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
@@ -246,7 +261,7 @@ def drop_expired(
         return None, None
     age_s = t_s - lock.track.t_s
     # A position in the level frame expires soon, but a rival stays a rival.
-    lasting = lock.in_world or rival is not None
+    lasting = lock.is_in_world_frame or rival is not None
     # After the clock was set back, no older track can be confirmed.
     if age_s < -MAX_TRACK_GAP_S or age_s > (LOCK_TIMEOUT_S if lasting else MAX_TRACK_GAP_S):
         return None, None
@@ -254,32 +269,46 @@ def drop_expired(
 
 
 def predict_rival_state(
-    lock: Lock | None, rival: RivalTrack | None, in_world: bool, t_s: float, constants: FilterSetup
+    lock: TargetLock | None,
+    rival: RivalTrack | None,
+    is_in_world_frame: bool,
+    t_s: float,
+    filter_setup: FilterSetup,
 ) -> Array | None:
     """Return the rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
 
     Until one of the two is confirmed, the target may be at either position.
     """
-    if lock is None or rival is None or not lock.in_world == rival.in_world == in_world:
+    if (
+        lock is None
+        or rival is None
+        or not lock.is_in_world_frame == rival.is_in_world_frame == is_in_world_frame
+    ):
         return None
     if rival.track.t_s <= lock.track.t_s:
         return None
-    return predict_track(rival.track, t_s, constants, with_cov=False).x
+    return predict_track(rival.track, t_s, filter_setup, with_cov=False).x
 
 
 def update_lock(
-    lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
-) -> Lock:
-    """Return the lock after the accepted pose `sight`, with the track that the pose updated."""
-    anew = verdict.restarts_track and not verdict.same_target
-    before = None if lock is None or anew or lock.in_world != sight.in_world else lock
-    return Lock(
+    lock: TargetLock | None, track: MarkerTrack, frame_pose: FramePose, verdict: GateVerdict
+) -> TargetLock:
+    """Return the lock after the accepted pose `frame_pose`, with the track that the pose
+    updated."""
+    anew = verdict.restarts_track and not verdict.is_same_target
+    before = (
+        None
+        if lock is None or anew or lock.is_in_world_frame != frame_pose.is_in_world_frame
+        else lock
+    )
+    return TargetLock(
         track=track,
-        pose=sight.pose,
-        in_world=sight.in_world,
-        frames=1 if before is None else before.frames + 1,
-        has_both_markers=sight.has_both_markers or (before is not None and before.has_both_markers),
-        before=None if before is None else before.track,
+        pose=frame_pose.pose,
+        is_in_world_frame=frame_pose.is_in_world_frame,
+        accepted_frames=1 if before is None else before.accepted_frames + 1,
+        has_both_markers=frame_pose.has_both_markers
+        or (before is not None and before.has_both_markers),
+        track_before_last_pose=None if before is None else before.track,
     )
 
 
@@ -294,43 +323,56 @@ class _Misfit:
     S: Array
 
     @cached_property
-    def squared(self) -> float:
+    def squared_mahalanobis(self) -> float:
         return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
     @property
-    def cost(self) -> float:
+    def log_likelihood_cost(self) -> float:
         """The squared distance plus a penalty for a larger covariance (negative log likelihood)."""
-        return self.squared + float(np.linalg.slogdet(self.S)[1])
+        return self.squared_mahalanobis + float(np.linalg.slogdet(self.S)[1])
 
     @property
     def distance_m(self) -> float:
         return float(np.linalg.norm(self.residual[1:]))
 
 
-def _compute_misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Misfit:
-    wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
+def _compute_misfit(
+    track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
+) -> _Misfit:
+    wanted, measured = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measured
     # The largest drift counts as three standard deviations.
-    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
+    drift_m = min(filter_setup.max_drift_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
     residual = measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     # A constant error shifts both.
-    bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
-    R = constants.R if measured.R is None else measured.R
-    S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _POSITION_AXES + R + bias @ bias.T
-    return _Misfit(residual, S + np.diag(_unmodelled_sigma(_range_m(sight)) ** 2))
+    error_shifts = (
+        wanted.constant_error_shifts[MEASURED]
+        if measured.constant_error_shifts is None
+        else measured.constant_error_shifts - wanted.constant_error_shifts[MEASURED]
+    )
+    R = filter_setup.R if measured.R is None else measured.R
+    S = (
+        wanted.P[MEASURED, MEASURED]
+        + drift_m**2 * _POSITION_AXES
+        + R
+        + error_shifts @ error_shifts.T
+    )
+    return _Misfit(residual, S + np.diag(_unmodelled_sigma(_range_m(frame_pose)) ** 2))
 
 
-def _is_clearly_consistent(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
+def _is_clearly_consistent(
+    track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
+) -> bool:
     """True if errors outside any covariance explain the misfit, as in most frames: a fast check."""
-    wanted = predict_track(track, sight.t_s, constants, with_cov=False)
-    residual = sight.measured.z - wanted.x[MEASURED]
+    wanted = predict_track(track, frame_pose.t_s, filter_setup, with_cov=False)
+    residual = frame_pose.measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
-    residual /= _unmodelled_sigma(_range_m(sight))
+    residual /= _unmodelled_sigma(_range_m(frame_pose))
     return float(residual @ residual) <= _GATE_CHI2
 
 
-def _range_m(sight: FramePose) -> float:
-    return math.hypot(*sight.pose.tvec_m.tolist())
+def _range_m(frame_pose: FramePose) -> float:
+    return math.hypot(*frame_pose.pose.tvec_m.tolist())
 
 
 def _unmodelled_sigma(range_m: float) -> Array:
@@ -342,96 +384,100 @@ def _unmodelled_sigma(range_m: float) -> Array:
     return np.array([_MIN_UNMODELLED_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _matches_last_view(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
+def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: Array) -> bool:
     """True if the pose fits the vehicle's last view of the target much better than its position in
     the world."""
-    dt_s = sight.t_s - lock.track.t_s
-    if not sight.in_world or dt_s > _MAX_CALM_DURATION_S:
+    dt_s = frame_pose.t_s - lock.track.t_s
+    if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
-    range_m = _range_m(sight)
-    residual = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
-    residual[1:] = sight.pose.e_m - lock.pose.e_m
+    range_m = _range_m(frame_pose)
+    residual = np.array([wrap_rad(frame_pose.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
+    residual[1:] = frame_pose.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unmodelled_sigma(range_m)
-    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, off_in_world))
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, world_residual))
     calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _GATE_CHI2
     return calm and seen < _MAX_REMAINING_MISFIT_FRACTION * jumped
 
 
 def _matches_previous_track(
-    lock: Lock, sight: FramePose, residual: Array, constants: FilterSetup
+    lock: TargetLock, frame_pose: FramePose, residual: Array, filter_setup: FilterSetup
 ) -> bool:
     """True if the pose fits the track before the lock's last pose much better than the present
     track, from which it differs by `residual`. At few pictures per second, a single wrong pose
     passes the gate and gives the track of a camera alone a wrong velocity."""
-    if lock.before is None or sight.in_world:
+    if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
-    fit, unclaimed = (
-        _compute_misfit(lock.before, sight, constants),
-        _unmodelled_sigma(_range_m(sight)),
+    misfit, unclaimed = (
+        _compute_misfit(lock.track_before_last_pose, frame_pose, filter_setup),
+        _unmodelled_sigma(_range_m(frame_pose)),
     )
-    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.residual, residual))
-    return fit.squared <= _GATE_CHI2 and before < _MAX_REMAINING_MISFIT_FRACTION * now
+    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (misfit.residual, residual))
+    return (
+        misfit.squared_mahalanobis <= _GATE_CHI2 and before < _MAX_REMAINING_MISFIT_FRACTION * now
+    )
 
 
 # --- Rivals ---
 
 
 def _update_rival(
-    before: RivalTrack | None, sight: FramePose, fit: _Misfit, constants: FilterSetup
+    before: RivalTrack | None, frame_pose: FramePose, misfit: _Misfit, filter_setup: FilterSetup
 ) -> RivalTrack:
     if before is not None:
-        track = step_track(before.track, sight.measured, sight.t_s, constants)
+        track = step_track(before.track, frame_pose.measured, frame_pose.t_s, filter_setup)
         assert track is not None
-        whole = before.whole_frames + int(sight.has_both_markers)
-        return replace(before, track=track, frames=before.frames + 1, whole_frames=whole)
-    turned_rad, farther_m = abs(float(fit.residual[0])), float(fit.residual[3])
-    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(fit.S[3, 3])
-    where = f"{fit.distance_m:.2f} m away from it"
-    if turned_rad > _MIN_REPORTED_ROTATION_RAD:
+        whole = before.frames_with_both_markers + int(frame_pose.has_both_markers)
+        return replace(
+            before, track=track, seen_frames=before.seen_frames + 1, frames_with_both_markers=whole
+        )
+    turned_rad, farther_m = abs(float(misfit.residual[0])), float(misfit.residual[3])
+    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(misfit.S[3, 3])
+    where = f"{misfit.distance_m:.2f} m away from it"
+    if turned_rad > _MIN_ROTATION_TO_REPORT_RAD:
         where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
     if has_different_range:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or it has another size"
     return RivalTrack(
-        track=start_track(sight.measured, sight.t_s, constants),
-        in_world=sight.in_world,
-        since_s=sight.t_s,
-        frames=1,
-        whole_frames=int(sight.has_both_markers),
+        track=start_track(frame_pose.measured, frame_pose.t_s, filter_setup),
+        is_in_world_frame=frame_pose.is_in_world_frame,
+        since_s=frame_pose.t_s,
+        seen_frames=1,
+        frames_with_both_markers=int(frame_pose.has_both_markers),
         has_different_range=has_different_range,
         text=where,
     )
 
 
-def _is_rival_accepted(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
-    if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
+def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
+    if lock.accepted_frames < ESTABLISHED_FRAMES and rival.seen_frames > lock.accepted_frames:
         return True
-    if sight.is_camera_alone and _has_jumped(lock, rival, sight):
+    if frame_pose.is_attitude_unknown and _is_rival_likely_target(lock, rival, frame_pose):
         return True
-    if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both_markers:
+    if rival.frames_with_both_markers < ESTABLISHED_FRAMES or not frame_pose.has_both_markers:
         return False
     if not lock.has_both_markers:
         return True
-    unseen_s = sight.t_s - max(rival.since_s, lock.track.t_s)
+    unseen_s = frame_pose.t_s - max(rival.since_s, lock.track.t_s)
     # A position outside the picture is not known to be empty.
     return (
-        (sight.is_lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
+        (frame_pose.is_lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.has_different_range
-        and rival.whole_frames >= REACQUIRE_FRAMES
+        and rival.frames_with_both_markers >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )
 
 
-def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
+def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     """True if the rival is most likely the target, after the camera has moved during lost
     frames."""
-    if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
+    if rival.since_s < lock.track.t_s or frame_pose.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
         return False
     if not lock.has_both_markers:
-        return rival.frames >= ESTABLISHED_FRAMES
-    return sight.has_both_markers and rival.whole_frames >= ESTABLISHED_FRAMES
+        return rival.seen_frames >= ESTABLISHED_FRAMES
+    return frame_pose.has_both_markers and rival.frames_with_both_markers >= ESTABLISHED_FRAMES
 
 
 # --- Expected position of the target in the next picture ---
@@ -439,24 +485,24 @@ def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
 # and as velocity times time. Each is weighted by its recent errors in the target's own pictures.
 
 
-_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each picture replaces
+_MOTION_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each picture replaces
 
 
 def expected_corners(
-    sight: LastPose | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
+    last_pose: LastPose | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Return the expected corners of both markers, (4, 2) px, and the expected pose of the target:
     the last pose, moved by the vehicle's motion.
 
     Without both attitudes: None and the unmoved pose. Without a recent pose: None and None.
     """
-    if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
+    if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
-    pose, then = sight.pose, sight.attitude
+    pose, then = last_pose.pose, last_pose.attitude
     if attitude is None or then is None:
         return None, PoseCandidate(pose.rvec_rad, pose.tvec_m)
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
-    by_place, by_speed = sight.error_rad2
+    by_place, by_speed = last_pose.error_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
     stepped_m, flown_m = _camera_displacements_m(then, attitude, setup)
     moved_m = stepped_m + share * (flown_m - stepped_m)
@@ -473,32 +519,34 @@ def expected_corners(
 
 
 def update_last_pose(
-    before: LastPose | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
+    previous: LastPose | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> LastPose:
-    """Return the record of a new pose, with the errors of the estimated motion since `before`."""
-    if before is None:
+    """Return the record of a new pose, with the errors of the estimated motion since `previous`."""
+    if previous is None:
         return LastPose(pose, attitude)
-    then, passed_s = before.attitude, pose.t_s - before.pose.t_s
+    then, passed_s = previous.attitude, pose.t_s - previous.pose.t_s
     if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
-        return LastPose(pose, attitude, before.error_rad2)
+        return LastPose(pose, attitude, previous.error_rad2)
     R = _R_world_cam(attitude, setup)
-    seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
+    seen_m = _R_world_cam(then, setup).dot(previous.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the line of sight, because the distance of a far target is uncertain along it.
     residual = [
         R.T.dot(displacement_m - seen_m)[:2] / pose.tvec_m[2]
         for displacement_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
-        old + _ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
-        for old, new in zip(before.error_rad2, residual, strict=True)
+        old + _MOTION_ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
+        for old, new in zip(previous.error_rad2, residual, strict=True)
     )
     return LastPose(pose, attitude, (by_place, by_speed))
 
 
-def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
+def is_in_view(position_world_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
-    tvec_m = R.T @ (place_m - attitude.position_m - _camera_offset_m(attitude, setup))
+    tvec_m = R.T @ (
+        position_world_m - attitude.position_m - _vehicle_to_camera_world_m(attitude, setup)
+    )
     # Further off the axis, a lens model may fold back into the picture.
     if (
         tvec_m[2] <= 0.0
@@ -512,7 +560,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 def _camera_displacements_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
     """Return the camera's displacement (3,) from the estimated positions, and from the
     velocities."""
-    turned_m = _camera_offset_m(now, setup) - _camera_offset_m(then, setup)
+    turned_m = _vehicle_to_camera_world_m(now, setup) - _vehicle_to_camera_world_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
         return stepped_m, stepped_m
@@ -525,7 +573,7 @@ def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
     return R_world_cam
 
 
-def _camera_offset_m(attitude: Attitude, setup: PoseSetup) -> Array:
+def _vehicle_to_camera_world_m(attitude: Attitude, setup: PoseSetup) -> Array:
     """Return the vector from the vehicle to the camera in the world, (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -238,10 +238,11 @@ class MarkerPose:
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
         reprojection_px: RMS error of the corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
-        cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        print_shift_m: shift of `e_m` by one standard deviation of the print's size and of the
-            sheet's curl, (3, 2). Included in `sigma_m` and `cov`, but identical in every frame.
-        camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
+        xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
+        print_error_shifts_m: shift of `e_m` by one standard deviation of the print's size and of
+            the sheet's curl, (3, 2). Included in `sigma_m` and `xyz_yaw_cov`, but identical in
+            every frame.
+        rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
     """
 
     source: Literal["large", "small", "joint"]
@@ -254,9 +255,9 @@ class MarkerPose:
     sigma_yaw_rad: float
     reprojection_px: float
     chi2: float = 0.0
-    cov: Array | None = None
-    print_shift_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
-    camera_cov: Array | None = None
+    xyz_yaw_cov: Array | None = None
+    print_error_shifts_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
+    rvec_tvec_cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,21 +266,22 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. `bias` (8, 4) is the shift of the state by one standard deviation of each constant
-    error: the vehicle's roll and pitch, the print's size and curl. `unseen` counts the frames since
-    the last measurement.
+    motion. `constant_error_shifts` (8, 4) is the shift of the state by one standard deviation of
+    each constant
+    error: the vehicle's roll and pitch, the print's size and curl. `unseen_frames` counts the
+    frames since the last measurement.
     """
 
     t_s: float
     x: Array
     P: Array
-    unseen: int = 0
-    bias: Array = field(default_factory=lambda: np.zeros((8, 4)))
+    unseen_frames: int = 0
+    constant_error_shifts: Array = field(default_factory=lambda: np.zeros((8, 4)))
 
     @property
     def cov(self) -> Array:
         """Covariance (8, 8) of the state, including the constant errors."""
-        return self.P + self.bias @ self.bias.T
+        return self.P + self.constant_error_shifts @ self.constant_error_shifts.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,17 +339,17 @@ class LastPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Lock:
+class TargetLock:
     """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `frames` with a pose, whether any pose used both markers, and the track
-    `before` the last pose, None for the first pose."""
+    frame, the number of `accepted_frames` with a pose, whether any pose used both markers, and the
+    track `track_before_last_pose` the last pose, None for the first pose."""
 
     track: MarkerTrack
     pose: MarkerPose
-    in_world: bool
-    frames: int
+    is_in_world_frame: bool
+    accepted_frames: int
     has_both_markers: bool
-    before: MarkerTrack | None = None
+    track_before_last_pose: MarkerTrack | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,10 +359,10 @@ class RivalTrack:
     whether its range differs from the target's."""
 
     track: MarkerTrack
-    in_world: bool
+    is_in_world_frame: bool
     since_s: float
-    frames: int
-    whole_frames: int
+    seen_frames: int
+    frames_with_both_markers: int
     has_different_range: bool
     text: str
 
@@ -368,18 +370,18 @@ class RivalTrack:
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
     """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order;
-    `used_poses`, the poses that update a track, by the track's name; and whether the two markers
-    contradict each other."""
+    `poses_by_track`, the poses that update a track, by the track's name; and whether the two
+    markers contradict each other."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
-    used_poses: dict[str, MarkerPose] = field(default_factory=dict)
-    contradicting: bool = False
+    poses_by_track: dict[str, MarkerPose] = field(default_factory=dict)
+    are_markers_contradicting: bool = False
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
         """The pose with the smallest standard deviation in `used_poses`, otherwise in `poses`; None
         without poses."""
-        poses = self.used_poses or self.poses
+        poses = self.poses_by_track or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
@@ -404,14 +406,16 @@ class PipelineState:
     """The pipeline's whole memory; `PipelineState()` is a fresh start."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
-    in_world: bool = False  # frame of the tracks: world of the state estimate, or level
+    are_tracks_in_world_frame: bool = (
+        False  # frame of the tracks: world of the state estimate, or level
+    )
     measured: MeasuredMarkers = MeasuredMarkers()  # poses of the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last_detections: Detections | None = None
     last_pose: LastPose | None = None  # the last pose
     disagreeing_frames: int = 0
     empty_frames: int = 0  # number of successive frames without a marker
-    lock: Lock | None = None
+    lock: TargetLock | None = None
     rival: RivalTrack | None = None
     field_state: FieldState = FieldState()
 
@@ -427,7 +431,7 @@ class PipelineOutput:
     disagreeing_frames: int = 0  # number of successive frames with contradicting markers
     picture_kind: PictureKind = "whole"  # kind of the picture
     lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
-    refused: bool = False  # this frame showed another vehicle's target, by its position
+    is_foreign_target: bool = False  # this frame showed another vehicle's target, by its position
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ def test_a_message_has_ros_s_order_axes_and_covariance(
     (message,), (transform,) = published(node, port, record)
 
     solved, R_true = output.poses["joint"], np.asarray(cv2.Rodrigues(rvec)[0]) @ R_MARKER_TARGET
-    assert solved.camera_cov is not None
+    assert solved.rvec_tvec_cov is not None
     position_m = np.array(values(message.pose.pose.position))
     R = Rotation.from_quat(values(message.pose.pose.orientation))  # scalar last, as in ROS
     assert np.linalg.norm(position_m - tvec) < 0.02 * np.linalg.norm(tvec)
@@ -128,7 +128,7 @@ def test_a_message_has_ros_s_order_axes_and_covariance(
     for about_x in (0.0, 1.1):  # in the camera's frame, and as tf2 turns it into another one
         Q = Rotation.from_euler("xyz", [about_x, 0.4 * about_x, -2.0 * about_x]).as_matrix()
         both = np.kron(np.eye(2), Q)
-        expected = spread_of(solved.rvec_rad, solved.tvec_m, solved.camera_cov, Q)
+        expected = spread_of(solved.rvec_rad, solved.tvec_m, solved.rvec_tvec_cov, Q)
         sigmas = np.sqrt(expected.diagonal())
         off = (both @ covariance @ both.T - expected) / np.outer(sigmas, sigmas)
         assert np.abs(off).max() < 1e-3

@@ -193,6 +193,6 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
         ):
             pose = estimate_pose([d], 0.0, None, setup.pose)
             e = pose.tvec_m - T[1]
-            squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
+            squares[name].append(float(e @ np.linalg.solve(pose.xyz_yaw_cov[:3, :3], e)) / 3.0)
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0

@@ -109,7 +109,7 @@ def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
     rates, position = track.x[RATES].copy(), track.x[POSITION].copy()
     for n in range(1, CONFIG.n_max + 1):
         track = step_track(track, None, n / 30, SETUP)
-        assert track.unseen == n
+        assert track.unseen_frames == n
         assert np.allclose(track.x[RATES], rates * CONFIG.alpha**n)
         position = position + track.x[VELOCITY] / 30
         assert np.allclose(track.x[POSITION], position)
@@ -117,14 +117,14 @@ def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
     again = step_track(
         track, Measurement(np.array([0.0, 1.0, 2.0, 3.0])), (CONFIG.n_max + 1) / 30, SETUP
     )
-    assert again.unseen == 0
+    assert again.unseen_frames == 0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_measurement_that_is_not_finite_counts_as_unseen(bad: float) -> None:
     start = start_track(Measurement(np.zeros(4)), 0.0, SETUP)
     track = step_track(start, Measurement(np.array([0.0, bad, 0.0, 0.5])), 0.03, SETUP)
-    assert track.unseen == 1
+    assert track.unseen_frames == 1
     assert np.isfinite(track.x).all()
     assert step_track(None, Measurement(np.array([bad, 0, 0, 0])), 0.0, SETUP) is None
 
@@ -169,7 +169,7 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     confirmed = step_track(track, Measurement(jumped + steps, R), 21 / 30.0, setup)
     assert np.sqrt(confirmed.P.diagonal()[POSITION]).max() < 0.002
     # In the world of a state estimate a camera's motion is known.
-    world, there = make_filter(KalmanConfig(), in_world=True), None
+    world, there = make_filter(KalmanConfig(), is_world_frame=True), None
     for k in range(20):
         there = step_track(there, Measurement(place, R), k / 30.0, world)
     there = step_track(there, Measurement(place + jump, R), 20 / 30.0, world)
@@ -269,7 +269,7 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
 ) -> None:
     """A pose that is solved with roll and pitch off by a little is off by `tilt` times it."""
     setup = build(gear_body_m=(0.01, -0.02, 0.03), kalman=KalmanConfig(attitude_sigma_deg=0.3))
-    constants = setup.tracks.select_filter(in_world)
+    constants = setup.track_setup.select_filter(in_world)
     true = Attitude(0.0, *rpy, (0.3, -0.2, 1.0))
     wrong = Attitude(0.0, rpy[0] + bias_rad[0], rpy[1] + bias_rad[1], rpy[2], true.position_m)
     in_body = rotation_from_rpy(rpy[0], rpy[1], 0.0).T @ e_m
@@ -278,10 +278,10 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
         level = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0) @ in_body
         pose = MarkerPose(
             "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
-            cov=1e-6 * np.eye(4),
+            xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
         found = track_measurement(pose, attitude, in_world, constants, setup.pose)
-        return found.z, found.bias[:, TILTS]
+        return found.z, found.constant_error_shifts[:, TILTS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

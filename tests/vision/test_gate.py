@@ -33,7 +33,7 @@ from perchctl.vision.tracks import (
     _is_clearly_consistent,
     judge_pose,
 )
-from perchctl.vision.types import Detections, Lock, MarkerTrack, RivalTrack
+from perchctl.vision.types import Detections, MarkerTrack, RivalTrack, TargetLock
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -161,9 +161,11 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     sight = FramePose(
         0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
     )
-    constants = make_filter(KalmanConfig(), in_world=True)
+    constants = make_filter(KalmanConfig(), is_world_frame=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
-    lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both_markers=True)
+    lock = TargetLock(
+        track=track, pose=pose, is_in_world_frame=True, accepted_frames=9, has_both_markers=True
+    )
     if _is_clearly_consistent(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).accepted
 
@@ -180,11 +182,11 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     )
     measured = Measurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
     sight = FramePose(0.1, pose, measured, in_world, True)
-    lock = Lock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
+    lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
     verdict = judge_pose(lock, None, sight, make_filter(KalmanConfig(), in_world))
     assert verdict.accepted is (x_m == -0.02 and not in_world)
-    assert verdict.same_target is verdict.accepted
-    again = Lock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
+    assert verdict.is_same_target is verdict.accepted
+    again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
     assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).accepted
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import Profile, WeightsConfig
 from perchctl.vision import MarkerPose, PipelineState, deinterlace, make_pipeline, step
-from perchctl.vision.merge import is_pair_inconsistent, merge_pair
+from perchctl.vision.merge import is_pair_inconsistent, merge_xyz_yaw
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -42,7 +42,7 @@ def pose(
 
 @given(w=weights, a=vector, b=vector)
 def test_position_is_w_times_the_pair_and_lies_between(w, a, b) -> None:
-    merged = merge_pair(a, b, w)
+    merged = merge_xyz_yaw(a, b, w)
     of_large = np.array([w.x, w.y, w.z])  # equation 9
     assert np.allclose(merged[:3], of_large * a[:3] + (1.0 - of_large) * b[:3])
     assert (merged[:3] >= np.minimum(a, b)[:3] - 1e-12).all()
@@ -52,7 +52,7 @@ def test_position_is_w_times_the_pair_and_lies_between(w, a, b) -> None:
 @given(w=weights, a=angle, gap=st.floats(-1.5, 1.5))
 def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> None:
     large, small = np.array([0, 0, 0, a]), np.array([0, 0, 0, wrap_rad(a + gap)])
-    merged = merge_pair(large, small, w)[3]
+    merged = merge_xyz_yaw(large, small, w)[3]
     assert abs(wrap_rad(merged - (a + (1.0 - w.yaw) * gap))) < 1e-9
 
 
@@ -91,7 +91,7 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
             error = np.array(
                 [*(pose.tvec_m - scene.target_m(part.t_s)), pose.e_yaw_rad - yaw_of(R)]
             )
-            nees.append(error @ np.linalg.solve(pose.cov, error) / 4.0)
+            nees.append(error @ np.linalg.solve(pose.xyz_yaw_cov, error) / 4.0)
             errors.append([*(1000.0 * error[:3]), np.degrees(error[3])])
     return np.sqrt(np.mean(np.square(errors), axis=0)), float(np.mean(nees))
 

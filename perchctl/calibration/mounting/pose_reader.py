@@ -60,11 +60,13 @@ class PoseReader:
 
 def _best_pose(output: PipelineOutput, t_s: float) -> TargetPose | None:
     pose = output.poses.get("joint") or min(output.poses.values(), key=_uncertainty, default=None)
-    if pose is None or pose.camera_cov is None or not np.isfinite(pose.camera_cov).all():
+    if pose is None or pose.rvec_tvec_cov is None or not np.isfinite(pose.rvec_tvec_cov).all():
         return None
     R = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0], dtype=np.float64)
     return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, camera_covariance(pose))
 
 
 def _uncertainty(pose: MarkerPose) -> float:
-    return float("inf") if pose.camera_cov is None else float(np.trace(pose.camera_cov[:3, :3]))
+    return (
+        float("inf") if pose.rvec_tvec_cov is None else float(np.trace(pose.rvec_tvec_cov[:3, :3]))
+    )
