@@ -96,8 +96,8 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
 
 
 def interpolated_edge_sigma_px(blur_px: float) -> float:
-    """Return the standard deviation, px, of an edge along interpolated rows with a blur of
-    `blur_px`."""
+    """Return the standard deviation, px, of the position of a nearly horizontal edge in an
+    interpolated field. `blur_px` is the standard deviation of the edge's blur."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_px * blur_px)
 
 

@@ -59,9 +59,16 @@ velocity. Smaller: noise restarts the track."""
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Standard deviations of accelerations: of the target along each axis, of its heading, and of
-    the rotation of the level frame (`frame_rotation_sigma_radps2`). `is_frame_drifting` is True if
-    the tracks are in the world frame."""
+    """Process noise of the tracks, as standard deviations of white accelerations.
+
+    Attributes:
+        acceleration_sigma_mps2: of the target along each axis.
+        heading_acceleration_sigma_radps2: of the target's heading.
+        frame_rotation_sigma_radps2: of the rotation of the level frame about its origin, which
+            moves a target in proportion to its distance.
+        is_frame_drifting: True if the tracks are in the world frame, whose origin drifts with the
+            state estimate.
+    """
 
     acceleration_sigma_mps2: float
     heading_acceleration_sigma_radps2: float
@@ -79,17 +86,25 @@ class ProcessNoise:
 
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
-    """The constants of a filter: R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper
-    (cm^2, deg^2), converted to SI. P0 (8, 8) is the covariance after the first measurement.
-    `rate_factor_per_unseen_frame` and `max_unseen_frames` are those of the profile. If
-    `process_noise` is not None, it replaces Q, and the covariance of each pose replaces
-    R.
+    """The constants of a filter.
 
-    A measurement z with the innovation v = z - H x and its covariance S = H P H^T + R restarts the
-    track if v^T S^-1 v (NIS) exceeds `restart_nis`. The model does not explain such a measurement,
-    for example after lost frames, and an update would turn the jump into a velocity that S does not
-    cover. The track restarts at z with R + v v^T, since z may be the wrong one until the next
-    measurement.
+    Attributes:
+        R, Q: noise of a measurement (4, 4) and of a step (8, 8): ``k1 I`` and ``k2 I`` of the paper
+            (cm^2, deg^2), converted to SI.
+        P0: covariance (8, 8) after the first measurement.
+        rate_factor_per_unseen_frame: factor on all rates in a frame without a measurement,
+            ``kalman.alpha`` of the profile (equation 3).
+        max_unseen_frames: frames without a measurement after which a track ends, ``kalman.n_max``
+            of the profile.
+        process_noise: if not None, it replaces Q, and the covariance of each pose replaces R.
+        tilt_sigma_rad: constant error of the vehicle's roll and pitch.
+        max_drift_mps: largest speed of the target in its frame while it is not measured.
+        restart_nis: limit of the normalized innovation squared (NIS), above which a track restarts.
+
+    With the innovation v = z - H x of a measurement z and its covariance S = H P H^T + R, NIS is
+    v^T S^-1 v. The motion model cannot explain a larger one, for example after lost frames, and an
+    update would turn the jump into a wrong velocity. The track therefore restarts at z with the
+    covariance R + v v^T, which still covers the old position until another measurement decides.
     """
 
     R: Array
@@ -106,8 +121,12 @@ class FilterSetup:
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
-    means the setup's R. `constant_error_shifts` (4, 4) is the shift of z by one standard deviation
-    of each constant error, or None."""
+    means the setup's R.
+
+    Column k of `constant_error_shifts` (4, 4) is the change of z by one standard deviation of
+    constant error k: the vehicle's roll and pitch, the print's size and curl. None means no such
+    errors.
+    """
 
     z: Array
     R: Array | None = None
@@ -116,8 +135,8 @@ class Measurement:
 
 @cache
 def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
-    """Load filterpy's prediction. It loads much of scipy, which takes a second on a small computer:
-    too long for a command's first word, and for a frame in flight."""
+    """Import filterpy's prediction late: it loads much of scipy, which takes a second on a small
+    computer. That would delay the start of every command, or a frame in flight."""
     from filterpy.kalman import predict
 
     loaded: Callable[..., tuple[Array, Array]] = predict
@@ -126,7 +145,8 @@ def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
 
 def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
     """Return the filter's constants. The initial standard deviation of the velocity is 5 cm/s in
-    the world frame, and 30 cm/s in the level frame, or 1 m/s with measured noise."""
+    the world frame. In the level frame, it is 30 cm/s, or 1 m/s if ``kalman.noise`` is
+    ``measured``."""
     _import_filterpy_predict()  # now, so that no frame waits for it
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
@@ -303,7 +323,7 @@ def predict_track(
 
 
 def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
-    """Return the state with its speed limited to the drift of its frame."""
+    """Return the state (8,) with the target's speed limited to `max_drift_mps` of the setup."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.max_drift_mps:
         return x

@@ -34,12 +34,17 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: `xyz_yaw` (x, y, z, yaw), velocity (3,), covariance (3, 3)
-    of the position, variance of the yaw, number of frames `unseen_frames`, and the stage of the
-    newest frame.
+    """The target in the tracks' frame.
 
-    `constant_error_shifts_m` (3, 4) is the shift of the position by one standard deviation of each
-    constant error.
+    Attributes:
+        xyz_yaw: position and yaw (4,).
+        velocity_mps: velocity (3,).
+        cov_m2, var_yaw_rad2: covariance (3, 3) of the position, and variance of the yaw, without
+            constant errors.
+        constant_error_shifts_m: change (3, 4) of the position by one standard deviation of each
+            constant error (see `Measurement`).
+        unseen_frames: number of frames since the last measurement.
+        stage: markers measured in the newest frame.
     """
 
     xyz_yaw: Array
@@ -147,9 +152,9 @@ def merge_tracks(
 
 
 def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
-    """Return the target with a covariance that covers a second possible position: the state (8,) of
-    a contradicting `rival_state`. With the difference d between both, the covariance grows by d
-    d^T."""
+    """Return the target with a covariance that also covers a second possible position: that of a
+    contradicting rival with the state `rival_state` (8,). With the difference d between both, the
+    covariance grows by d d^T."""
     off = rival_state[_POSITION_AND_YAW] - merged.xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -174,9 +179,9 @@ frame earlier."""
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the markers with their corners moved to the frame's time.
 
-    If `setup.readout_s` is None, the corners stay, and `common_shift_px` is their shift for a
-    typical readout time. Otherwise `common_shift_px`, `sigma_px` and `cov_px2` contain the error of
-    the shift.
+    With `readout_s` None, the corners stay, and `common_error_shift_px` is their possible shift,
+    for a typical readout time. Otherwise the corners are moved, and `common_error_shift_px`,
+    `sigma_px` and `cov_px2` include the error of that correction.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:

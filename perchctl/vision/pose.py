@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -50,8 +50,9 @@ class PoseSetup:
 
     @cached_property
     def curl_lift_m(self) -> dict[_Source, Array]:
-        """Distance of each corner from the sheet's plane, m, for one standard deviation of each of
-        the two modes of curl: (8, 2), ``joint`` (16, 2), with each corner twice, for x and y."""
+        """Distance of each corner from the flat sheet, m, for one standard deviation of the sheet's
+        curl: (8, 2), or (16, 2) for ``joint``. The columns are the modes of `curl_lift`; each
+        corner has two equal rows, for its x and y in the picture."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
@@ -195,7 +196,9 @@ def normal_cam(pose: MarkerPose) -> Array:
 
 
 def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR: Array) -> Array:
-    """Return the derivative (3,) of atan2(h[1, 0], h[0, 0]) by rvec through ``dR/drvec`` (3, 9)."""
+    """Return the derivative (3,) of the target's yaw in the level frame with respect to the
+    rotation vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR` (3, 9) is
+    ``dR/drvec``."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
@@ -309,9 +312,17 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
     return None
 
 
-def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
-    """Return the covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
-    the change of the pose (6,) by one standard deviation of the sheet's curl.
+class PoseCovariance(NamedTuple):
+    """Covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and the change
+    of the pose (6,) by one standard deviation of the sheet's curl."""
+
+    cov: Array
+    chi2: float
+    curl_shift: Array
+
+
+def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
+    """Return the covariance of a pose, the chi2 of its corners, and the effect of the sheet's curl.
 
     The covariance covers the noise of the corners (at least as large as the residuals), shifts
     common to all corners, and a twist of the sheet, but not its curl.
@@ -324,7 +335,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
-        return np.full((6, 6), np.inf), math.inf, np.zeros(6)
+        return PoseCovariance(np.full((6, 6), np.inf), math.inf, np.zeros(6))
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
     growth = max((_CLAIMED_SIGMA_DOF + chi2) / (_CLAIMED_SIGMA_DOF + freedom), 0.7)
@@ -334,11 +345,12 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     curled, twisted = gain.dot(curl).T
     if weight is not None:
         cov += np.multiply.outer(twisted, twisted)
-    return cov, chi2 / freedom, curled
+    return PoseCovariance(cov, chi2 / freedom, curled)
 
 
 def _whitened_curl_effect(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """Return the effect of each mode of curl on the whitened errors."""
+    """Return the change (2n, 2) of the whitened errors by one standard deviation of each mode of
+    curl."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane appears where a target moved along its normal would show it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m
@@ -387,8 +399,8 @@ def _score(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
 
 
 def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
-    """Return the best candidate near the normal mirrored at the line of sight, if it is a different
-    one."""
+    """Return the second solution of a planar marker: the candidate refined from a normal that is
+    mirrored about the line of sight. Empty if both normals are nearly the same."""
     R = rotation_matrix(scored.rvec)
     normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -422,17 +434,17 @@ def _choose_likeliest(
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """Return the distances of corners (n, 3) from the sheet's plane at one standard deviation of
-    each mode of curl: the whole edge to one side, or two corners to each side. Shape (2n, 2), m,
-    with each corner's row twice, for its x and y."""
+    """Return the distances of corners (n, 3) from the flat sheet for one standard deviation of each
+    mode of curl: a bowl, with all corners to one side, and a saddle, with neighbouring corners to
+    opposite sides. Shape (2n, 2), m, with each corner's row twice, for its x and y."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def curl_weight_matrix(whitened_curl: Array) -> Array:
-    """Return the weights ``(I + curl curl^T)^-1`` (2n, 2n) of errors; curl is (2n, k), one column
-    per mode."""
+    """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is `whitened_curl`
+    (2n, k), one column per mode."""
     inner = np.linalg.inv(np.eye(whitened_curl.shape[1]) + whitened_curl.T @ whitened_curl)
     weight: Array = np.eye(len(whitened_curl)) - whitened_curl @ inner @ whitened_curl.T
     return weight
@@ -463,12 +475,19 @@ _SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMN
 
 @dataclass(frozen=True, eq=False)
 class WeightedCorners:
-    """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole camera K, with
-    standard deviations sigma_px (n,). whitening (2n, 2n) makes the errors independent and of unit
-    variance. shift (2n, k) holds one whitened standard deviation of each common error: the shift of
-    all edges, the detections' `common_shift_px`, and the jitter of a detection's rows.
-    `curl_lift_m` (2n, 2) is the result of `curl_lift`, and `is_curled` is True if the curl changes
-    the weights of the corners."""
+    """Corners with the weights of their errors.
+
+    Attributes:
+        object_m, image_px: corners (n, 3) on the target, and (n, 2) in the picture of a pinhole
+            camera `K` (3, 3).
+        sigma_px: standard deviations (n,).
+        whitening: matrix (2n, 2n) that makes the errors independent, with unit variance.
+        whitened_error_shifts: one standard deviation, whitened, of each error common to several
+            corners (2n, k): the shift of all edges, `common_error_shift_px` of the detections, and
+            the jitter of each detection's rows.
+        curl_lift_m: result (2n, 2) of `curl_lift`.
+        is_curled: True if the sheet's curl changes the weights of the corners.
+    """
 
     object_m: Array
     image_px: Array
@@ -487,8 +506,8 @@ def weigh_corners(
     K: Array,
     curl_lift_m: Array,
 ) -> WeightedCorners:
-    """Weigh the detections' corners: `image_px` in a pinhole camera K, `curl_lift_m` from
-    `curl_lift`."""
+    """Weigh the detections' corners. `image_px` are the corners in a pinhole camera K, and
+    `curl_lift_m` is the result of `curl_lift`."""
     n, m = len(image_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
@@ -553,8 +572,12 @@ def _side_sigma_px(detection: Detection, corners: Array) -> Array:
 
 
 def _whitening_of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
-    `_SIDE_WHITENING_FLAT_INDICES`; `sigma_px` is a scalar for all lines, or (4,)."""
+    """Return the elements, at `_SIDE_WHITENING_FLAT_INDICES`, of the matrix that whitens corners
+    which are intersections of four fitted lines. Each line has independent errors of offset and
+    tilt.
+
+    `normals` (4, 2) are the lines' unit normals; `sigma_px` is a scalar for all lines, or (4,).
+    """
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT_WHITENING_FACTOR
     return np.concatenate([across, across, -tilt, tilt])

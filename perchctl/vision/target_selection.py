@@ -155,9 +155,9 @@ def track_measurement(
 def gear_to_target_error_shifts_m(
     target_error_shifts_m: Array, attitude: Attitude, filter_setup: FilterSetup, setup: PoseSetup
 ) -> Array:
-    """Return the effect (3, 4) of constant errors on the vector from gear to target in level axes:
-    `target_error_shifts_m` (3, 4) of the target minus the effect of roll and pitch errors on the
-    gear."""
+    """Return the change (3, 4) of the vector from gear to target, in level axes, by one standard
+    deviation of each constant error: `target_error_shifts_m` (3, 4) of the target in the world,
+    minus the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_error_shifts_m)
     moved[:, TILTS] -= tilt_jacobian(gear_level) * filter_setup.tilt_sigma_rad

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from perchctl.vision.types import (
     MarkerPose,
     MarkerTrack,
     MeasuredMarkers,
+    MotionErrors,
     PipelineState,
     RivalTrack,
     TargetLock,
@@ -181,9 +183,9 @@ _MAX_REMAINING_MISFIT_FRACTION = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose as a measurement, whether both markers contributed, whether the locked
-    target's position is in the picture, and whether the camera has no vehicle with a known
-    attitude."""
+    """A frame's pose and its measurement for the filter, with whether both markers contributed and
+    whether the locked target's position is in the picture. `is_attitude_unknown` is True if the
+    camera is used alone, without a vehicle."""
 
     t_s: float
     pose: MarkerPose
@@ -275,7 +277,8 @@ def predict_rival_state(
     t_s: float,
     filter_setup: FilterSetup,
 ) -> Array | None:
-    """Return the rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
+    """Return the rival's state (8,) at `t_s` if the rival was seen more recently than the locked
+    target; otherwise None.
 
     Until one of the two is confirmed, the target may be at either position.
     """
@@ -317,7 +320,8 @@ def update_lock(
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """The misfit of a pose in (yaw, x, y, z), (4,), and its covariance (4, 4)."""
+    """The difference of a pose from its prediction in (yaw, x, y, z), (4,), and its covariance (4,
+    4)."""
 
     residual: Array
     S: Array
@@ -328,7 +332,8 @@ class _Misfit:
 
     @property
     def log_likelihood_cost(self) -> float:
-        """The squared distance plus a penalty for a larger covariance (negative log likelihood)."""
+        """The squared Mahalanobis distance plus a penalty for a larger covariance (twice the
+        negative log likelihood, without its constant)."""
         return self.squared_mahalanobis + float(np.linalg.slogdet(self.S)[1])
 
     @property
@@ -363,7 +368,8 @@ def _compute_misfit(
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
-    """True if errors outside any covariance explain the misfit, as in most frames: a fast check."""
+    """True if errors that no covariance models, of lens, print and latency, already explain the
+    misfit, as in most frames: a fast check that saves the full one."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup, with_cov=False)
     residual = frame_pose.measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
@@ -376,7 +382,8 @@ def _range_m(frame_pose: FramePose) -> float:
 
 
 def _unmodelled_sigma(range_m: float) -> Array:
-    """Return the standard deviations of (yaw, x, y, z) for errors outside any covariance."""
+    """Return the standard deviations of (yaw, x, y, z) at a range due to errors that no covariance
+    models."""
     sideways_m, along_m = (
         _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
         _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
@@ -385,8 +392,9 @@ def _unmodelled_sigma(range_m: float) -> Array:
 
 
 def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: Array) -> bool:
-    """True if the pose fits the vehicle's last view of the target much better than its position in
-    the world."""
+    """True if the target is where the vehicle saw it last, but not where the world frame predicts
+    it: the pose in the level frame has changed much less than its `world_residual`. Then the state
+    estimate has jumped."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
@@ -404,9 +412,10 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
 def _matches_previous_track(
     lock: TargetLock, frame_pose: FramePose, residual: Array, filter_setup: FilterSetup
 ) -> bool:
-    """True if the pose fits the track before the lock's last pose much better than the present
-    track, from which it differs by `residual`. At few pictures per second, a single wrong pose
-    passes the gate and gives the track of a camera alone a wrong velocity."""
+    """True if the pose fits the track as it was before the last accepted pose much better than the
+    present track. The last accepted pose was then most likely wrong: at a low frame rate, a single
+    wrong pose may pass the gate and give the track of a camera alone a wrong velocity. `residual`
+    (4,) is the pose's distance from the present track."""
     if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
     misfit, unclaimed = (
@@ -471,8 +480,8 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 
 
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
-    """True if the rival is most likely the target, after the camera has moved during lost
-    frames."""
+    """True if the rival is most likely the target, seen from another place because the camera moved
+    during lost frames."""
     if rival.since_s < lock.track.t_s or frame_pose.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
         return False
     if not lock.has_both_markers:
@@ -502,7 +511,7 @@ def expected_corners(
     if attitude is None or then is None:
         return None, PoseCandidate(pose.rvec_rad, pose.tvec_m)
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
-    by_place, by_speed = last_pose.error_rad2
+    by_place, by_speed = last_pose.motion_errors
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
     stepped_m, flown_m = _camera_displacements_m(then, attitude, setup)
     moved_m = stepped_m + share * (flown_m - stepped_m)
@@ -526,7 +535,7 @@ def update_last_pose(
         return LastPose(pose, attitude)
     then, passed_s = previous.attitude, pose.t_s - previous.pose.t_s
     if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
-        return LastPose(pose, attitude, previous.error_rad2)
+        return LastPose(pose, attitude, previous.motion_errors)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(previous.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the line of sight, because the distance of a far target is uncertain along it.
@@ -536,9 +545,9 @@ def update_last_pose(
     ]
     by_place, by_speed = (
         old + _MOTION_ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
-        for old, new in zip(previous.error_rad2, residual, strict=True)
+        for old, new in zip(previous.motion_errors, residual, strict=True)
     )
-    return LastPose(pose, attitude, (by_place, by_speed))
+    return LastPose(pose, attitude, MotionErrors(by_place, by_speed))
 
 
 def is_in_view(position_world_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
@@ -557,15 +566,25 @@ def is_in_view(position_world_m: Array, attitude: Attitude, setup: PoseSetup) ->
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
-def _camera_displacements_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """Return the camera's displacement (3,) from the estimated positions, and from the
-    velocities."""
+class _CameraDisplacements(NamedTuple):
+    """The camera's displacement (3,) in the world, by the difference of two estimated positions,
+    and by velocity times time."""
+
+    by_position_m: Array
+    by_velocity_m: Array
+
+
+def _camera_displacements_m(
+    then: Attitude, now: Attitude, setup: PoseSetup
+) -> _CameraDisplacements:
+    """Return the camera's displacement between two attitudes, computed in both ways."""
     turned_m = _vehicle_to_camera_world_m(now, setup) - _vehicle_to_camera_world_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
-        return stepped_m, stepped_m
+        return _CameraDisplacements(stepped_m, stepped_m)
     half_s = 0.5 * (now.t_s - then.t_s)
-    return stepped_m, turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
+    flown_m = turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
+    return _CameraDisplacements(stepped_m, flown_m)
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ MarkerName = Literal["large", "small"]
 PictureKind = Literal["whole", "woven", "top", "bottom"]
 MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
 """The target's markers, the large one first."""
+GearToTargetInLevel = Array
+"""A vector (3,) from the gear to the target in level axes, m: the paper's (e_x, e_y, e_z)."""
 
 
 class Stage(Enum):
@@ -249,7 +251,7 @@ class MarkerPose:
     t_s: float
     rvec_rad: Array
     tvec_m: Array
-    e_m: Array
+    e_m: GearToTargetInLevel
     e_yaw_rad: float
     sigma_m: Array
     sigma_yaw_rad: float
@@ -266,10 +268,9 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. `constant_error_shifts` (8, 4) is the shift of the state by one standard deviation of
-    each constant
-    error: the vehicle's roll and pitch, the print's size and curl. `unseen_frames` counts the
-    frames since the last measurement.
+    motion. Column k of `constant_error_shifts` (8, 4) is the change of the state by one standard
+    deviation of constant error k: the vehicle's roll and pitch, the print's size and curl.
+    `unseen_frames` counts the frames since the last measurement.
     """
 
     t_s: float
@@ -315,7 +316,7 @@ class TargetEstimate:
     measured: bool
     tracked: bool
     unseen: int
-    e_m: Array
+    e_m: GearToTargetInLevel
     e_yaw_rad: float
     velocity_mps: Array
     sigma_m: Array
@@ -325,24 +326,32 @@ class TargetEstimate:
     world_velocity_mps: Array | None = None
 
 
+class MotionErrors(NamedTuple):
+    """Recent mean square errors of the vehicle's estimated motion since the last pose, as angles
+    seen from the camera, rad^2: computed from the difference of two estimated positions, and from
+    velocity times time."""
+
+    by_position_rad2: float = 0.0
+    by_velocity_rad2: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class LastPose:
-    """A pose of the target and the vehicle's attitude at that time, if known.
-
-    `error_rad2` holds the recent mean square errors of the vehicle's estimated motion as angles
-    from the camera: of its position differences, and of its velocity times the time.
-    """
+    """A pose of the target, the vehicle's attitude at that time, if known, and the errors of the
+    vehicle's estimated motion between poses. The motion with the smaller error has more weight in
+    the prediction of the next pose."""
 
     pose: MarkerPose
     attitude: Attitude | None
-    error_rad2: tuple[float, float] = (0.0, 0.0)
+    motion_errors: MotionErrors = field(default_factory=MotionErrors)
 
 
 @dataclass(frozen=True, eq=False)
 class TargetLock:
-    """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `accepted_frames` with a pose, whether any pose used both markers, and the
-    track `track_before_last_pose` the last pose, None for the first pose."""
+    """The target that the pipeline is locked on: its last track and pose in the world or the level
+    frame, the number of `accepted_frames` with a pose of it, and whether any pose used both
+    markers. `track_before_last_pose` is the track without its last pose; None after the first
+    one."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -354,9 +363,16 @@ class TargetLock:
 
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
-    """A track of something that looks like the target at a position where the target cannot be
-    (`text`): its first time, the numbers of its frames and of its frames with both markers, and
-    whether its range differs from the target's."""
+    """A track of something that looks like the target, at a position where the target cannot be.
+
+    Attributes:
+        track: its filter.
+        is_in_world_frame: True if the track is in the world frame, False if in the level frame.
+        since_s: time of its first frame.
+        seen_frames, frames_with_both_markers: number of its frames, and of those with both markers.
+        has_different_range: True if its range differs from the target's.
+        text: where it is relative to the target, in words.
+    """
 
     track: MarkerTrack
     is_in_world_frame: bool
@@ -369,9 +385,13 @@ class RivalTrack:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order;
-    `poses_by_track`, the poses that update a track, by the track's name; and whether the two
-    markers contradict each other."""
+    """The poses of one frame.
+
+    Attributes:
+        poses: all poses, by ``joint``, ``large``, ``small``, in this order.
+        poses_by_track: the poses that update a track, by the track's name.
+        are_markers_contradicting: True if the two markers contradict each other.
+    """
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     poses_by_track: dict[str, MarkerPose] = field(default_factory=dict)
@@ -387,10 +407,18 @@ class MeasuredMarkers:
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """State of the detection of interlacing in a stream: `kind` of the last examined frame,
-    `frames_since_examined` frames ago; whether the top field is first, None until the `order_votes`
-    decide; the last periods of the frames; the time of the last frame; and the picture of the
-    `previous_image` frame, unless that was whole."""
+    """State of the detection of interlacing in a stream.
+
+    Attributes:
+        kind: kind of the last frame that was examined for interlacing.
+        frames_since_examined: number of frames since then.
+        order_votes: sum of the votes on the order: positive if the top field seems to be first,
+            negative if the bottom field does.
+        is_top_first: order of the fields; None until the votes decide.
+        periods_s: the last periods between frames.
+        last_frame_t_s: time of the last frame.
+        previous_image: picture of the previous frame, unless that frame was whole.
+    """
 
     kind: PictureKind | None = None
     frames_since_examined: int = 0

@@ -63,11 +63,10 @@ def find_expected_blurred(
     expected_corners_px: Mapping[MarkerName, Array],
     start_blur_index: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first marker found near its `expected_corners_px` corners (4, 2) px; empty if none
-    is found.
+    """Return the first marker found near its expected corners (4, 2) px; empty if none is found.
 
-    An even or odd `start_blur_index` selects fits that start with little or with much blur; None
-    tries both.
+    `start_blur_index` selects the blur with which the fits start: little blur if it is even, much
+    blur if it is odd, to save time; None tries both.
     """
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = (
@@ -107,8 +106,8 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
 def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return quads (m, 4, 2) similar to a marker, rolled to its orientation, best first, each
-    position once."""
+    """Return the quadrilaterals (m, 4, 2) whose cells resemble a marker's, best first, without
+    duplicates. Their corners are rolled to the marker's orientation."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -248,10 +247,10 @@ def align_marker(
 def has_matching_drawing(
     alignment: Alignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
 ) -> bool:
-    """True if the picture matches the drawing.
+    """True if the picture matches the fitted drawing and determines its corners well enough.
 
-    Without the marker, the correlation of the pattern stays below 0.72 at the right strength; with
-    the marker, it is above 0.95.
+    Where there is no marker, the correlation of the inner pattern stays below 0.72 if its contrast
+    is plausible; on a marker, it is above 0.95.
     """
     return (
         alignment.pattern_correlation > _MIN_INNER_CORRELATION
@@ -263,8 +262,8 @@ def has_matching_drawing(
 
 
 def has_distinctive_bits(alignment: Alignment) -> bool:
-    """True if any other codeword would look different. All of 36 other markers that
-    `has_matching_drawing` accepted had a `wrong_bit_degree` above 0.5."""
+    """True if flipping any single bit of the codeword would fit the picture clearly worse. Of other
+    markers that `has_matching_drawing` accepted, all 36 had a `bit_flip_fraction` above 0.5."""
     return (
         alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
         and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA

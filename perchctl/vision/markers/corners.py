@@ -55,8 +55,8 @@ def apply_homography(H: Array, points: Array) -> Array:
 
 
 def projected_corners_jacobian(homography: Array) -> Array:
-    """Return the Jacobian (8, 8) of the projected corners of the unit square by the terms `p` of
-    `increment_homography`, at a homography (3, 3)."""
+    """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
+    respect to the `increment` of `increment_homography`."""
     q = _UNIT_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
@@ -64,8 +64,8 @@ def projected_corners_jacobian(homography: Array) -> Array:
 
 
 def increment_homography(H: Array, increment: Array) -> Array:
-    """Return H (I + P), scaled so that the last element is 1. p (8,) are the first elements of P
-    (3, 3), row by row; the last one is 0."""
+    """Return H (I + P), scaled so that its last element is 1. `increment` (8,) contains the first
+    eight elements of P (3, 3), row by row; the last one is 0."""
     H = H @ np.array(
         [
             [1 + increment[0], increment[1], increment[2]],
@@ -139,9 +139,11 @@ CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6  # derived from the other marker, not me
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """Refined corners of a marker: standard deviations and covariance as in `Detection`, the
-    largest and the smallest blur of a side, px, and the `edge_shift` correction that was
-    applied."""
+    """Refined corners of a marker, with their uncertainty as in `Detection`.
+
+    `blur_px` and `sharpest_side_blur_px` are the largest and the smallest blur of a side, and
+    `edge_shift` is the shift of all edges that was corrected.
+    """
 
     corners_px: Array
     sigma_px: float
@@ -155,12 +157,12 @@ class RefinedCorners:
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells_per_side: int) -> RefinedCorners:
-    """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep them raw if one leaves its window.
+    """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep the raw corners if one leaves its
+    window.
 
-    Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window of half
-    a cell to each side, 1 to 5 px; `cells_per_side` is the number of cells along a side. Blur
-    biases such a corner inwards by 0.15 to 0.3 px, so that the target looks too far away: `refined`
-    is False.
+    Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
+    extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,
+    so that the target seems too far away. The result's `refined` is therefore False.
     """
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))

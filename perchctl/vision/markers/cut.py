@@ -26,6 +26,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -89,7 +90,7 @@ def is_target_cut(
 def can_whole_marker_be_in_view(
     expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
 ) -> bool:
-    """True if an expected marker (4, 2) px may be completely in the picture."""
+    """True if at least one expected marker (4, 2) px may be completely in the picture."""
     return any(
         is_inside_picture(corners, shape, -_MAX_EDGE_DISTANCE_PX)
         for corners in expected_corners_px.values()
@@ -183,7 +184,7 @@ def _initial_pose(
 
 
 def _search_near_pose(
-    start: RigidPose, texture: Texture, overview: UndistortedOverview
+    start: RigidPose, texture: DrawingTexture, overview: UndistortedOverview
 ) -> RigidPose | None:
     """Return the prediction moved to its best match in the picture; None without a match."""
     best, pose, lattice = _MIN_OVERVIEW_CORRELATION, None, overview.lattice
@@ -257,12 +258,17 @@ _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
 @dataclass(frozen=True, eq=False)
 class OverviewLattice:
-    """Nodes of a pinhole camera's picture, `node_spacing_normalised` apart in normalised
-    coordinates, starting at `first_node_normalised` (2,). `map_x_px` and `map_y_px` are the pixel
-    positions of their samples in the picture reduced to `reduced_size_px` (width, height).
+    """A regular grid of nodes in normalised image coordinates, at which pictures are sampled
+    without lens distortion.
 
-    `is_in_picture` marks the nodes in the picture. Beyond `valid_radius_normalised`, a lens model
-    may fold back.
+    Attributes:
+        first_node_normalised: x and y of the first node, (2,).
+        node_spacing_normalised: distance between neighbouring nodes.
+        valid_radius_normalised: distance from the optical axis up to which the lens model is used;
+            further out, it may map two directions to the same pixel.
+        map_x_px, map_y_px: maps for cv2.remap: the position of each sample in the reduced picture.
+        reduced_size_px: width and height of the reduced picture.
+        is_in_picture: True for nodes inside the picture, (rows, columns).
     """
 
     first_node_normalised: Array
@@ -276,8 +282,8 @@ class OverviewLattice:
 
 @dataclass(frozen=True, eq=False)
 class UndistortedOverview:
-    """A reduced picture: grey values (rows, columns) at the nodes of a lattice; `is_visible` is
-    True for nodes in view and uncovered."""
+    """A reduced picture without lens distortion: grey values (rows, columns) at the nodes of a
+    lattice. `is_visible` is True for nodes in the picture that the vehicle does not cover."""
 
     lattice: OverviewLattice
     grey: FloatImage
@@ -327,8 +333,8 @@ def make_lattice(camera: CameraModel) -> OverviewLattice:
 def make_overview(
     image: NDArray[np.uint8], camera: CameraModel, hidden_mask: NDArray[np.uint8] | None = None
 ) -> UndistortedOverview:
-    """Return the reduced picture at the lattice's nodes; nodes with `hidden_mask` (h, w) set are
-    not seen."""
+    """Return the picture without lens distortion, reduced to the nodes of the camera's lattice.
+    Nodes where `hidden_mask` (h, w) is not zero are marked as not visible."""
     lattice = make_lattice(camera)
     seen = lattice.is_in_picture
     if hidden_mask is not None:
@@ -353,7 +359,7 @@ def _downsample(fine: FloatImage) -> FloatImage:
 
 
 def render_drawing(
-    H: Array, texture: Texture, lattice: OverviewLattice, margin_nodes: int = 0
+    H: Array, texture: DrawingTexture, lattice: OverviewLattice, margin_nodes: int = 0
 ) -> FloatImage:
     """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin_nodes`
     nodes around."""
@@ -384,11 +390,18 @@ def render_drawing(
     return _downsample(np.asarray(fine, np.float32))
 
 
+class DrawingMatch(NamedTuple):
+    """Correlation of the picture with the drawing, 0 to 1, and grey levels from black to white."""
+
+    correlation: float
+    contrast_grey: float
+
+
 def correlate_drawing(
-    H: Array, texture: Texture, overview: UndistortedOverview
-) -> tuple[float, float]:
-    """Return the view's correlation with the drawing projected by H (3, 3), and the contrast in
-    grey levels."""
+    H: Array, texture: DrawingTexture, overview: UndistortedOverview
+) -> DrawingMatch:
+    """Compare the overview with the drawing projected by H (3, 3), under the light that fits
+    best."""
     lattice = overview.lattice
     rows, columns = np.nonzero(overview.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -399,13 +412,13 @@ def correlate_drawing(
         < PAPER_REACH_LARGE_HALF_SIDES
     )
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
-        return 0.0, 0.0
+        return DrawingMatch(0.0, 0.0)
     white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
     grey = overview.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
-    return fit_correlation(grey, grey - A @ light), float(light[3])
+    return DrawingMatch(fit_correlation(grey, grey - A @ light), float(light[3]))
 
 
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
@@ -421,9 +434,15 @@ _TEXTURE_SIZE_PX = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Points along the drawing's edges: `points` (n, 2) and `normal` (n, 2) from black to white.
-    Per point (n,): index of its line, standard deviation of that line's print error, width of the
-    adjacent cell, and whether the edge belongs to the small marker."""
+    """Points along the edges of the target's drawing, in half sides of the large marker.
+
+    Attributes:
+        points, normal: points (n, 2), and unit normals (n, 2) from black to white.
+        line_index: index (n,) of the straight line that contains the point.
+        print_sigma_half_sides: standard deviation (n,) of that line's print error.
+        cell_width_half_sides: width (n,) of the adjacent cell.
+        is_small_marker: True for edges of the small marker, (n,).
+    """
 
     points: Array
     normal: Array
@@ -433,22 +452,25 @@ class Outline:
     is_small_marker: NDArray[np.bool_]
 
 
-Texture = tuple[NDArray[np.float32], Array]
-"""Whiteness of the paper, float32 (m, m), 0 to 1, and T (3, 3) from own coordinates to its
-pixels."""
+class DrawingTexture(NamedTuple):
+    """A picture of the target and its white paper: `whiteness` (m, m), 0 to 1, and the homography
+    (3, 3) from the drawing's coordinates to its pixels."""
+
+    whiteness: FloatImage
+    H_pixels_drawing: Array
 
 
 @lru_cache(maxsize=8)
 def make_outline(
     drawing: Drawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
 ) -> Outline:
-    """Return the edges of both markers; tolerances are print errors of an edge's position, in
-    cells."""
+    """Return the edges of both markers as points. The tolerances are standard deviations of the
+    position of a printed edge, in cells."""
     hidden = _SMALL_MARKER_REACH_HALF_SIDES * drawing.small_to_large_side
     edges = [
         edge
         for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
-        if np.abs(edge[0]).max(axis=1).min() > hidden
+        if np.abs(edge.points).max(axis=1).min() > hidden
     ]
     large = len(edges)
     if drawing.small_cell_whiteness is not None:
@@ -474,22 +496,32 @@ def make_outline(
 
 
 @lru_cache(maxsize=8)
-def make_texture(drawing: Drawing) -> Texture:
-    """Return a picture of the drawing up to `PAPER_REACH_LARGE_HALF_SIDES`, and the homography (3,
-    3) to its pixels."""
+def make_texture(drawing: Drawing) -> DrawingTexture:
+    """Render the target and its white paper to `PAPER_REACH_LARGE_HALF_SIDES` from the centre."""
     axis = make_grid(_TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES).node_positions
     wide = render_cells(drawing, axis, PAPER_REACH_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
     more = (len(wide) - _TEXTURE_SIZE_PX) // 2
     scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_HALF_SIDES)
     first = PAPER_REACH_LARGE_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
-    return np.clip(wide, 0.0, 1.0), T
+    return DrawingTexture(np.clip(wide, 0.0, 1.0), T)
+
+
+class _CellEdge(NamedTuple):
+    """An edge between a black and a white cell: points (n, 2), unit normal from black to white, a
+    key that is equal for edges on one straight line, and the width of the cell."""
+
+    points: Array
+    normal: tuple[float, float]
+    line_key: tuple[float, int, int]
+    cell_width_half_sides: float
 
 
 def _iterate_cell_edges(
     cells: Array, half_side: float, points_per_edge: int
-) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """Yield the sides between cells of different colour, in the form of `Outline`."""
+) -> Iterator[_CellEdge]:
+    """Yield each edge between a black and a white cell of a marker with half the side `half_side`,
+    sampled at `points_per_edge` points."""
     width = 2.0 * half_side / len(cells)
     s = (
         _EDGE_END_MARGIN_CELLS
@@ -507,7 +539,7 @@ def _iterate_cell_edges(
             at[:, 1 - across] = width * (i + s) - half_side
             towards = float(np.sign(step[i, j]))
             normal = (towards, 0.0) if across == 0 else (0.0, towards)
-            yield at, normal, (half_side, across, j), width
+            yield _CellEdge(at, normal, (half_side, across, j), width)
 
 
 # --- Pose of the target from the edges in view ---
@@ -551,8 +583,8 @@ _PREDICTION_INFORMATION: Array = (
 
 @dataclass(frozen=True, eq=False)
 class RigidPose:
-    """Rotation R (3, 3) and translation t (3,), in half sides of the large marker, of the drawing
-    in the camera."""
+    """Pose of the drawing in the camera frame: rotation `R_cam_drawing` (3, 3), and translation
+    `t_cam_half_sides` (3,) in half sides of the large marker."""
 
     R_cam_drawing: Array
     t_cam_half_sides: Array
@@ -567,9 +599,16 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A pose with its covariance (6, 6) of rotation and translation; the numbers of edge points in
-    view, of points at which an edge was found, and of points on the small marker among these; and
-    the RMS residual of the found points."""
+    """A fitted pose and its quality.
+
+    Attributes:
+        pose: the pose of the drawing.
+        cov: covariance (6, 6) of rotation (rad) and translation (half sides).
+        points_in_view: number of edge points in the picture.
+        points_found: number of these points at which an edge was found.
+        small_marker_points: number of found points on the small marker.
+        residual_px: RMS distance of the found edges from the drawing's.
+    """
 
     pose: RigidPose
     cov: Array
@@ -581,10 +620,15 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """Edge points of an outline in the picture: `points` (n, 2) px and unit normal (n, 2) from
-    black to white. `J` (n, 7) is their motion along the normal with rotation, translation and the
-    shift of all edges (white over black), `px_per_half_side` (n,) the scale across the edge, and
-    `outline_index` (n,) their index in the outline."""
+    """Edge points of an outline that are in the picture.
+
+    Attributes:
+        points, normal: points (n, 2) px, and unit normals (n, 2) from black to white.
+        J: derivative (n, 7) of each point's motion along its normal with respect to rotation (rad),
+            translation (half sides) and the shift of all edges (px, white over black).
+        px_per_half_side: scale (n,) across the edge.
+        outline_index: index (n,) of the point in the outline.
+    """
 
     points: Array
     normal: Array
@@ -593,9 +637,14 @@ class _EdgePoints:
     outline_index: NDArray[np.intp]
 
 
-_FitStep = tuple[Array, Array, Array, float]
-"""Step of all unknowns (7,), inverse of their normal matrix, weights of the points (n,), and
-variance of one point, px^2."""
+class _FitStep(NamedTuple):
+    """A Gauss-Newton step of the seven unknowns (7,), the inverse of their normal matrix (7, 7),
+    the weights of the points (n,), and the variance of one point."""
+
+    step: Array
+    inverse_normal_matrix: Array
+    weight: Array
+    variance_px2: float
 
 
 def fit_pose(
@@ -625,7 +674,7 @@ def fit_pose(
         found = _solve_step(edge_points, offset_px, is_edge_found, change_from_start)
         if found is None:
             return None
-        step = found[0][:6]
+        step = found.step[:6]
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
         pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_half_sides + step[3:])
         change_from_start[:6] += step
@@ -640,8 +689,8 @@ def fit_pose(
 
 
 def predict_fit_accuracy(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """Return the result of `fit_pose` for a perfect picture at that pose; None if too little is
-    visible."""
+    """Return the result that `fit_pose` would have for a perfect picture taken at that pose; None
+    if too little of the target is visible."""
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTHS_PX[0], camera.size_px[::-1], camera, None
     )
@@ -736,7 +785,8 @@ def _solve_step(
     is_edge_found: NDArray[np.bool_],
     change_from_start: Array,
 ) -> _FitStep | None:
-    """Return a robust step, given the sum `change_from_start` (7,) of the previous steps."""
+    """Return one robust Gauss-Newton step of the seven unknowns; None if too few edges count.
+    `change_from_start` (7,), the sum of the previous steps, is pulled back to zero by the prior."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
@@ -755,7 +805,7 @@ def _solve_step(
         step = inverse @ (
             J.T @ (weight * offset_px) / variance - _PREDICTION_INFORMATION * change_from_start
         )
-    return step, inverse, weight, variance
+    return _FitStep(step, inverse, weight, variance)
 
 
 def _make_pose_fit(

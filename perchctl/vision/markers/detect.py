@@ -89,16 +89,17 @@ class Prior:
     Attributes:
         expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
             expected.
-        expected_both_corners_px: `expected_corners_px`, with a missing marker derived from the
-            other one.
+        expected_both_corners_px: the same, with a missing marker derived from the other one.
         search_mode: the kinds of search for this frame.
-        start_blur_index: its parity selects the first guess of the blur; None tries all.
-        was_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; False
-            without edge fits.
-        was_target_cut: `was_seen_recently`, and no marker can have been completely in that picture.
+        start_blur_index: selects the blur with which blurred fits start (see
+            `find_expected_blurred`).
+        was_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; always
+            False if edge fits are disabled.
+        was_target_cut: `was_seen_recently` is True, and no marker can have been completely in that
+            picture.
         edge_shift: the shift of all edges measured in the last frames; None measures it.
-        own_target_offset_m: selects one of several targets if none is expected; None uses the
-            picture alone.
+        own_target_offset_m: function that selects one of several targets if none is expected; None
+            uses the picture alone.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
@@ -539,8 +540,8 @@ _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large
 
 
 def is_line_fit_sufficient(corners: RefinedCorners, pattern: Pattern) -> bool:
-    """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
-    least 6 px and 6 times the blur."""
+    """True if the corners come from an edge fit that is as accurate as a photometric fit: with
+    cells of at least 6 px and 6 times the blur."""
     cell_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
     return corners.refined and cell_px >= max(
         _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_BLURS * corners.blur_px
@@ -550,9 +551,12 @@ def is_line_fit_sufficient(corners: RefinedCorners, pattern: Pattern) -> bool:
 def refine_photometrically(
     picture: Picture, found_corners: _FoundCorners, is_from_search: bool = False
 ) -> _FoundCorners:
-    """Return the `found_corners` markers, with a photometric fit of those whose edges do not
-    suffice, and any other visible marker derived from the first. If `is_from_search`, a single
-    marker is dropped unless its edges suffice or the drawing confirms it."""
+    """Fit the drawing to each marker in `found_corners` whose edge fit is not accurate enough, and
+    add the other marker, located from the one that was found, if it is visible.
+
+    If `is_from_search`, a single marker is dropped unless its edge fit is accurate enough or the
+    drawing confirms it.
+    """
     image, patterns, better = picture.image, picture.setup.patterns, dict(found_corners)
     if "small" in better and "large" not in better:
         large = find_large_around(picture, better["small"])
@@ -625,9 +629,12 @@ _MAX_CENTRE_OFFSET_SIDES = 0.12  # share of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _FoundCorners:
-    """Return the markers near corners `places` (4, 2) px whose four sides are straight edges, by
-    `refine_corners_by_lines`: all at once because they share the shift of all edges. The cells are
-    not examined. `shift` None measures the shift of all edges."""
+    """Fit the four sides of each marker near corners `places` (4, 2) px, and return those with four
+    straight sides. The cells are not examined.
+
+    All markers are fitted together, because blooming and gamma move all edges of a picture by the
+    same number of pixels. `shift` is that shift if it is known; None measures it.
+    """
     if not places:
         return {}
     rims = [picture.setup.patterns[name].border_cells for name in places]

@@ -43,10 +43,13 @@ _LOOSE_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
 class DetectorSetup:
     """Constants of `detect_markers`, made by `make_detector_setup`.
 
-    `large_and_small_dictionaries` are those of the large and the small marker;
-    `small_to_large_side` is the small side over the large side; `hidden_mask` marks the pixels
-    covered by the vehicle. Without `is_line_fit_enabled`, markers are neither fitted nor tracked by
-    fits.
+    Attributes:
+        large_and_small_dictionaries: OpenCV's dictionaries, with one marker each.
+        patterns: appearance of both markers.
+        small_to_large_side: side of the small marker over that of the large one.
+        is_line_fit_enabled: if False, markers are only detected by OpenCV and refined by
+            `refine_subpix`, without edge fits and photometric fits.
+        hidden_mask: True for pixels that the vehicle covers, (h, w).
     """
 
     large_and_small_dictionaries: tuple[Any, Any]

@@ -115,8 +115,9 @@ def sample_profiles(
     """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, with the picture's
     border pixels repeated outside.
 
-    On float pictures, OpenCV 5 interpolates at the exact position. On 8-bit pictures, other
-    releases round it to 1/32 px, which is as large as the intended standard deviation.
+    The picture is converted to float, on which OpenCV 5 interpolates at the exact position. Other
+    releases, on 8-bit pictures, round it to 1/32 px, which is as large as the intended standard
+    deviation.
     """
     h, w = image.shape
     reach = float(half_px.max()) + 2.0
@@ -186,11 +187,12 @@ def refine_corners_by_lines(
     camera: CameraModel,
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None for corners without a marker's sides.
+    """Fit lines to the sides of m markers with corners (m, 4, 2) px, and intersect them; None for
+    each marker whose four sides were not found.
 
-    The shift of all edges is measured unless it is `known_edge_shift`. A marker with wide edges, or
-    with edges near the ends of the profiles, is fitted again with the profiles centred on its
-    edges.
+    `border_cells` are the cells inside each marker's border. The shift of all edges is measured
+    unless `known_edge_shift` is given. A marker with wide edges, or with edges near the ends of the
+    profiles, is fitted again with the profiles centred on its edges.
     """
     found = _refine_lines_once(image, raw_px, border_cells, camera, known_edge_shift)
     centred = raw_px.copy()
@@ -330,11 +332,12 @@ def _measure_edge_shift(
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
-    """Return how far white has grown over black, from the width of a border whose outer edge has
-    the `corners` (m, 4, 2); None if no inner edge was sampled.
+    """Measure how far white has grown over black, px, from the width of a border whose outer edge
+    has the `corners` (m, 4, 2); None if no inner edge was sampled.
 
-    Outer edges that moved in by d shrink the marker's own scale. The inner edges, at the share r of
-    it, moved out by d and appear d (1 + r) too far out.
+    A growth by d moves the border's outer edge in, and its inner edge out, by d. In the marker's
+    own scale, whose unit is the outer edge as measured, an inner edge at r then appears at r + d (1
+    + r), and this is solved for d.
     """
     if inner_edges is None:
         return None
@@ -382,8 +385,8 @@ def _measure_edge_shift(
 
 
 def _bow_px(markers: MarkerSides, outer_edges: EdgeData, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides are further out than their middles,
-    beyond the noise; 0 if noise explains it."""
+    """Return the bow of the widest marker's sides, px: how far their ends are further out than
+    their middles. 0 if noise may explain it."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = np.matmul(outer_edges.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outward_signs(markers, lines)[four] * markers.px_per_normalised[four]
@@ -436,8 +439,12 @@ def _corner_sigma_px(
 def _row_jitter_sigma_px(
     normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
 ) -> float:
-    """Return the standard deviation of corners due to jittering rows, which affects upright sides
-    only."""
+    """Return the standard deviation, px, of corners due to the jitter of rows in analogue video; 0
+    if it is not significant. Jitter moves upright sides only.
+
+    `normals_x` are the x components of the four sides' unit normals, and `line_end_variances_px2`
+    the variances of the ends of the lines fitted to them.
+    """
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -463,12 +470,19 @@ _SIDE_INDICES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MarkerSides:
-    """Sides of m markers: corners `raw_corners_px` (m, 4, 2) and normalised, `corners_normalised`;
-    `border_cells`, the cells next to each marker's border; the side lengths `side_lengths_px` and
-    the depths of the cells behind them `cell_width_across_side_px` (m, 4); mean cell width
-    `cell_px` (m,); index of the marker with the `widest_marker_index` cells; `winding` of the
-    corners, +1 or -1 (m,); and pixels per normalised unit along each side `px_per_normalised`
-    (4m,)."""
+    """The sides of m markers before their edges are measured.
+
+    Attributes:
+        raw_corners_px: corners (m, 4, 2) in the picture.
+        border_cells: the cells inside each marker's border.
+        corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
+        side_lengths_px: lengths (m, 4).
+        cell_width_across_side_px: width (m, 4) of the border across each side.
+        cell_px: mean width of a cell, (m,).
+        widest_marker_index: index of the marker with the widest cells.
+        winding: direction of the corners, +1 or -1, (m,).
+        px_per_normalised: pixels per unit of normalised coordinates along each side, (4m,).
+    """
 
     raw_corners_px: Array
     border_cells: Sequence[BorderCells]
@@ -587,9 +601,9 @@ def find_neighbour_edges(
     inner_border_cells: BorderCells,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Return the neighbours of the edges at `positions_along_side` (rows, n) of sides: four rows
-    per rim, then, if given, four rows for the inner edges of `inner_border_cells`'s border.
-    `neighbour_distance_px` (rows,) is the size of a cell across the edge."""
+    """Return the neighbours of edges at `positions_along_side` (rows, n), as shares of a side: four
+    rows for each marker in `border_cells`, then, if there are more rows, four for the inner edges
+    of the border of `inner_border_cells`."""
     has_inner_neighbour, has_outer_neighbour = (
         np.zeros(positions_along_side.shape, np.float32),
         np.zeros(positions_along_side.shape, np.float32),
@@ -659,9 +673,12 @@ _MEDIAN_NEUTRAL_FILL: Floats = np.where(
 class NeighbourEdges:
     """The neighbouring edges that blur into a measured edge.
 
-    neighbour_distance_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 if
-    another edge with the same contrast is one cell further in or out, (rows, n). possible: False if
-    no edge can be found, (rows, n).
+    Attributes:
+        neighbour_distance_px: distance to a neighbouring edge, the size of a cell across the edge,
+            (rows,).
+        has_inner_neighbour, has_outer_neighbour: 1 if another edge with the same contrast is one
+            cell further in or out, otherwise 0, (rows, n).
+        can_be_located: False if no edge can be found on the profile, (rows, n).
     """
 
     neighbour_distance_px: Array
@@ -728,7 +745,8 @@ class _Profiles:
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the edges from one window around all middles, and which ones count."""
+        """Locate the edge on each profile with a wide window around the profile's middle. Return
+        its offsets, px (rows, n), and which profiles are usable."""
         spread = self.u * (_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -742,7 +760,9 @@ class _Profiles:
     def locate_in_narrow_window(
         self, line: Floats, blur_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Return the edges from a window around the row's line, which ones count, and blur^2."""
+        """Locate the edge on each profile again, with a narrow window around the side's `line`
+        (rows, n). Return its offsets, px (rows, n), which profiles are usable, and the variance of
+        the blur, px^2 (rows,)."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
@@ -779,8 +799,8 @@ class _Profiles:
 
 
 def _fit_line_to_half_midmeans(edge_offsets_px: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return lines (rows, n) through the middle of each row's halves, robust to a bad quarter of
-    either."""
+    """Fit a line (rows, n) to each side through the mean of the middle 50 % of the offsets in each
+    half of its profiles, so that up to a quarter of a half may be outliers."""
     halves = np.where(usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
         -1, 2, 2 * _QUARTER_PROFILES
     )

@@ -143,9 +143,12 @@ def is_fully_visible(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _linearize_edges(seen: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the derivatives (9, rows * n) of the edges by the terms of
-    `projected_corners_jacobian` and by the shift of all edges, px; and their normal equations (9,
-    9), (9,), per px^2 of an edge's variance."""
+    """Linearise the edges' offsets, px, in nine unknowns: the increment of the homography (8) and
+    the shift of all edges.
+
+    Returns the derivatives (9, rows * n), the normal matrix (9, 9) and its right-hand side (9,),
+    for an edge with a variance of 1 px^2.
+    """
     u, v = seen.points[..., 0], seen.points[..., 1]
     nx, ny = OUTWARD_NORMALS[seen.side_index].T[..., None] * seen.px_per_half_side[:, None]
     A = np.empty((9, *u.shape))
@@ -178,8 +181,9 @@ def _make_refined_corners(
     pattern: Pattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the corners of the square H (3, 3), with their covariance from the residuals of the
-    edges, px (rows, n), and the normal matrix (9, 9); None if the corners are too uncertain."""
+    """Return the corners of the marker projected by H (3, 3), with their covariance; None if they
+    are too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit, and
+    `normal_matrix` (9, 9) is that of the last step."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -327,12 +331,20 @@ _WINDOW_SAMPLE_OFFSETS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 
 
 @dataclass(frozen=True, eq=False)
 class VisibleEdges:
-    """Edges measured in one round of the fit.
+    """Edges measured in one round of the fit: n profiles in each row, with one row per visible
+    edge.
 
-    Per profile (rows, n): point in the marker's coordinates (rows, n, 2), outward offset from the
-    square's edge, weight. Per row (rows,): index of the side, distance of the edge from the centre
-    in half sides, pixels per half side across it, blur in units of the window. `white_grey` is the
-    grey level of white paper.
+    Attributes:
+        points: measured points (rows, n, 2) in the marker's own coordinates.
+        offset_px: outward distance (rows, n) of each point from the model's edge.
+        weight: weight (rows, n) of each profile.
+        side_index: index of the edge's side, 0 to 3, (rows,).
+        centre_distance_half_sides: distance of the edge from the marker's centre: 1 for a side,
+            less for an inner edge of the border, (rows,).
+        px_per_half_side: scale across the edge, (rows,).
+        blur_window_fraction: standard deviation of the blur over the half length of the window,
+            (rows,).
+        white_grey: grey level of white paper.
     """
 
     points: Array

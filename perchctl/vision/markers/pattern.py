@@ -30,11 +30,12 @@ _SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], 
 
 @dataclass(frozen=True, eq=False)
 class BorderCells:
-    """The cells next to a marker's border, along its four sides in the order of the corners.
+    """The cells just inside a marker's border, along its four sides in the order of the corners.
 
-    is_white: (4, n), 1 for a white cell; the first and last ones belong to the border.
-    white_behind: (4, n), 1 if the cell behind it is white too. tolerance: print error of an edge's
-    position, in cells.
+    Attributes:
+        is_white: 1 for a white cell, (4, n); the first and last ones belong to the border.
+        is_white_two_cells_deep: 1 if the next cell further in is white, too, (4, n).
+        print_tolerance_cells: standard deviation of the position of a printed edge.
     """
 
     is_white: Array
@@ -213,11 +214,11 @@ BLUR_MARGIN_NODES = 12
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A marker's `cell_whiteness` with its border, 1 = white, (n, n).
+    """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
 
-    For the target's large marker, also the small marker's cells, `small_cell_whiteness`, the
-    `small_to_large_side` of the small to the large side, and `paper_half_side`, half the side of
-    the paper in the marker's coordinates (None: infinite).
+    The target's large marker also has the small marker's cells, `small_cell_whiteness`; the side of
+    the small marker over its own, `small_to_large_side`; and half the side of the paper in the
+    marker's coordinates, `paper_half_side` (None: infinite).
     """
 
     cell_whiteness: Array
@@ -227,7 +228,8 @@ class Drawing:
 
     @property
     def compared_half_side(self) -> float:
-        """Half the side of the compared square, in the marker's own coordinates."""
+        """Half the side of the square that the photometric fit compares with the picture, in the
+        marker's own coordinates."""
         return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
@@ -236,8 +238,8 @@ def make_drawing(
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side: float = 0.0,
 ) -> Drawing:
-    """Return a marker's drawing from its inner bits, 1 = white; `small_marker_bits` and
-    `small_to_large_side` describe a marker inside."""
+    """Return a marker's drawing from its inner bits, 1 = white. If a small marker is printed in its
+    centre, `small_marker_bits` and `small_to_large_side` describe it."""
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
         return Drawing(cells)
@@ -252,7 +254,8 @@ def make_drawing(
 def _cell_coverage(
     node_positions: Array, half_node_spacing: float, n_cells: int, square_half_side: float
 ) -> Array:
-    """Return the share of each cell in each node, (nodes, cells)."""
+    """Return the fraction of each node's width that each cell covers, (nodes, cells), along one
+    axis. The cells fill a square from -square_half_side to square_half_side."""
     edges = square_half_side * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = (
         node_positions[:, None] - half_node_spacing,
@@ -272,10 +275,10 @@ def _add_margin_nodes(node_positions: Array, half_node_spacing: float) -> Array:
 
 @lru_cache(maxsize=64)
 def render_layers(drawing: Drawing, nodes_per_side: int) -> tuple[NDArray[np.float32], ...]:
-    """Render the drawing at n by n nodes.
+    """Render the drawing at n by n nodes and the margin around them.
 
-    Returns the whiteness of the nodes, 0 to 1, and, if the paper around the marker ends inside the
-    compared square, the share of each node that lies outside the paper.
+    Returns the whiteness of each node, 0 to 1. If the paper ends inside the compared square, a
+    second layer contains the fraction of each node outside the paper.
     """
     half_node_spacing = drawing.compared_half_side / nodes_per_side
     node_positions: Array = half_node_spacing * (
@@ -319,8 +322,8 @@ def render_cells(
 def blurred_cell_coverage(
     drawing: Drawing, node_positions: Array, half_node_spacing: float, blur_sigma_nodes: float
 ) -> Array:
-    """Return the share (n, cells) of each row of cells in each node, blurred by `blur_sigma_nodes`
-    nodes."""
+    """Return the fraction of each node's width that each row of cells covers, (n, cells), after a
+    Gaussian blur of `blur_sigma_nodes`."""
     wide = _cell_coverage(
         _add_margin_nodes(node_positions, half_node_spacing),
         half_node_spacing,
@@ -340,7 +343,7 @@ def blurred_cell_coverage(
 
 
 def blur_nodes(sharp: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
-    """Return the nodes, with the margin around them, after a Gaussian blur of `blur_sigma_nodes`
-    nodes."""
+    """Return the nodes after a Gaussian blur of `blur_sigma_nodes`. The input has a margin of
+    `BLUR_MARGIN_NODES` on all sides, and so has the result."""
     soft = cv2.GaussianBlur(sharp, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

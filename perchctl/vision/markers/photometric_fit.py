@@ -96,13 +96,15 @@ class Alignment:
 
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
-        fit_correlation: correlation of the picture with the drawing.
-        pattern_correlation, pattern_contrast: correlation and contrast of the inner bits, beyond a
-            black square of the same size; the contrast is relative to the border's.
-        cell_deviation_per_contrast: largest mean deviation of a cell, in units of the gain.
-        bit_flip_fraction, bit_flip_fraction_sigma: how far the worst-fitting cell has the opposite
-            colour, 0 (as drawn) to 1 (wrong bit), and the standard deviation of the least certain
-            cell.
+        fit_correlation: correlation of the picture with the fitted drawing.
+        pattern_correlation: correlation of the inner bits with what a plain black square of the
+            same size leaves unexplained in the picture.
+        pattern_contrast: contrast of the inner bits relative to the border's.
+        cell_deviation_per_contrast: largest mean deviation of a cell, relative to the contrast of
+            black and white.
+        bit_flip_fraction: how far the worst cell has the opposite colour, from 0 (as drawn) to 1
+            (wrong bit).
+        bit_flip_fraction_sigma: standard deviation of that fraction for the least certain cell.
         blur_px: standard deviation of the blur.
         motion_from_start_px: largest distance of a corner from its start.
     """
@@ -121,9 +123,16 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Residuals of a picture's grey values from a drawing in its best light, with a gain of grey
-    levels from black to white; the derivatives J by the unknowns; and the normal equations N x = g
-    of the next increment, per unit of noise."""
+    """One linearised round of the fit.
+
+    Attributes:
+        gain: grey levels from black to white.
+        grey_residual: the picture's grey values minus the drawing's under the light that fits best,
+            (n * n,).
+        J: derivatives of the drawing's grey values with respect to the unknowns (k, n * n).
+        noise_variance_grey2: variance of a residual.
+        N, g: normal equations N x = g of the next increment, divided by that variance.
+    """
 
     gain: float
     grey_residual: Array
@@ -277,13 +286,11 @@ def _measure_bit_flip_fraction(
     inverse_normal_matrix: Array,
     correlated_nodes: float,
 ) -> tuple[float, float]:
-    """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`.
+    """Return `bit_flip_fraction` and `bit_flip_fraction_sigma` of an `Alignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped one. `inverse_normal_matrix` is the inverse of the normal matrix N of
-    `equations`, and `correlated_nodes` the number of neighbouring nodes that share the same
-    information.
+    1 for a flipped one. `correlated_nodes` is the result of `_estimate_correlated_nodes`.
     """
     soft, noise, gain = seen.blurred_cell_coverage, equations.noise_variance_grey2, equations.gain
     n, m = soft.shape
@@ -315,7 +322,8 @@ def _measure_inner_pattern_match(
 
 
 def _estimate_correlated_nodes(grey_residual: Array) -> float:
-    """Return the number of neighbouring nodes with the same information."""
+    """Return how many neighbouring nodes share one independent residual, from the correlation of
+    `grey_residual` (n, n) between neighbours. The variance of a fit is larger by this factor."""
     energy = max(float((grey_residual * grey_residual).mean()), 1e-9)
     factor = 1.0
     for a, b in (
@@ -350,7 +358,8 @@ def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], 
 
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
-    """Return the derivatives (9, n * n) of grey by the increment and the blur's square."""
+    """Return the derivatives (9, n * n) of the drawing's grey values under `illumination` with
+    respect to the homography's increment (8) and the variance of the blur."""
     gain, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.blurred_layers
     bend = min(max(float(illumination[BEND]) / gain, -0.9), 0.9)
@@ -380,7 +389,8 @@ class Grid:
 
 @lru_cache(maxsize=64)
 def make_grid(nodes_per_side: int, half_side: float) -> Grid:
-    """Return the nodes in the middle of n by n parts of a square from -reach to reach."""
+    """Return the nodes in the middle of n by n equal parts of a square from -half_side to
+    half_side."""
     node_positions = half_side * ((2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0)
     return Grid(nodes_per_side, node_positions, _grid_coordinates(node_positions))
 
@@ -430,7 +440,8 @@ def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
 def _extract_patch(
     image: NDArray[np.uint8], grid: Grid, H: Array, node_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the required part of the picture, and its first pixel (2, 1)."""
+    """Return the part of the picture that contains all nodes, and its top left pixel (2, 1); None
+    if a node is outside the picture."""
     h, w = image.shape
     x, y = project_nodes(H, grid.uv1) + node_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -487,8 +498,9 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_layers(self) -> tuple[tuple[Array, Array], ...]:
-        """Each sheet at the nodes (n * n,), and its derivatives (9, n * n) by the eight terms of a
-        homography's increment and by the blur's square."""
+        """The layers of `render_layers` after the blur. Each is a pair: its values at the nodes (n
+        * n,), and their derivatives (9, n * n) with respect to the homography's increment (8) and
+        the variance of the blur."""
         sharp = render_layers(self.drawing, self.grid.nodes_per_side)
         return tuple(
             _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions)
@@ -497,8 +509,9 @@ class RenderedDrawing:
 
     @cached_property
     def illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), the eighth if
-        the sheet ends, and their Gram matrix."""
+        """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), and their Gram
+        matrix. The eighth row, for the grey beyond the paper, exists only if the paper ends inside
+        the compared square."""
         u, v, one = self.grid.uv1
         (white, _), *others = self.blurred_layers
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -507,8 +520,8 @@ class RenderedDrawing:
 
     @cached_property
     def black_square_illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of a black square's grey values under any light except slopes of the gain and bend:
-        rows (4 or 5, n * n), and their Gram matrix."""
+        """The same for a plain black square in place of the marker, but without the slopes of the
+        gain and without the bend of the tone curve: rows (4 or 5, n * n), and their Gram matrix."""
         soft = blur_nodes(
             render_black_square(len(self.drawing.cell_whiteness), self.grid.nodes_per_side),
             self.blur_sigma_nodes,
@@ -522,7 +535,7 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_cell_coverage(self) -> Array:
-        """Share of each row (or column) of cells in each node, (n, cells)."""
+        """Fraction of each node's width that each row (or column) of cells covers, (n, cells)."""
         half_node = self.drawing.compared_half_side / self.grid.nodes_per_side
         return blurred_cell_coverage(
             self.drawing, self.grid.node_positions, half_node, self.blur_sigma_nodes
@@ -531,8 +544,9 @@ class RenderedDrawing:
 
 @lru_cache(maxsize=16)
 def render_blurred(drawing: Drawing, nodes_per_side: int, blur_table_index: int) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_LOG_BLUR_TABLE_STEP *
-    step)`` nodes."""
+    """Return the drawing at n by n nodes over the compared square, blurred by
+    ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes: the blurs form a table, so that results
+    can be cached."""
     return RenderedDrawing(
         drawing,
         make_grid(nodes_per_side, drawing.compared_half_side),

@@ -70,7 +70,8 @@ def search(
     little.
 
     With `search_mode` "near" or "window", only the window is searched; with "sharp", only the whole
-    picture. `own_target_offset_m` selects one of several targets if none is expected.
+    picture; otherwise both. If several targets are found and none is expected, the closest by
+    `own_target_offset_m` is chosen.
     """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
