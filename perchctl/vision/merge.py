@@ -116,7 +116,7 @@ def merge_tracks(
     weights: WeightsConfig,
 ) -> MergedTarget | None:
     """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    `poses_by_track` update, or otherwise from the tracks measured last; None without tracks."""
+    update, or otherwise from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())

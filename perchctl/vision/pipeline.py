@@ -104,7 +104,7 @@ def make_pipeline(
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera; several streams may share it.
 
-    `hidden_mask` marks the pixels (h, w) that the vehicle covers in the camera's pictures; None
+    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's pictures; None
     reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
     """
     pose = PoseSetup(
@@ -252,7 +252,7 @@ def step_detections(
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
     """Run the part of `step` after the detection. `start_pose` is the expected pose of the target,
-    `picture_kind` the kind of the picture."""
+    and `picture_kind` tells whether the picture is whole or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
     measured = measure_markers(

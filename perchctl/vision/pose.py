@@ -228,7 +228,8 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A candidate, its reprojection errors (n, 2) and their Jacobian (2n, 6) by rvec and tvec."""
+    """A candidate, its reprojection errors (n, 2), and their Jacobian (2n, 6) with respect to rvec
+    and tvec."""
 
     error_px: Array
     jacobian: Array
@@ -250,7 +251,7 @@ class TiltPrior:
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
         """True if the candidate's normal differs from a known `normal_cam` by more than
-        `spread_rad`."""
+        `sigma_rad`."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.sigma_rad

@@ -56,8 +56,8 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks, lock and rival after a frame, and the verdict of the gate; `measured.used_poses`
-    is empty if the gate rejects the frame's pose."""
+    """The tracks, lock and rival after a frame, and the verdict of the gate;
+    `measured.poses_by_track` is empty if the gate rejects the frame's pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -218,8 +218,7 @@ def judge_pose(
     frame_pose: FramePose,
     filter_setup: FilterSetup,
 ) -> GateVerdict:
-    """Return the gate's verdict on a frame's pose `frame_pose`, given the lock and the rival, if
-    any."""
+    """Return the gate's verdict on a frame's pose, given the lock and the rival, if any."""
     lock, rival = drop_expired(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
@@ -296,7 +295,7 @@ def predict_rival_state(
 def update_lock(
     lock: TargetLock | None, track: MarkerTrack, frame_pose: FramePose, verdict: GateVerdict
 ) -> TargetLock:
-    """Return the lock after the accepted pose `frame_pose`, with the track that the pose
+    """Return the lock after the gate accepted `frame_pose`. `track` is the track that this pose
     updated."""
     anew = verdict.restarts_track and not verdict.is_same_target
     before = (
@@ -567,8 +566,8 @@ def is_in_view(position_world_m: Array, attitude: Attitude, setup: PoseSetup) ->
 
 
 class _CameraDisplacements(NamedTuple):
-    """The camera's displacement (3,) in the world, by the difference of two estimated positions,
-    and by velocity times time."""
+    """The camera's displacement (3,) in the world between two attitudes: from the difference of the
+    two estimated positions, and from velocity times time."""
 
     by_position_m: Array
     by_velocity_m: Array

@@ -153,20 +153,20 @@ class Detection:
     sigma_px: float
     refined: bool
     edge_shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
-    # (4, 2): one standard deviation of a shift common to all corners
+    # (4, 2): change of the corners by one standard deviation of an error common to all of them
     common_error_shift_px: Array | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = (
         0.0  # standard deviation due to the jitter of rows in analogue video
     )
-    # for sides along the rows, if every second one is interpolated
+    # additional standard deviation of sides along the rows, if every second row is interpolated
     horizontal_side_extra_sigma_px: float = 0.0
 
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """Growth of white over black at the edges of a picture, px, its standard deviation, px, and the
-    number of pictures since its measurement."""
+    """How far white has grown over black at all edges of a picture, px, its standard deviation, px,
+    and the number of pictures since it was measured."""
 
     shift_px: float
     sigma_px: float
@@ -299,8 +299,9 @@ class TargetEstimate:
         tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
             is the target's last position.
         unseen: number of frames since the last detection.
-        e_m: target relative to the gear in the level frame, (3,) m. Its standard deviation sigma_m
-            (3,) also covers the position of a contradicting pose while only that is seen.
+        e_m: target relative to the gear in the level frame, (3,) m.
+        sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`. While only a
+            rival is seen, which may be the target, sigma_m also covers the rival's position.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: the filter's velocity of `e_m` (`kalman.frame: level`) or of the target in the
             world (`kalman.frame: world`), in level axes, (3,).
@@ -399,8 +400,8 @@ class MeasuredMarkers:
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
-        """The pose with the smallest standard deviation in `used_poses`, otherwise in `poses`; None
-        without poses."""
+        """The pose with the smallest standard deviation in `poses_by_track`, otherwise in `poses`;
+        None without poses."""
         poses = self.poses_by_track or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 

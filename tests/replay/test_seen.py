@@ -69,10 +69,10 @@ def test_they_show_all_that_matters() -> None:
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (edge_fit, "_SHIFT_PRIOR_PX"),  # the fit of edges
+        (edge_fit, "_EDGE_SHIFT_PRIOR_SIGMA_PX"),  # the fit of edges
         pytest.param(edge_fit, "MIN_LINE_SIGMA_PX", marks=pytest.mark.long),
-        pytest.param(pose, "_CLAIMED_SPREAD_DOF", marks=pytest.mark.long),  # the pose
-        (the_filter, "_ACCELERATION_DURATION_S"),
+        pytest.param(pose, "_CLAIMED_SIGMA_DOF", marks=pytest.mark.long),  # the pose
+        (the_filter, "_ACCELERATION_CORRELATION_TIME_S"),
     ],
 )
 def test_a_changed_constant_of_the_pipeline_is_noticed(

@@ -202,12 +202,13 @@ def align_marker(
     max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
     must_be_distinctive: bool = True,
 ) -> RefinedCorners | None:
-    """Return the marker fitted by its drawing; None unless the picture matches the drawing.
+    """Fit a marker's drawing to the picture and return its corners; None unless the picture matches
+    the drawing.
 
     `max_motion_sides` is the largest distance of the corners from `start_px`, and
     `max_corner_sigma_sides` their largest standard deviation, both in side lengths; `blur_px` is a
-    first guess. If `must_be_distinctive`, the codeword must be distinctive; otherwise the other
-    marker identifies this one.
+    first guess. If `must_be_distinctive`, the picture must also exclude every other codeword; this
+    is not necessary if the other marker identifies this one.
     """
     side_px = mean_side_px(start_px)
     if not side_px >= MIN_MARKER_SIDE_PX:

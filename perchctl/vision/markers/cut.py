@@ -361,8 +361,8 @@ def _downsample(fine: FloatImage) -> FloatImage:
 def render_drawing(
     H: Array, texture: DrawingTexture, lattice: OverviewLattice, margin_nodes: int = 0
 ) -> FloatImage:
-    """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin_nodes`
-    nodes around."""
+    """Return the whiteness, 0 to 1, of the drawing projected by H (3, 3), at the lattice's nodes
+    and at `margin_nodes` more nodes on each side."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_NODE
     start = (
         lattice.first_node_normalised
@@ -391,7 +391,8 @@ def render_drawing(
 
 
 class DrawingMatch(NamedTuple):
-    """Correlation of the picture with the drawing, 0 to 1, and grey levels from black to white."""
+    """How well the picture matches the drawing: their correlation, 0 to 1, and the picture's
+    contrast from black to white, in grey levels."""
 
     correlation: float
     contrast_grey: float

@@ -114,8 +114,8 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class CornerFindings:
-    """Results of the methods tried so far: the markers' `corners`, and the result of the last
-    `search_result`."""
+    """Results of the methods tried so far: the markers' `corners`, and the raw markers that the
+    last search found, `search_result`."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
     search_result: FoundMarkers = field(default_factory=FoundMarkers)
@@ -327,7 +327,7 @@ def detect_markers(
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
-    The search starts at the corners (4, 2) px `expected_corners_px` from the vehicle's motion, or
+    The search starts at `expected_corners_px`, each (4, 2), predicted from the vehicle's motion, or
     otherwise near the `previous` detections. `empty_frames`, the number of successive frames
     without markers, alternates the kinds of search; None applies all kinds. If no target is
     expected, `own_target_offset_m` selects one of several. For a frame of two fields, the result is
@@ -674,10 +674,10 @@ def add_partly_visible(
     found_corners: _FoundCorners,
     shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the `found_corners` markers of `refine_expected_markers` plus those fitted to their
-    visible part.
+    """Return the markers in `found_corners`, plus the expected markers of which a visible part
+    could be fitted.
 
-    If the small marker was seen, the large one is expected around it.
+    If the small marker was found, the large one is expected around it.
     """
     places, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:

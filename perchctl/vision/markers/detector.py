@@ -179,7 +179,8 @@ def is_hidden(
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if any pixel up to `reach_half_sides` half sides from the marker's centre is hidden."""
+    """True if any pixel within `reach_half_sides` (in half sides of the marker) of the marker's
+    centre is hidden by the vehicle."""
     if hidden is None:
         return False
     h, w = hidden.shape

@@ -497,9 +497,15 @@ class MarkerSides:
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Edges on profiles: `grey` values (rows, n, steps + 1), half lengths `window_half_px` of the
-    windows in them (rows,), edge `points` (rows, n, 2), normalised, `weight` (rows, n) and blur
-    (rows,)."""
+    """Edges measured on n profiles across each side.
+
+    Attributes:
+        grey: grey values along the profiles, (rows, n, steps + 1).
+        window_half_px: half length of the window around the edge, (rows,).
+        points: edge points in normalised image coordinates, (rows, n, 2).
+        weight: weight of each point, 0 for outliers, (rows, n).
+        blur_px: standard deviation of the blur, (rows,).
+    """
 
     grey: Floats
     window_half_px: Array

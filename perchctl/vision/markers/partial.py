@@ -202,7 +202,7 @@ def _make_refined_corners(
     )
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.border_cells.cells_per_side
-    # The square alone; `shift_sigma_px` covers the uncertainty of the shift of all edges.
+    # The square alone; `edge_shift_sigma_px` covers the uncertainty of the shift of all edges.
     J = projected_corners_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_px) ** 2

@@ -298,16 +298,16 @@ def render_layers(drawing: Drawing, nodes_per_side: int) -> tuple[NDArray[np.flo
 
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square with `cells_per_side` cells per side, at n by n
-    nodes."""
+    """Return the whiteness of a black square with the size of a marker that has `cells_per_side`
+    cells, at n by n nodes."""
     return render_layers(Drawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side)[0]
 
 
 def render_cells(
     drawing: Drawing, node_positions: Array, half_node_spacing: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness of the nodes at `node_positions` x `node_positions`, and of
-    `BLUR_MARGIN_NODES` additional nodes on all sides."""
+    """Return the whiteness of the square grid of nodes with the coordinates `node_positions` in
+    both directions, and of `BLUR_MARGIN_NODES` additional nodes on all sides."""
     wide = _add_margin_nodes(node_positions, half_node_spacing)
     C = _cell_coverage(wide, half_node_spacing, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T

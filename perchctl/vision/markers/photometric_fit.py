@@ -12,7 +12,7 @@ by cell, does not show the marker.
 
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
 the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
-same with that blur; `Alignment.wrong_bit_degree` says how close one is.
+same with that blur; `Alignment.bit_flip_fraction` says how close one is.
 
 Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
 grids are (n, n) nodes, stored as rows of n * n.
@@ -273,8 +273,7 @@ def _linearize_greys(
 
 
 def fit_correlation(grey: Array, grey_residual: Array) -> float:
-    """Return the correlation of grey values (k,) with their fit, whose residual is `grey_residual`
-    (k,)."""
+    """Return the correlation of grey values (k,) with their fit, given the residuals (k,)."""
     spread = grey - grey.mean()
     explained = 1.0 - float((grey_residual**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -489,8 +488,8 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A marker's drawing, rendered at the nodes of a grid with a Gaussian blur of
-    `blur_sigma_nodes` nodes."""
+    """A marker's drawing at the nodes of a grid, after a Gaussian blur with a standard deviation of
+    `blur_sigma_nodes`."""
 
     drawing: Drawing
     grid: Grid
