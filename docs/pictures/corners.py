@@ -24,7 +24,7 @@ from perchctl.plot import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, figure_bytes,
 from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
     apply_homography,
-    homography_from_unit_square,
+    homography_from_centred_square,
     mean_side_px,
     refine_subpix,
 )
@@ -94,7 +94,7 @@ def partial_view_fit(file: Path) -> None:
     """The edges that are in view, and the square that follows from them."""
     view = _view("Partial-view fit")
     figure, whole, near = _panels(view)
-    H = homography_from_unit_square(undistort_px(_found(view), CAMERA))
+    H = homography_from_centred_square(undistort_px(_found(view), CAMERA))
     seen = find_visible_edges(view.picture, H, _LARGE)
     assert seen is not None
     points = apply_homography(H, seen.points[seen.weight > 0.0])
@@ -220,7 +220,7 @@ def _drawing(view: View, file: Path) -> None:
     assert fit is not None
     n = 44
     grid = make_grid(n, drawing.compared_half_side)
-    H = homography_from_unit_square(undistort_px(fit.corners_px, CAMERA))
+    H = homography_from_centred_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
     node_px = drawing.compared_half_side * mean_side_px(fit.corners_px) / n

@@ -32,7 +32,7 @@ class OwnTargetPosition:
 
 
 OwnTargetOffset = Callable[[MarkerName, Array], float]
-"""Function that returns the distance of a marker with corners (4, 2) px from the own target's
+"""Function that returns the distance, m, of a marker with corners (4, 2) px from the own target's
 position, or inf."""
 
 

@@ -27,7 +27,7 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     apply_homography,
-    homography_to_unit_square,
+    homography_to_centred_square,
     is_inside_picture,
     mean_side_px,
     side_lengths_px,
@@ -153,7 +153,9 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
         return corners_px
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     template = _render_template(
-        pattern, apply_homography(homography_to_unit_square(local - first), grid), side_px * scale
+        pattern,
+        apply_homography(homography_to_centred_square(local - first), grid),
+        side_px * scale,
     )
     score = cv2.matchTemplate(patch.astype(np.float32), template, cv2.TM_CCOEFF_NORMED)
     _, _, _, peak = cv2.minMaxLoc(score)

@@ -1,8 +1,8 @@
 """Geometry of a marker's square in the picture (sides, area, concentric squares), and its refined
 corners.
 
-The unit square is the marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1), (-1, 1)
-in the order of `Detection.corners_px`.
+The centred square is the marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1), (-1,
+1) in the order of `Detection.corners_px`.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from perchctl.geometry import Array
 from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-UNIT_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-"""Corners of the unit square in the marker's own coordinates, (4, 2)."""
+CENTRED_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Corners of the centred square, -1 to 1, in the marker's own coordinates, (4, 2)."""
 # indices of corner i's neighbours
 NEXT_CORNER, PREVIOUS_CORNER = (np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2]))
 OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
-_UNIT_SQUARE_F32 = UNIT_SQUARE.astype(np.float32)
-_UNIT_SQUARE_HOMOGENEOUS: Array = np.column_stack([UNIT_SQUARE, np.ones(4)])
+_CENTRED_SQUARE_F32 = CENTRED_SQUARE.astype(np.float32)
+_CENTRED_SQUARE_HOMOGENEOUS: Array = np.column_stack([CENTRED_SQUARE, np.ones(4)])
 _INCREMENT_JACOBIANS: Array = np.array(
     [
         [[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]]
-        for u, v in UNIT_SQUARE
+        for u, v in CENTRED_SQUARE
     ]
 )
 """Motion of each corner with the terms of an increment, in the marker's own coordinates."""
 
 
-def homography_from_unit_square(corners: Array) -> Array:
+def homography_from_centred_square(corners: Array) -> Array:
     """Return the homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
-    H = cv2.getPerspectiveTransform(_UNIT_SQUARE_F32, corners.astype(np.float32))
+    H = cv2.getPerspectiveTransform(_CENTRED_SQUARE_F32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
-def homography_to_unit_square(corners: Array) -> Array:
+def homography_to_centred_square(corners: Array) -> Array:
     """Return the homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
-    H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT_SQUARE_F32)
+    H = cv2.getPerspectiveTransform(corners.astype(np.float32), _CENTRED_SQUARE_F32)
     return np.asarray(H, dtype=np.float64)
 
 
@@ -57,7 +57,7 @@ def apply_homography(H: Array, points: Array) -> Array:
 def projected_corners_jacobian(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
     respect to the `increment` of `increment_homography`."""
-    q = _UNIT_SQUARE_HOMOGENEOUS.dot(homography.T)
+    q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
     return np.asarray((A @ _INCREMENT_JACOBIANS).reshape(8, 8))
@@ -107,7 +107,7 @@ def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = N
     without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
-        homography_from_unit_square(straight), (_UNIT_SQUARE_F32 * ratio).astype(np.float64)
+        homography_from_centred_square(straight), (_CENTRED_SQUARE_F32 * ratio).astype(np.float64)
     )
     return found if camera is None else distort_to_px(found, camera)
 

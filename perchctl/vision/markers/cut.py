@@ -36,7 +36,7 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
-    UNIT_SQUARE,
+    CENTRED_SQUARE,
     RefinedCorners,
     apply_homography,
     is_inside_picture,
@@ -172,7 +172,7 @@ def _initial_pose(
         return None
     half_side = ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform(
-        (half_side * UNIT_SQUARE).astype(np.float32), rays.astype(np.float32)
+        (half_side * CENTRED_SQUARE).astype(np.float32), rays.astype(np.float32)
     )
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
@@ -220,7 +220,7 @@ def _is_reliable(found: PoseFit) -> bool:
 
 def _marker_corners(found: PoseFit, half_side: float, camera: CameraModel) -> RefinedCorners | None:
     """Return the corners of the marker with this half side; None outside the lens model."""
-    r = np.column_stack([half_side * UNIT_SQUARE, np.zeros(4)]) @ found.pose.R_cam_drawing.T
+    r = np.column_stack([half_side * CENTRED_SQUARE, np.zeros(4)]) @ found.pose.R_cam_drawing.T
     X = r + found.pose.t_cam_half_sides
     if X[:, 2].min() <= 0.0:
         return None  # one corner is next to or behind the camera

@@ -41,14 +41,14 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array, is_finite
 from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
+    CENTRED_SQUARE,
     NEXT_CORNER,
     OUTWARD_NORMALS,
     PREVIOUS_CORNER,
-    UNIT_SQUARE,
     RefinedCorners,
     apply_homography,
-    homography_from_unit_square,
-    homography_to_unit_square,
+    homography_from_centred_square,
+    homography_to_centred_square,
     side_lengths_px,
     signed_double_area,
 )
@@ -351,7 +351,7 @@ def _measure_edge_shift(
         float(markers.cell_px[k]),
     )
     r = 1.0 - 2.0 / rim.cells_per_side
-    own = apply_homography(homography_to_unit_square(corners[k]), inner_edges.points)
+    own = apply_homography(homography_to_centred_square(corners[k]), inner_edges.points)
     far = np.matmul(own, OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = inner_edges.weight * (inner_edges.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
@@ -561,7 +561,7 @@ def measure_edges(
     if with_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
         inner = apply_homography(
-            homography_from_unit_square(markers.corners_normalised[widest]), r * UNIT_SQUARE
+            homography_from_centred_square(markers.corners_normalised[widest]), r * CENTRED_SQUARE
         )[None]
         starts = np.concatenate([starts, inner])
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])

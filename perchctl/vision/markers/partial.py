@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort_to_px, pinhole_px, undistort_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
+    CENTRED_SQUARE,
     NEXT_CORNER,
     OUTWARD_NORMALS,
     PREVIOUS_CORNER,
-    UNIT_SQUARE,
     RefinedCorners,
     apply_homography,
-    homography_from_unit_square,
+    homography_from_centred_square,
     increment_homography,
     is_inside_picture,
     mean_side_px,
@@ -106,7 +106,7 @@ def fit_partly_visible(
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
-    H = homography_from_unit_square(start)
+    H = homography_from_centred_square(start)
     for k in range(_PARTIAL_FIT_ITERATIONS):
         seen = find_visible_edges(picture, H, pattern)
         if seen is None:
@@ -196,7 +196,7 @@ def _make_refined_corners(
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
     noise2 = max(_ROBUST_VARIANCE_FACTOR * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
-    pinhole = apply_homography(H, UNIT_SQUARE)
+    pinhole = apply_homography(H, CENTRED_SQUARE)
     corners_px = distort_to_px(
         apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera
     )
@@ -279,7 +279,7 @@ def _project_sample_points_px(corners_px: Array, pattern: Pattern, camera: Camer
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points), 2), np.nan)
-    undistorted = apply_homography(homography_from_unit_square(rays), pattern.sample_points)
+    undistorted = apply_homography(homography_from_centred_square(rays), pattern.sample_points)
     at = distort_to_px(undistorted, camera)
     near = (
         np.abs(undistort_to_normalised(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
@@ -363,7 +363,7 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     camera, cells, corners = (
         picture.camera,
         pattern.border_cells.cells_per_side,
-        apply_homography(H, UNIT_SQUARE),
+        apply_homography(H, CENTRED_SQUARE),
     )
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -373,7 +373,7 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H
-    starts = np.stack([apply_homography(to_rays, r * UNIT_SQUARE) for r in rings])
+    starts = np.stack([apply_homography(to_rays, r * CENTRED_SQUARE) for r in rings])
     scale_px = (0.25 * (sides_px[PREVIOUS_CORNER] + sides_px[NEXT_CORNER]))[side]
     s = profile_positions(sides_px[side] * at)
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)

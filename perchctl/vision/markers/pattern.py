@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     apply_homography,
-    homography_from_unit_square,
+    homography_from_centred_square,
     is_inside_picture,
 )
 
@@ -187,7 +187,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 def _read_samples(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
     """Return the grey values (k,) at the sample points; None outside the picture."""
-    at = apply_homography(homography_from_unit_square(corners_px), pattern.sample_points)
+    at = apply_homography(homography_from_centred_square(corners_px), pattern.sample_points)
     # The sample points are inside the corners.
     if not (is_inside_picture(corners_px, image.shape) or is_inside_picture(at, image.shape)):
         return None

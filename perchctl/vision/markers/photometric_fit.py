@@ -33,9 +33,9 @@ from perchctl.geometry import Array
 from perchctl.values import cached_property
 from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
-    UNIT_SQUARE,
+    CENTRED_SQUARE,
     apply_homography,
-    homography_from_unit_square,
+    homography_from_centred_square,
     increment_homography,
     projected_corners_jacobian,
 )
@@ -164,7 +164,7 @@ def align_drawing(
         np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
     )
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
-    grid, H = make_grid(n, reach), homography_from_unit_square(start)
+    grid, H = make_grid(n, reach), homography_from_centred_square(start)
     node_shift_px = lens_shift_px(grid, H, camera)
     patch = _extract_patch(image, grid, H, node_shift_px)
     if patch is None:
@@ -210,7 +210,7 @@ def align_drawing(
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
     gain, grey_residual = equations.gain, equations.grey_residual
-    corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
+    corners_px = distort_px(apply_homography(H, CENTRED_SQUARE).T, camera).T
     pattern_correlation, pattern_contrast = _measure_inner_pattern_match(seen, grey, gain)
     correlated_nodes = _estimate_correlated_nodes(grey_residual.reshape(n, n))
     inverse_normal_matrix = np.asarray(np.linalg.inv(equations.N))

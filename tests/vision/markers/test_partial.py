@@ -20,7 +20,7 @@ from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     apply_homography,
-    homography_from_unit_square,
+    homography_from_centred_square,
 )
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
@@ -176,7 +176,7 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.is_inner & ~LARGE.is_white)[0]
     spots = apply_homography(
-        homography_from_unit_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
+        homography_from_centred_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
     )
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
@@ -242,7 +242,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
     assert is_hidden(covered, TRUE)
-    bare, at = render(*POSE, noise=2.0), homography_from_unit_square(undistort_px(TRUE, CAMERA))
+    bare, at = render(*POSE, noise=2.0), homography_from_centred_square(undistort_px(TRUE, CAMERA))
     seen = [
         find_visible_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE)
         for gear in (None, covered)
