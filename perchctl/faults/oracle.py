@@ -70,6 +70,9 @@ KEY_HELD_S = 1.0
 """A key that repeats is one press until this long after the first."""
 REPEAT_WITHIN_S = 0.23
 """A second press does not count if another follows within this time, as a key repeats."""
+REPEAT_SPREAD_S = 0.021
+"""Largest difference between the intervals of a key that repeats, s: the simulated clock delivers a
+press up to 10 ms early or late. Larger: a hand counts as a key, and its stop need not be obeyed."""
 
 
 class Sample(NamedTuple):
@@ -123,7 +126,7 @@ def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
 
 def _are_repeats(presses_s: Sequence[float]) -> bool:
     delay_s, *periods_s = (later_s - earlier_s for earlier_s, later_s in pairwise(presses_s))
-    return delay_s > 2.0 * max(periods_s) and max(periods_s) - min(periods_s) < 0.01
+    return delay_s > 2.0 * max(periods_s) and max(periods_s) - min(periods_s) <= REPEAT_SPREAD_S
 
 
 class _Lasting:
