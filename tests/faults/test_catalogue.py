@@ -75,8 +75,9 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
         case = draw_fault_case(BY_NAME[name], Phase.ALIGN, np.random.default_rng(seed), SCENARIO)
         presses_s = case.effects[0].keywords["presses_s"]
         if seed % 2:
-            begin_s = 0.0001 * seed
-            presses_s = [math.ceil(100 * (begin_s + press_s)) / 100 for press_s in presses_s]
+            late_s = np.random.default_rng(seed).choice([0.0, 0.01], len(presses_s))
+            steps_s = [math.ceil(round(100 * press_s, 6)) / 100 for press_s in presses_s]
+            presses_s = [step_s + more_s for step_s, more_s in zip(steps_s, late_s, strict=True)]
         now_s = [0.0]
         switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])  # noqa: B023
         for now_s[0] in presses_s:
