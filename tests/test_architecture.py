@@ -91,7 +91,7 @@ MOST_NAMES = {
     "fleet": 29,
     "flight": 19,
     "link": 18,
-    "record": 12,
+    "record": 13,
     "mission": 35,
     "perception": 5,
     "positioning": 10,

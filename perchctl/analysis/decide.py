@@ -18,7 +18,7 @@ import numpy as np
 from perchctl.errors import InvalidValue
 from perchctl.mission import Observation, PlannerState, Turn, load_table, step_mission
 from perchctl.profile import Profile
-from perchctl.record import FlightLog, to_exact_json
+from perchctl.record import FlightLog, log_names, to_exact_json
 from perchctl.vehicle import Command
 
 FieldDifference = tuple[str, Any, Any]
@@ -116,8 +116,12 @@ def _difference(
         "outcome": state.outcome,
         "reason": state.reason,
     }
-    compared = [n for n in replayed if ("Turn", n) not in comparison.unknown]
-    return comparison.first_difference((n, getattr(turn, n), replayed[n]) for n in compared)
+    logged = log_names(Turn)
+    return comparison.first_difference(
+        (logged.keys[n], getattr(turn, n), value)
+        for n, value in replayed.items()
+        if (logged.owner, logged.keys[n]) not in comparison.unknown
+    )
 
 
 # --- In which field two values first differ ---
@@ -132,6 +136,8 @@ class Comparison:
         unknown: fields that are not compared, each as the names of its dataclass and of itself.
         tolerances: by the name of a field, by how much its numbers may differ, in the field's own
             unit; the empty name stands for all other fields.
+
+    All names are those in the log.
     """
 
     unknown: Collection[tuple[str, str]] = ()
@@ -149,10 +155,12 @@ class Comparison:
             return None
         parts: list[FieldDifference]
         if dataclasses.is_dataclass(recorded):
-            owner = type(recorded).__name__
-            names = [each.name for each in dataclasses.fields(recorded)]
-            compared = [n for n in names if (owner, n) not in self.unknown]
-            parts = [(f"{name}.{n}", getattr(recorded, n), getattr(replayed, n)) for n in compared]
+            logged = log_names(recorded.__class__)
+            parts = [
+                (f"{name}.{key}", getattr(recorded, n), getattr(replayed, n))
+                for n, key in logged.keys.items()
+                if (logged.owner, key) not in self.unknown
+            ]
         elif isinstance(recorded, dict):
             keys = {**recorded, **replayed}
             parts = [(f"{name}.{key}", recorded.get(key), replayed.get(key)) for key in keys]

@@ -21,7 +21,7 @@ from perchctl.errors import InvalidValue
 from perchctl.flight import FlightInputs
 from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
-from perchctl.record import FlightLog
+from perchctl.record import FlightLog, log_names
 from perchctl.vision import Pipeline, make_pipeline
 
 CAUTION = (
@@ -305,10 +305,11 @@ def _differing(
         was, seen = each.turn.observation, each.observation
         fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
         if was is not None and seen is not None:
+            logged = log_names(Observation)
             fields += [
-                (n, getattr(was, n), getattr(seen, n))
+                (logged.keys[n], getattr(was, n), getattr(seen, n))
                 for n in FlightInputs.SENSED_FIELDS
-                if ("Observation", n) not in comparison.unknown
+                if (logged.owner, logged.keys[n]) not in comparison.unknown
             ]
         difference = comparison.first_difference(fields)
         if difference is not None:

@@ -2,6 +2,7 @@ from .exact import from_exact_json as from_exact_json
 from .exact import json_line as json_line
 from .exact import to_exact_json as to_exact_json
 from .header import camera_record as camera_record
+from .keys import log_names as log_names
 from .read import FlightLog as FlightLog
 from .read import PhaseSpan as PhaseSpan
 from .read import read_log as read_log

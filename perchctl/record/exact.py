@@ -21,6 +21,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from perchctl.record.keys import log_names
+
 T = TypeVar("T")
 _GONE = {"timing"}  # fields of a flight in real time by 0.2.0
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
@@ -62,22 +64,29 @@ def to_exact_json(value: Any) -> Any:
 def _exact_fields(value: Any) -> dict[str, Any]:
     kind: Any = type(value)
     found: dict[str, Any] = {}
-    for name, default, members in _fields_of(kind):
+    for name, key, default, members in _fields_of(kind):
         part = getattr(value, name)
         if part is None:
             if default is not None:
-                found[name] = None
+                found[key] = None
         elif len(members) > 1:
-            found[name] = [type(part).__name__, to_exact_json(part)]
+            found[key] = [type(part).__name__, to_exact_json(part)]
         else:
-            found[name] = to_exact_json(part)
+            found[key] = to_exact_json(part)
     return found
 
 
 @cache
-def _fields_of(kind: type) -> list[tuple[str, Any, tuple[Any, ...]]]:
-    hints = typing.get_type_hints(kind)
-    return [(f.name, f.default, _members(hints[f.name])) for f in dataclasses.fields(kind)]
+def _fields_of(kind: type) -> list[tuple[str, str, Any, tuple[Any, ...]]]:
+    hints, keys = typing.get_type_hints(kind), log_names(kind).keys
+    return [
+        (f.name, keys[f.name], f.default, _members(hints[f.name])) for f in dataclasses.fields(kind)
+    ]
+
+
+@cache
+def _names_by_key(kind: type) -> dict[str, str]:
+    return {key: name for name, key, _, _ in _fields_of(kind)}
 
 
 @cache
@@ -91,6 +100,8 @@ def _members(hint: Any) -> tuple[Any, ...]:
 @dataclasses.dataclass(frozen=True)
 class ExactField:
     """A field of a dataclass at some depth of a type, for example ``observation.imu.t_s``.
+
+    All names are those in the log (`perchctl.record.keys`).
 
     Attributes:
         path: the dotted names that lead to it.
@@ -116,9 +127,9 @@ def exact_fields(hint: Any, path: str = "") -> list[ExactField]:
                 found += exact_fields(part, path)
             continue
         assert isinstance(kind, type)
-        for name, default, _ in _fields_of(kind):
-            within = f"{path}.{name}" if path else name
-            found.append(ExactField(within, kind.__name__, name, default is not None))
+        for name, key, default, _ in _fields_of(kind):
+            within = f"{path}.{key}" if path else key
+            found.append(ExactField(within, log_names(kind).owner, key, default is not None))
             found += exact_fields(_hints(kind)[name], within)
     return found
 
@@ -136,9 +147,10 @@ def collect_written_names(hint: Any, data: Any, names: dict[str, set[str]]) -> N
     args = typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         assert isinstance(kind, type)
-        names.setdefault(kind.__name__, set()).update(data)
-        for name in _hints(kind).keys() & data.keys():
-            collect_written_names(_hints(kind)[name], data[name], names)
+        names.setdefault(log_names(kind).owner, set()).update(data)
+        for key, name in _names_by_key(kind).items():
+            if key in data:
+                collect_written_names(_hints(kind)[name], data[key], names)
     elif typing.get_origin(kind) is tuple:
         kinds = [args[0]] * len(data) if args[-1] is Ellipsis else args
         for each, part in zip(kinds, data, strict=True):
@@ -188,14 +200,14 @@ def _from_exact(hint: Any, data: Any) -> Any:
 
 
 def _dataclass_from(kind: Any, data: Any) -> Any:
-    hints, values = _hints(kind), {}
-    for name, part in data.items():
-        if name in _GONE:
+    hints, values, names = _hints(kind), {}, _names_by_key(kind)
+    for key, part in data.items():
+        if key in _GONE:
             continue
         try:
-            values[name] = _from_exact(hints[name], part)
+            values[names[key]] = _from_exact(hints[names[key]], part)
         except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(f"{key}: {error}") from None
     return kind(**values)
 
 

@@ -26,8 +26,10 @@ from perchctl.mission import (
     TurnInputs,
     UnfilteredPose,
 )
-from perchctl.record import from_exact_json, to_exact_json
-from perchctl.record.exact import decode_line, encode_line, to_rounded_json
+from perchctl.record import from_exact_json, read_log, to_exact_json
+from perchctl.record.exact import decode_line, encode_line, exact_fields, to_rounded_json
+from perchctl.record.header import turn_fields
+from perchctl.record.keys import CLASS_KEYS, FIELD_KEYS
 from perchctl.record.read import parse_exact, parse_turn
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
@@ -42,6 +44,7 @@ from perchctl.vehicle import (
 from perchctl.vision import CameraModel
 from tests.helpers import log as synthetic
 
+CORPUS = Path(__file__).parents[1] / "data" / "flights"
 floats = st.floats(width=64)
 vectors = st.tuples(floats, floats, floats)
 
@@ -195,6 +198,20 @@ def test_a_turn_of_an_earlier_version_comes_back() -> None:
     del record["began_s"]
     with pytest.raises(InvalidValue, match="began_s"):
         parse_turn(record)
+
+
+def test_a_log_keeps_its_keys_whatever_the_program_calls_a_field() -> None:
+    """A log of an earlier version has no other keys, and each entry of the tables is for a field
+    that exists."""
+    now = turn_fields()
+    for owner, keys in read_log(CORPUS / "hovered.jsonl.gz").header["turn_fields"].items():
+        assert set(keys) <= set(now[owner])
+    written = {each.owner: set[str]() for each in exact_fields(Turn)}
+    for each in exact_fields(Turn):
+        written[each.owner].add(each.name)
+    for kind, keys in FIELD_KEYS.items():
+        assert set(keys.values()) <= written[CLASS_KEYS.get(kind, kind)]
+    assert set(CLASS_KEYS.values()) <= written.keys()
 
 
 @pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()])])
