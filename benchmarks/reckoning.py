@@ -116,7 +116,7 @@ class Filter:
 
     def add_velocity(self, b: Belief, dt_s: float) -> None:
         for i, axis in enumerate(self.axes):
-            pushed = b.is_target_positioned and not b.is_velocity_corrected and i < 2
+            pushed = b.is_positioned_by_target and not b.is_position_correcting_velocity and i < 2
             if not pushed:
                 v = b.telemetry.velocity_mps[i]
                 axis.update(1, v, axis.rv**2 / dt_s, 2.0 * MOST_SIGMAS)
@@ -175,7 +175,7 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         state, _ = step_mission(state, turn.observation, log.flown_profile)
         b, imu = state.belief, turn.observation.imu
         dt_s = 0.0 if before is None else imu.t_s - before.t_s
-        if before is None or imu.silent_s > before.t_s:
+        if before is None or imu.last_silence_end_s > before.t_s:
             filter_.begin(b.telemetry.velocity_mps)
         if before is not None and 0.0 < dt_s < 0.3:
             filter_.predict(np.subtract(imu.velocity_mps, before.velocity_mps), dt_s)
@@ -183,8 +183,8 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         filter_.remember(b.telemetry.t_s, b.telemetry.yaw_rad)
         if (
             b.is_position_valid
-            and b.dead_reckoned_s is None
-            and b.first_jump_s is None
+            and b.dead_reckoning_since_s is None
+            and b.first_estimate_jump_at_s is None
             and dt_s > 0.0
         ):
             filter_.add_velocity(b, dt_s)
@@ -200,7 +200,9 @@ def errors(log: FlightLog) -> Iterator[tuple[float, list[tuple[float, float]]]]:
     last_s = -math.inf
     for k, moment in enumerate(flown):
         b = moment.belief
-        known = b.is_position_valid and b.dead_reckoned_s is None and b.reckoning.imu is not None
+        known = (
+            b.is_position_valid and b.dead_reckoning_since_s is None and b.reckoning.imu is not None
+        )
         if not known or b.height_m < LEAST_HEIGHT_M or b.obs.t_s - last_s < BEGINS_EVERY_S:
             continue
         last_s = b.obs.t_s
@@ -221,11 +223,11 @@ def _blind(
         dt_s = now.imu.t_s - imu.t_s
         if dt_s <= 0.0:
             continue
-        struck = now.imu.silent_s > imu.t_s or now.imu.blow_s > imu.t_s
+        struck = now.imu.last_silence_end_s > imu.t_s or now.imu.last_impact_at_s > imu.t_s
         if struck or now.height_m < FLOOR_M or not left:
             return
         gained = np.subtract(now.imu.velocity_mps, imu.velocity_mps)
-        old = advance_reckoning(old, now.imu, now.telemetry, believed=False)
+        old = advance_reckoning(old, now.imu, now.telemetry, is_estimate_believed=False)
         for axis, dv in zip(new, gained, strict=True):
             axis.predict(float(dv), dt_s)
         imu = now.imu

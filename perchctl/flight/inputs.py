@@ -210,7 +210,11 @@ class FlightInputs:
         newest, imu = self.history.newest, self.history.imu
         if newest is None:
             return math.inf
-        return now_s - newest.t_s + max(newest.behind_s, imu.stuck_attitude_s, imu.stuck_position_s)
+        return (
+            now_s
+            - newest.t_s
+            + max(newest.behind_s, imu.only_attitude_frozen_for_s, imu.only_position_frozen_for_s)
+        )
 
     def catch_up(self, began_s: float, now_s: float) -> None:
         """Take in the telemetry that came while camera or vision hung in the tick of `began_s`."""
@@ -329,7 +333,11 @@ class TargetPositioning:
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """Send the position that `pose` gives, if any, unless the vehicle is in contact."""
-        if pose is None or self._touches or history.imu.stuck_attitude_s > FROZEN_ATTITUDE_S:
+        if (
+            pose is None
+            or self._touches
+            or history.imu.only_attitude_frozen_for_s > FROZEN_ATTITUDE_S
+        ):
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
         if then is not None and now is not None:

@@ -259,7 +259,7 @@ def _mission(
             began_s,
             # Against the ceiling the picture shows no target and steers nothing.
             search=state is None or state.phase is not Phase.COMPLETE,
-            sends_sights=state is None or state.belief.dead_reckoned_s is None,
+            sends_sights=state is None or state.belief.dead_reckoning_since_s is None,
             drops_sightings=drops_sightings,
         )
         drops_sightings = False
@@ -283,9 +283,9 @@ def _mission(
             parts.link.send(command)
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
         if (
-            state.belief.diverged
+            state.belief.is_position_diverged
             and parts.positions is not None
-            and not (before and before.belief.diverged)
+            and not (before and before.belief.is_position_diverged)
         ):
             parts.positions.stop()
             drops_sightings = True

@@ -157,28 +157,33 @@ def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
     """Return the state at the start of a landing; `before` is the state before the transition."""
     b, tel, old = state.belief, state.belief.telemetry, before.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
-    if heard and tel.has_bit(HL_ACTIVE) and not b.is_target_positioned and not b.diverged:
+    if (
+        heard
+        and tel.has_bit(HL_ACTIVE)
+        and not b.is_positioned_by_target
+        and not b.is_position_diverged
+    ):
         state = replace(state, order_count=MIN_LANDING_ORDERS, last_order_s=b.obs.t_s)
     elif heard and tel.thrust < 1 and before.stopped_s is None:
         # The motors were stopped or never ran; no order may start them again.
         state = replace(state, stopped_s=b.obs.t_s)
-    contact_z_m = old.contact_z_m
-    pressed_unseen = state.pressed and b.is_target_positioned
-    if contact_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
+    last_contact_body_z_m = old.last_contact_body_z_m
+    pressed_unseen = state.pressed and b.is_positioned_by_target
+    if last_contact_body_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
         # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
         # ceiling. It counts as free only after a sighting from below.
-        contact_z_m = tel.position_m[2]
+        last_contact_body_z_m = tel.position_m[2]
     # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
     state = move_setpoint_to_vehicle(Context(state))
-    within = contact_z_m is not None or b.reckoning.distance_below_m < MAGNET_REACH_M
-    lost = b.has_lost_position
+    within = last_contact_body_z_m is not None or b.reckoning.distance_below_m < MAGNET_REACH_M
+    lost = b.has_no_position_for_descent
     b = replace(
         b,
-        in_reach_since_s=before.t_s
-        if within and old.in_reach_since_s is None
-        else old.in_reach_since_s,
-        contact_z_m=contact_z_m,
-        hover=hover.estimate_hover_thrust(old),
+        in_magnet_reach_since_s=before.t_s
+        if within and old.in_magnet_reach_since_s is None
+        else old.in_magnet_reach_since_s,
+        last_contact_body_z_m=last_contact_body_z_m,
+        hover_thrust_estimate=hover.estimate_hover_thrust(old),
     )
     return replace(state, belief=start_dead_reckoning(b) if lost else b)
 
@@ -222,7 +227,7 @@ def descend(c: Context) -> Action:
         b.is_in_magnet_reach,
         b.is_flight_data_unreliable,
     )
-    if b.is_target_positioned or not (in_reach or doubtful):
+    if b.is_positioned_by_target or not (in_reach or doubtful):
         state, away = leave_press(c)
         if away is not None:
             return state, away
@@ -231,7 +236,7 @@ def descend(c: Context) -> Action:
     if in_reach:
         gives_up = c.in_phase_s > PEEL_TIMEOUT_S and (b.is_imu_fresh or not doubtful)
         return _transfer_weight(c) if gives_up else _descend_by_setpoints(c)
-    if b.is_target_positioned:
+    if b.is_positioned_by_target:
         return _descend_by_thrust(c) if c.state.descent.thrust or low else _descend_by_setpoints(c)
     overdue = c.in_phase_s > landing.setpoint_time_s
     return _order_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
@@ -260,7 +265,7 @@ def _is_falling_free(c: Context) -> bool:
     if state.order_count:
         return False
     caught = state.catch_above_m is None
-    return b.contact_z_m is not None and caught and b.is_sinking(-PEEL_FALL_MPS)
+    return b.last_contact_body_z_m is not None and caught and b.is_sinking(-PEEL_FALL_MPS)
 
 
 def _is_standing(c: Context) -> bool:
@@ -268,7 +273,7 @@ def _is_standing(c: Context) -> bool:
     b = c.belief
     if b.is_telemetry_fresh and c.held_s(ON_FLOOR) >= FLOOR_DWELL_S:
         return True
-    placed = b.is_target_positioned and b.is_position_valid and b.dead_reckoned_s is None
+    placed = b.is_positioned_by_target and b.is_position_valid and b.dead_reckoning_since_s is None
     low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_in_magnet_reach
     return (
         placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < MAX_RESTING_CLIMB_MPS
@@ -280,8 +285,8 @@ def _restart_with_catch(c: Context) -> Action:
     tel, b = c.telemetry, c.belief
     belief = replace(
         b,
-        contact_z_m=None,
-        in_reach_since_s=None,
+        last_contact_body_z_m=None,
+        in_magnet_reach_since_s=None,
         reckoning=replace(b.reckoning, distance_below_m=math.inf),
     )
     state = replace(
@@ -303,7 +308,7 @@ def _restart_with_catch(c: Context) -> Action:
 
 def _catch_fall(c: Context) -> Action | None:
     """Catch the fall by position; None without a heading or with diverged positions."""
-    return None if c.belief.heading_lost or c.belief.diverged else catch_slip(c)
+    return None if c.belief.heading_lost or c.belief.is_position_diverged else catch_slip(c)
 
 
 # --- The four policies ---

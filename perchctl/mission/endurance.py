@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
-    MIN_LOADED_S,
+    MIN_TIME_UNDER_LOAD_S,
     BatteryFit,
-    Drive,
+    PowerTrain,
     charge_from_rest_v,
     fit_sag_model,
     full_thrust_discharge_per_s,
-    identify_drive,
+    identify_power_train,
 )
 from perchctl.mission.belief.contact import max_press_thrust
 from perchctl.mission.context import Context
@@ -40,9 +40,13 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
     most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.belief.battery_fit
-    used_mah = energy.counted_discharge * c.profile.vehicle.battery_mah
-    load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
-    counted_s = predict_hover_time_s(energy, c.profile, load, identify_drive(c.telemetry))
+    used_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
+    thrust_fraction = (
+        c.belief.hover_thrust or FULL_THRUST * energy.mean_thrust_fraction
+    ) / FULL_THRUST
+    counted_s = predict_hover_time_s(
+        energy, c.profile, thrust_fraction, identify_power_train(c.telemetry)
+    )
     seconds = None if energy.no_reading_s > MAX_READING_GAP_S else counted_s
     if c.belief.target.world_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
@@ -60,26 +64,33 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
 
 
 def predict_hover_time_s(
-    state: BatteryFit, profile: Profile, load: float, drive: Drive
+    state: BatteryFit, profile: Profile, thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
     """Return the hover time, s, at `load` (share of full thrust) until `battery-low` fires; None if
     unknown."""
-    if state.rest_v is None or state.loaded_s < MIN_LOADED_S or not load > 0.0:
+    if (
+        state.rest_v is None
+        or state.time_under_load_s < MIN_TIME_UNDER_LOAD_S
+        or not thrust_fraction > 0.0
+    ):
         return None
     safety, perch = profile.safety, profile.planner.perch
     hover_v = max(
-        float(profile.link.parameters.get("pm.lowVoltage", drive.low_power_v)), safety.min_load_v
+        float(profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)),
+        safety.min_load_v,
     )
     lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else MAX_PRESS_VOLTAGE_DIP_V)
-    press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, discharge_factor = fit_sag_model(state)
-    end_v = hover_v + sag_v * load
+    press_load = max(thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
+    sag_v, discharge_rate_factor = fit_sag_model(state)
+    end_v = hover_v + sag_v * thrust_fraction
     if profile.planner.hover is None:
         end_v = max(end_v, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (
-        discharge_factor * load * full_thrust_discharge_per_s(profile.vehicle.battery_mah, drive)
+        discharge_rate_factor
+        * thrust_fraction
+        * full_thrust_discharge_per_s(profile.vehicle.battery_mah, power_train)
     )
 
 
@@ -96,8 +107,8 @@ def predict_durations(c: Context) -> MissionDurations:
     """Predict how long this attempt, each retry and the landing take, from the height of the known
     target."""
     planner, hover = c.planner, c.planner.hover
-    top_z_m = c.belief.target.contact_body_z_m - (0.0 if hover is None else hover.below_m)
-    up_m = max(0.0, top_z_m - c.telemetry.position_m[2])
+    top_z_m = c.belief.target.body_z_touching_target_m - (0.0 if hover is None else hover.below_m)
+    climb_m = max(0.0, top_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s
     if hover is None:
         touch_s += TOUCH_DURATION_S
@@ -112,9 +123,9 @@ def predict_durations(c: Context) -> MissionDurations:
             BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
         )
     retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
-    descent_s = max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps
+    descent_s = max(0.0, c.belief.height_m + climb_m) / planner.landing.speed_mps
     return MissionDurations(
-        attempt_s=aligned_s + _climb_duration_s(c.profile, up_m) + touch_s,
+        attempt_s=aligned_s + _climb_duration_s(c.profile, climb_m) + touch_s,
         retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
         landing_s=descent_s + LANDING_END_DURATION_S,
     )
@@ -145,7 +156,7 @@ def _no_reading_grace_s(c: Context) -> float:
     return c.safety.battery_stale_s - max(c.belief.battery_fit.no_reading_s, c.obs.battery_age_s)
 
 
-def _climb_duration_s(profile: Profile, up_m: float) -> float:
+def _climb_duration_s(profile: Profile, climb_m: float) -> float:
     ascend = profile.planner.ascend
-    near_m = min(up_m, ascend.near_m)
-    return (up_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps
+    near_m = min(climb_m, ascend.near_m)
+    return (climb_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps

@@ -20,7 +20,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import MAX_RAW_THRUST
 from perchctl.mission.belief.reckoning import BIAS_TIME_CONSTANT_S
-from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, TargetMotion
+from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, VisualMotion
 from perchctl.mission.context import Context
 from perchctl.mission.release import clear_contact_below
 from perchctl.mission.setpoints import Action
@@ -123,10 +123,10 @@ MAX_RAMP_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
 
-def _camera_motion(c: Context) -> TargetMotion | None:
+def _camera_motion(c: Context) -> VisualMotion | None:
     """Return the motion from pictures if the telemetry is old and the pictures are newer; else
     None."""
-    b, seen = c.belief, c.belief.target_motion
+    b, seen = c.belief, c.belief.visual_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
     return seen if old and seen.is_known and seen.t_s > b.telemetry.t_s else None
 
@@ -134,7 +134,7 @@ def _camera_motion(c: Context) -> TargetMotion | None:
 def _is_target_redetected(c: Context) -> bool:
     """True if the telemetry is old and the target is detected again, but not yet for long enough to
     determine the motion."""
-    b, seen = c.belief, c.belief.target_motion
+    b, seen = c.belief, c.belief.visual_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
     return old and not seen.is_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
 
@@ -163,7 +163,7 @@ def _climb_age_s(c: Context) -> float:
 def should_wait_for_climb_rate(c: Context) -> bool:
     """True if the vertical speed is unknown and the hover thrust is rough: setpoints are better for
     a while."""
-    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_imprecise
+    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover_thrust_estimate.is_imprecise
     return _is_climb_unknown(c) and begins_rough and c.in_phase_s < MAX_SETPOINT_DESCENT_S
 
 
@@ -178,7 +178,7 @@ def descend_level(c: Context) -> Action:
     if _camera_motion(c) is not None:  # on the floor, recent orders cause no climb
         sinks, ramp_per_s = measured_mps <= -MIN_CAMERA_SINK_MPS, CAMERA_THRUST_RAMP_PER_S
     hover_thrust = hover.estimate_hover_thrust(b).thrust
-    height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
+    height_m = b.height_m if b.dead_reckoning_since_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_S:
@@ -232,7 +232,7 @@ def _measured_climb_mps(c: Context) -> float:
     the vehicle in place since the last telemetry."""
     seen = _camera_motion(c)
     if seen is not None:
-        return seen.velocity_mps[2]
+        return seen.vehicle_velocity_mps[2]
     held = c.telemetry.t_s < c.state.entry.t_s - SETPOINT_SETTLING_S
     return 0.0 if held else c.belief.climb_mps
 
@@ -245,10 +245,16 @@ def _find_floor_detection_s(
     descent, b, seen = c.state.descent, c.belief, _camera_motion(c)
     if descent.floor_detected_s is not None:
         return descent.floor_detected_s
-    struck = c.t_s - b.imu.blow_s < TOUCHDOWN_DURATION_S and b.reckoning.impact_mps < 0.0
+    struck = (
+        c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_DURATION_S
+        and b.reckoning.climb_before_impact_mps < 0.0
+    )
     weak = 0.0 < descent.thrust < CAMERA_STANDING_THRUST_FRACTION * hover_thrust
     stands = (
-        seen is not None and seen.e_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M and weak and not sinks
+        seen is not None
+        and seen.target_from_gear_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
+        and weak
+        and not sinks
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
@@ -257,7 +263,7 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
     """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
-    is_height_wrong = b.mismatch.later_s != 0.0 or b.diverged
+    is_height_wrong = b.mismatch.later_s != 0.0 or b.is_position_diverged
     low = height_m <= NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
     if _camera_motion(c) is not None:
@@ -272,18 +278,20 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
     """Return the state, without its contact once a position or pictures show the vehicle lower, or
     after a fall."""
     state, b, seen = c.state, c.belief, _camera_motion(c)
-    if b.is_position_valid and b.dead_reckoned_s is None:
+    if b.is_position_valid and b.dead_reckoning_since_s is None:
         return clear_contact_below(state, MAGNET_RELEASED_BELOW_M)
-    in_reach_since_s = b.in_reach_since_s
-    fell = in_reach_since_s is not None and b.imu.fell_s > max(in_reach_since_s, state.entry.t_s)
-    seen_below = seen is not None and seen.e_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
+    in_magnet_reach_since_s = b.in_magnet_reach_since_s
+    fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
+        in_magnet_reach_since_s, state.entry.t_s
+    )
+    seen_below = seen is not None and seen.target_from_gear_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
-            contact_z_m=None,
-            in_reach_since_s=None,
+            last_contact_body_z_m=None,
+            in_magnet_reach_since_s=None,
             reckoning=replace(b.reckoning, distance_below_m=math.inf),
-            dead_reckoned_s=None if b.dead_reckoned_s is None else c.t_s,
+            dead_reckoning_since_s=None if b.dead_reckoning_since_s is None else c.t_s,
         )
         return replace(state, belief=belief)
     return state
@@ -293,13 +301,13 @@ def _is_overdue(c: Context) -> bool:
     """True if the vehicle has been without a position for so long that it must have landed or
     hang."""
     state, b = c.state, c.belief
-    if b.dead_reckoned_s is None and not b.diverged:
+    if b.dead_reckoning_since_s is None and not b.is_position_diverged:
         return False
     descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
-    began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
+    began_s = max(b.dead_reckoning_since_s or 0.0, state.entry.t_s)
     measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_S
     spare_s = DESCENT_MARGIN_S if measured else UNMEASURED_DESCENT_MARGIN_S
-    if not measured and b.hover.is_imprecise:
+    if not measured and b.hover_thrust_estimate.is_imprecise:
         spare_s += MAX_SETPOINT_DESCENT_S
     return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_SINK_MPS
 
@@ -323,7 +331,7 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     reckoning, yaw_rad = b.reckoning, c.telemetry.yaw_rad
     x_mps, y_mps, _ = reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
-    blind_s = 0.0 if b.dead_reckoned_s is None else c.t_s - b.dead_reckoned_s
+    blind_s = 0.0 if b.dead_reckoning_since_s is None else c.t_s - b.dead_reckoning_since_s
     visual_age_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
     unsure_mps = min(
         MAX_LATERAL_SIGMA_MPS,
@@ -333,20 +341,24 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     part *= min(1.0, MAX_FULL_BRAKE_AGE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _rotate_to_heading(part * x_mps, part * y_mps, yaw_rad)
     seen, gain = _camera_motion(c), BRAKE_GAIN_RAD_PER_MPS
-    if seen is not None and b.is_camera_consistent:
+    if seen is not None and b.is_camera_motion_consistent:
         ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
         if c.t_s - seen.t_s <= MAX_CAMERA_SPEED_AGE_S:
-            ahead_mps, left_mps, _ = seen.velocity_mps
+            ahead_mps, left_mps, _ = seen.vehicle_velocity_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,
     )
-    known = 0.0 if b.diverged else min(1.0, reckoning.position_control_s / BIAS_TIME_CONSTANT_S)
+    known = (
+        0.0
+        if b.is_position_diverged
+        else min(1.0, reckoning.time_under_position_control_s / BIAS_TIME_CONSTANT_S)
+    )
     counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_ATTITUDE_ERROR_AGE_S)
     ahead_mps2, left_mps2 = _rotate_to_heading(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
     )
-    roll_rad, pitch_rad = c.obs.imu.misled_rad
+    roll_rad, pitch_rad = c.obs.imu.roll_pitch_error_rad
     return (
         _brake_tilt_rad(-left_mps, gain) - _wind_tilt_rad(left_mps2) + roll_rad,
         _brake_tilt_rad(ahead_mps, gain) + _wind_tilt_rad(ahead_mps2) + pitch_rad,

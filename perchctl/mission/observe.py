@@ -43,5 +43,5 @@ def _apply_frame_shift(state: PlannerState) -> PlannerState:
         state,
         setpoint=b.sent.setpoint,
         entry=replace(state.entry, position_m=b.sent.maneuver_start_m),
-        blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.frame_shift_m[2],
+        blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.world_frame_shift_m[2],
     )

@@ -71,8 +71,8 @@ class Event:
             held = EventKind.HOLD, state.pause_reason, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif (
-            state.belief.last_stale_s == obs.t_s
-            and before.belief.last_stale_s != before.t_s
+            state.belief.position_last_stale_at_s == obs.t_s
+            and before.belief.position_last_stale_at_s != before.t_s
             and not state.hold
         ):
             text = position_loss_text(state.belief.with_observation(obs, profile))

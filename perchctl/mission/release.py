@@ -105,10 +105,10 @@ def lower_thrust(c: Context) -> Action:
         lowest = MIN_HOLDING_THRUST_FRACTION * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
-    assert b.contact_z_m is not None
-    slid_m = 0.0 if b.is_position_valid else c.telemetry.position_m[2] - b.contact_z_m
+    assert b.last_contact_body_z_m is not None
+    slid_m = 0.0 if b.is_position_valid else c.telemetry.position_m[2] - b.last_contact_body_z_m
     top = state.entry.position_m[2] + perch.press_m + slid_m
-    low = b.contact_z_m - complete.release_drop_m + slid_m
+    low = b.last_contact_body_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
     sent = limit_setpoint(c, correct_setpoint(c, setpoint, lift=False))
     return replace(state, setpoint=setpoint), sent
@@ -124,7 +124,12 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
     released_s = state.released_s
     if released_s is None:
         released_s, z_m = c.t_s, c.telemetry.position_m[2]
-        b = replace(b, contact_z_m=z_m if b.contact_z_m is None else b.contact_z_m)
+        b = replace(
+            b,
+            last_contact_body_z_m=z_m
+            if b.last_contact_body_z_m is None
+            else b.last_contact_body_z_m,
+        )
         state = replace(state, released_s=released_s, belief=b)
     hung_s = c.held_s(FULL_WEIGHT_HANGS)
     unconfirmed = b.last_thrust_mismatch_s >= c.t_s - hung_s
@@ -142,8 +147,8 @@ def hold_contact_by_position(c: Context) -> Action:
     fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
-    if b.contact_z_m is not None and b.is_position_valid:
-        z_m = b.contact_z_m
+    if b.last_contact_body_z_m is not None and b.is_position_valid:
+        z_m = b.last_contact_body_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_ABOVE_MOTORS_ON_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limit_setpoint(c, setpoint)
 
@@ -181,7 +186,7 @@ def catch_slip(c: Context) -> Action | None:
         return None
     begun = c.in_phase_s < MIN_CATCH_DURATION_S
     if begun or (b.climb_mps < CATCH_END_CLIMB_MPS and c.in_phase_s < MAX_CATCH_DURATION_S):
-        x, y = _braking_setpoint_m(c) if b.is_displaced else state.entry.position_m[:2]
+        x, y = _braking_setpoint_m(c) if b.has_uncorrected_gust else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_above_m, state.entry.yaw_rad
         )
@@ -204,6 +209,9 @@ def clear_contact_below(state: PlannerState, distance_below_m: float) -> Planner
     """Return the state, without its contact if the vehicle is more than `distance_below_m` below
     it."""
     b = state.belief
-    if b.contact_z_m is None or b.telemetry.position_m[2] >= b.contact_z_m - distance_below_m:
+    if (
+        b.last_contact_body_z_m is None
+        or b.telemetry.position_m[2] >= b.last_contact_body_z_m - distance_below_m
+    ):
         return state
-    return replace(state, belief=replace(b, contact_z_m=None, contact=None))
+    return replace(state, belief=replace(b, last_contact_body_z_m=None, contact=None))

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.belief import ContactOffset
-from perchctl.mission.belief.contact import MOTORS_STOPPED, contact_offset
+from perchctl.mission.belief.contact import MOTORS_STOPPED, current_gear_offset
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Claim, Outcome, Phase
@@ -187,7 +187,7 @@ class FlightReport:
         b = state.belief.with_observation(obs, profile)
         hangs, contact = state.phase is Phase.PERCHED, b.contact
         if hangs and contact is None:  # the magnet caught the vehicle during the descent
-            contact = contact_offset(b)
+            contact = current_gear_offset(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,
@@ -246,15 +246,20 @@ def find_touchdown(c: Context) -> Touchdown | None:
     """
     b = c.belief
     tel, imu, reckoning = c.telemetry, b.imu, b.reckoning
-    blow = imu.blow
-    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > MAX_TOUCHDOWN_AGE_S:
+    impact = imu.newest_impact
+    if (
+        c.state.phase is Phase.PERCHED
+        or min(tel.t_s, imu.motors_off_since_s) - impact.t_s > MAX_TOUCHDOWN_AGE_S
+    ):
         return None
-    higher = blow.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_M
-    if b.is_position_valid and b.dead_reckoned_s is None and higher:
+    higher = impact.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_M
+    if b.is_position_valid and b.dead_reckoning_since_s is None and higher:
         return None
-    reckoned = b.dead_reckoned_s is not None or b.diverged
-    speed_mps = -(reckoning.impact_mps if reckoned else blow.estimated_mps)
-    return Touchdown(max(0.0, speed_mps), blow.peak_g)
+    reckoned = b.dead_reckoning_since_s is not None or b.is_position_diverged
+    speed_mps = -(
+        reckoning.climb_before_impact_mps if reckoned else impact.estimated_climb_before_mps
+    )
+    return Touchdown(max(0.0, speed_mps), impact.peak_g)
 
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:

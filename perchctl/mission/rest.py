@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from perchctl.mission.belief.contact import possible_contact_tolerance_m
+from perchctl.mission.belief.contact import contact_height_tolerance_m
 from perchctl.mission.belief.target import MIN_FAR_ABOVE_M
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Claim, Phase
@@ -40,14 +40,14 @@ def find_rest_state(c: Context) -> RestState:
     b, state = c.belief, c.state
     if _is_held_elsewhere(c):
         return RestState.HELD
-    if b.is_target_positioned or not b.is_position_valid:
+    if b.is_positioned_by_target or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _find_rest_state_by_falls(c)
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HANGING_HEIGHT_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
     stayed = high and not b.target.is_far_above and came_down_m < MAX_STAYED_DESCENT_M
-    at_contact = b.contact_z_m is not None and not b.target.is_far_above
+    at_contact = b.last_contact_body_z_m is not None and not b.target.is_far_above
     if stayed or (b.height_m > MAX_REST_ON_FLOOR_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
@@ -63,15 +63,14 @@ def _is_held_elsewhere(c: Context) -> bool:
     ):
         return False
     if Claim.HELD_BY_OTHER in state.entry.claims:
-        return b.imu.fell_s <= state.entry.t_s
+        return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
-        possible_contact_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M
-        and b.contact is None
+        contact_height_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M and b.contact is None
     )
     by_position = (
         b.is_position_valid
-        and not b.is_target_positioned
-        and b.first_jump_s is None
+        and not b.is_positioned_by_target
+        and b.first_estimate_jump_at_s is None
         and b.height_m > MIN_HANGING_HEIGHT_M
     )
     return below and (b.target.is_fresh or by_position)
@@ -80,23 +79,31 @@ def _is_held_elsewhere(c: Context) -> bool:
 def _find_rest_state_by_falls(c: Context) -> RestState:
     """Return the rest state from the falls since the vehicle came within the magnet's reach, if
     ever, and from silences that could hide a fall."""
-    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_reach_since_s
+    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_magnet_reach_since_s
     floor_s = c.state.descent.floor_detected_s
-    down_s = max(b.imu.fell_s, -math.inf if floor_s is None else floor_s)
+    down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt
-    unsure = reckoning.doubtful_gap_s > max(down_s, reckoning.sighting_s)
+    unsure = reckoning.last_possible_catch_gap_end_s > max(down_s, reckoning.last_sighting_at_s)
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
-    came_unheard = unsure and reckoning.doubtful_gap_s <= since_s
-    return RestState.UNKNOWN if came_unheard or b.imu.gap_s > since_s else RestState.HANGS
+    came_unheard = unsure and reckoning.last_possible_catch_gap_end_s <= since_s
+    return (
+        RestState.UNKNOWN
+        if came_unheard or b.imu.last_fall_hiding_gap_end_s > since_s
+        else RestState.HANGS
+    )
 
 
 def is_still_hanging(c: Context) -> bool:
     """True if a position shows the vehicle at its contact, or the accelerometer shows no fall."""
     b, tel = c.belief, c.telemetry
-    if not b.is_target_positioned and b.is_position_valid and b.contact_z_m is not None:
+    if (
+        not b.is_positioned_by_target
+        and b.is_position_valid
+        and b.last_contact_body_z_m is not None
+    ):
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
-        if not falls and b.contact_z_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M:
+        if not falls and b.last_contact_body_z_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M:
             return True
     return _find_rest_state_by_falls(c) is RestState.HANGS
 

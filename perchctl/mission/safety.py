@@ -10,23 +10,23 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.contact import (
-    BLOCKED,
+    CLIMB_BLOCKED,
     HANGING,
     HANGING_DWELL_S,
-    PRESS_SATURATION_FRACTION,
+    SATURATED_FRACTION_OF_FULL_THRUST,
     SATURATED_THRUST,
     Support,
+    contact_height_tolerance_m,
+    gear_offset_at_last_touch_or_now,
     max_press_thrust,
-    newest_contact_offset,
-    possible_contact_tolerance_m,
 )
-from perchctl.mission.belief.motion import MAX_PUSH_DELAY_S
+from perchctl.mission.belief.motion import MAX_PUSH_TO_ESTIMATE_DELAY_S
 from perchctl.mission.belief.quality import (
     BATTERY_LOW,
+    ESTIMATE_CONTRADICTS_IMU,
     TARGET_BELOW,
     TILTED,
     VARIANCE_TOO_LARGE,
-    VELOCITY_DISAGREES,
     no_picture_reason,
     position_loss_text,
     variance_text,
@@ -76,7 +76,7 @@ latency's standard deviation: pictures that are 0.1 s later than assumed cause u
 a rotated camera leads the vehicle further away."""
 MAX_VERTICAL_CLIMB_OFFSET_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
-VELOCITY_DISAGREES_DWELL_S = 0.1
+ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
 OSCILLATION_SINK_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
@@ -110,15 +110,15 @@ def has_diverged(c: Context) -> bool:
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
-    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S or _is_oscillating(c):
+    if c.held_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S or _is_oscillating(c):
         return True
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
-        touched = b.contact_z_m is not None or c.state.stopped_s is not None
+        touched = b.last_contact_body_z_m is not None or c.state.stopped_s is not None
         return not touched and _setpoint_deviation_m(c) > MAX_LANDING_DEVIATION_M
     spare_m = (
-        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.delay_sigma_s if b.is_target_positioned else 0.0
+        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.delay_sigma_s if b.is_positioned_by_target else 0.0
     )
     if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
         return _setpoint_deviation_m(c) > MAX_GROUND_DISPLACEMENT_M + spare_m
@@ -127,7 +127,7 @@ def has_diverged(c: Context) -> bool:
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < MAX_VERTICAL_CLIMB_OFFSET_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
-    is_pushed = b.imu.t_s - b.imu.pushed_s <= MAX_PUSH_DELAY_S  # by moving air
+    is_pushed = b.imu.t_s - b.imu.last_push_at_s <= MAX_PUSH_TO_ESTIMATE_DELAY_S  # by moving air
     stays = b.height_m < DIVERGED_LOW_HEIGHT_M or (only_climbs and not is_pushed)
     return _setpoint_deviation_m(c) > (MAX_LOW_DEVIATION_M + spare_m if stays else MAX_DEVIATION_M)
 
@@ -156,13 +156,13 @@ def divergence_reason(c: Context) -> str:
         "the motion capture may have swapped axes, delayed positions or a rotated rigid body; run "
         "perchctl check --lift"
     )
-    if b.is_target_positioned:
+    if b.is_positioned_by_target:
         cause = (
             "the camera's rotation in camera.mount may be wrong; measure it with "
             "`perchctl calibrate mount`"
         )
     found = f"the vehicle drifted {_setpoint_deviation_m(c):.2f} m from its setpoint"
-    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S:
+    if c.held_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S:
         found = "the estimated velocity contradicts the accelerometer"
     return f"{found} at a height of {b.height_m:.2f} m: {cause}"
 
@@ -172,7 +172,7 @@ def is_position_lost(c: Context) -> bool:
     earlier: after a blow or gust that no sighting has corrected, because of its variance, or
     because sightings contradict it."""
     b = c.belief
-    if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
+    if b.position_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
         return True
     if (
         b.position_age_s > MIN_CONTRADICTED_POSITION_AGE_S
@@ -180,7 +180,7 @@ def is_position_lost(c: Context) -> bool:
     ):
         return True
     unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VARIANCE_M2PS2
-    return b.is_target_positioned and b.is_position_stale and unsure
+    return b.is_positioned_by_target and b.is_position_stale and unsure
 
 
 def is_outside_fence(c: Context) -> bool:
@@ -265,14 +265,14 @@ def is_held_elsewhere(c: Context) -> bool:
 
 def is_blocked(c: Context) -> bool:
     """True if the vehicle has pressed against an obstacle for `safety.blocked_s`."""
-    return c.held_s(BLOCKED) >= c.safety.blocked_s
+    return c.held_s(CLIMB_BLOCKED) >= c.safety.blocked_s
 
 
 def is_blocked_off_target(c: Context) -> bool:
     """True if the vehicle is blocked at a position where a press would not prove the contact."""
     pressing = c.state.phase is Phase.PERCH
     return is_blocked(c) and not (
-        pressing and abs(c.belief.target.error_z_m) <= possible_contact_tolerance_m(c.belief)
+        pressing and abs(c.belief.target.error_z_m) <= contact_height_tolerance_m(c.belief)
     )
 
 
@@ -285,7 +285,9 @@ def is_press_thrust_insufficient(c: Context) -> bool:
         return True
     near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
     near = near and c.planner.hover is None
-    return near and c.belief.hover_thrust > PRESS_SATURATION_FRACTION * max_press_thrust(c.profile)
+    return near and c.belief.hover_thrust > SATURATED_FRACTION_OF_FULL_THRUST * max_press_thrust(
+        c.profile
+    )
 
 
 def _outcome_after_lock(before: Outcome | None) -> Outcome:
@@ -370,8 +372,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "estimator-jump",
         PRE_CONTACT_PHASES,
         lambda c: (
-            c.belief.first_jump_s is not None
-            and c.t_s - c.belief.first_jump_s >= c.safety.jump_hold_s
+            c.belief.first_estimate_jump_at_s is not None
+            and c.t_s - c.belief.first_estimate_jump_at_s >= c.safety.jump_hold_s
         ),
         "the state estimate jumped: landing at the current position",
     ),
@@ -470,8 +472,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_ATTACH_PHASES,
         lambda c: c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S,
         lambda c: (
-            f"the vehicle hangs at the target's height, {newest_contact_offset(c.belief).text}: "
-            f"the target's magnet may hold it"
+            f"the vehicle hangs at the target's height, "
+            f"{gear_offset_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
         ),
         claims=Claim.HANGS,
     ),

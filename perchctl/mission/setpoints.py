@@ -116,7 +116,7 @@ def step_towards(
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not turns:
         yaw_radps = 0.0
-    if is_cautious and c.belief.mounting.is_unconfirmed:
+    if is_cautious and c.belief.mounting.is_awaiting_evidence:
         xy_mps = min(xy_mps, UNCONFIRMED_MOUNTING_SPEED_MPS) if c.belief.target.is_fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
@@ -170,7 +170,7 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     setpoint and integral. Without a setpoint, or with diverged positions, the integral becomes
     zero."""
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
-    if reference is None or c.belief.diverged:
+    if reference is None or c.belief.is_position_diverged:
         return replace(c.state, integral_m=(0.0, 0.0))
     if not c.belief.is_position_valid or c.belief.speed_mps > MAX_IN_PLACE_SPEED_MPS:
         return c.state
@@ -219,7 +219,7 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
     if gain == 0.0:
         return 0.0, 0.0
     (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps
-    ax, ay = c.belief.lean_acceleration_mps2
+    ax, ay = c.belief.acceleration_from_lean_mps2
     dx = LATERAL_ERROR_GAIN * (reference.x_m - x) - LATERAL_DAMPING_S * vx - LEAN_DAMPING_S2 * ax
     dy = LATERAL_ERROR_GAIN * (reference.y_m - y) - LATERAL_DAMPING_S * vy - LEAN_DAMPING_S2 * ay
     dx, dy = gain * dx, gain * dy
@@ -232,7 +232,7 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
     """Return the held setpoint one tick later; lower if the target is the position source and out
     of view."""
     b = c.belief
-    if not (b.is_target_positioned and b.is_position_stale) or b.takeoff_position_m is None:
+    if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HOLD_HEIGHT_M)
     z_m = setpoint.z_m - OUT_OF_VIEW_SINK_MPS * max(0.0, c.t_s - c.state.t_s)

@@ -143,7 +143,7 @@ class Perception:
                 t_s,
                 (x_m, y_m, z_m),
                 history.samples,
-                history.imu.offset_g,
+                history.imu.accelerometer_offset_g,
                 measured,
             )
         if output.target is not None and output.target.measured:

@@ -12,7 +12,44 @@ from functools import cache
 
 CLASS_KEYS: dict[str, str] = {}
 """The name of a dataclass in the log's ``turn_fields``, by its name in the program."""
-FIELD_KEYS: dict[str, dict[str, str]] = {}
+FIELD_KEYS: dict[str, dict[str, str]] = {
+    "FusionAge": {
+        "variance_changed_at_s": "changed_s",
+        "no_fusion_since_s": "none_since_s",
+    },
+    "Impact": {
+        "estimated_climb_before_mps": "estimated_mps",
+        "imu_climb_before_mps": "felt_mps",
+    },
+    "ImuMotion": {
+        "attitude_frozen_for_s": "attitude_frozen_s",
+        "acceleration_frozen_for_s": "frozen_s",
+        "position_frozen_for_s": "place_frozen_s",
+        "last_fall_at_s": "fell_s",
+        "low_g_since_s": "light_since_s",
+        "vertical_offset_mps2": "offset_mps2",
+        "newest_impact": "blow",
+        "speed_gained_in_impact_mps": "blow_mps",
+        "last_impact_at_s": "blow_s",
+        "recent_samples": "last_moment",
+        "climb_steady_since_s": "steady_s",
+        "steady_climb_mps": "steady_mps",
+        "lateral_steady_since_s": "steady_aside_s",
+        "mean_lateral_mps": "steady_aside_mps",
+        "mean_lateral_g": "aside_g",
+        "last_push_at_s": "pushed_s",
+        "accelerometer_offset_g": "offset_g",
+        "last_silence_end_s": "silent_s",
+        "last_fall_hiding_gap_end_s": "gap_s",
+        "restarted_at_s": "started_s",
+        "sunk_while_frozen_m": "sunk_m",
+        "mean_hover_thrust": "hover_thrust",
+        "roll_pitch_error_rad": "misled_rad",
+        "roll_pitch_rate_radps": "turning_radps",
+        "fusion_age": "corrections",
+        "motors_off_since_s": "off_s",
+    },
+}
 """The key of a field in the log, by the names of its dataclass and of itself in the program."""
 
 

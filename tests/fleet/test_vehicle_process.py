@@ -118,7 +118,9 @@ def test_the_last_place_is_told_only_if_it_is_known(reporter: StatusReporter) ->
     good = tick()
     assert result_at(reporter, good).place_m == good.telemetry.position_m[:2]
     belief = good.state.belief
-    diverged = replace(good, state=replace(good.state, belief=replace(belief, diverged=True)))
+    diverged = replace(
+        good, state=replace(good.state, belief=replace(belief, is_position_diverged=True))
+    )
     assert result_at(reporter, diverged).place_m is None
     later = replace(belief.obs, t_s=belief.obs.t_s + 30.0)
     old = replace(good, state=replace(good.state, belief=replace(belief, obs=later)))

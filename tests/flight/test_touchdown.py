@@ -42,7 +42,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
             link.send(PositionSetpoint(place[0], place[1], place[2] + min(0.5, 0.3 * t_s), 0.0))
         else:
             dropped_s = min(dropped_s, t_s)
-            link.send(RawThrust(int(share * motion.hover_thrust)))
+            link.send(RawThrust(int(share * motion.mean_hover_thrust)))
         for _ in range(10):
             t_s += 0.002
             link.advance_to(t_s)
@@ -54,11 +54,16 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
                 place = sample.position_m
             motion = motion.with_sample(last, sample)
             believed = not blind or t_s < dropped_s
-            carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
+            carried, last = (
+                advance_reckoning(carried, motion, sample, is_estimate_believed=believed),
+                sample,
+            )
     assert last is not None
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
-    state = remembering(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, dead_reckoned_s=blind_s)
+    state = remembering(
+        state_in(Phase.LANDED, z_m=0.0), reckoning=carried, dead_reckoning_since_s=blind_s
+    )
     return speed_mps, find_touchdown(context_at(state, obs, profile))
 
 
@@ -96,7 +101,7 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
 )
 def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Impact, told: bool) -> None:
     ended = remembering(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
-    obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, blow=blow))
+    obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, newest_impact=blow))
     assert find_touchdown(context_at(ended, obs, PROFILE)) == (HARD if told else None)
 
 

@@ -44,7 +44,7 @@ AT_CEILING = state_with(
     phase=Phase.COMPLETE,
     t_s=T_S,
     takeoff_position_m=(0.0, 0.0, 0.0),
-    contact_z_m=CEILING_M,
+    last_contact_body_z_m=CEILING_M,
     released_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
@@ -126,7 +126,7 @@ def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
 HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
-PRESSING = remembering(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
+PRESSING = remembering(AT_CEILING, phase=Phase.PERCH, last_contact_body_z_m=None, released_s=None)
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
 

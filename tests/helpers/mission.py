@@ -29,9 +29,9 @@ CEILING_M = 2.2
 FINE_BATTERY = BatteryFit(
     takeoff_rest_v=4.1,
     rest_v=4.08,
-    load=HOVER_THRUST / 65535,
-    mean_load=HOVER_THRUST / 65535,
-    loaded_s=5.0,
+    filtered_thrust_fraction=HOVER_THRUST / 65535,
+    mean_thrust_fraction=HOVER_THRUST / 65535,
+    time_under_load_s=5.0,
 )
 """After some seconds of flight: enough for every attempt."""
 PROFILE = Profile()
@@ -192,7 +192,9 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
         state = replace(state, belief=replace(state.belief, since=held))
     if "hover_thrust" in changes:
         thrust = changes.pop("hover_thrust")
-        changes["hover"] = HoverThrust(thrust, LEARNED_SIGMA) if thrust else HoverThrust()
+        changes["hover_thrust_estimate"] = (
+            HoverThrust(thrust, LEARNED_SIGMA) if thrust else HoverThrust()
+        )
     belief = {name: value for name, value in changes.items() if name in _BELIEF - {"since"}}
     descent = {name: value for name, value in changes.items() if name in _DESCENT}
     entry = {_ENTRY[name]: value for name, value in changes.items() if name in _ENTRY}
@@ -242,6 +244,6 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         last_target_world_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         battery_fit=FINE_BATTERY,
-        contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
+        last_contact_body_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
         hover_errors=HoverErrors(t_s, t_s),
     )

@@ -265,7 +265,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
-    held = {"contact_z_m": HANG_Z_M, "released_s": 10.0, **changes}
+    held = {"last_contact_body_z_m": HANG_Z_M, "released_s": 10.0, **changes}
     return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 

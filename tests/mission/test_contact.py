@@ -8,10 +8,10 @@ import pytest
 
 from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
-    BLOCKED,
+    CLIMB_BLOCKED,
     CONTACT,
     PRESS_THRUST_RATIO,
-    SUPPORTED_BY_IMU,
+    SUPPORT_SHOWN_BY_IMU,
     is_pressing,
 )
 from perchctl.profile import Profile
@@ -44,7 +44,7 @@ def touching(
     place_m = (0.0, 0.0, CEILING_M + distance_below_m)
     seen = {
         "target": target_at(BEGIN_S, place_m, (0, 0, HANG_Z_M), measured_s=BEGIN_S - unseen_s),
-        "imu": ImuMotion(t_s=BEGIN_S, steady_s=steady_s),
+        "imu": ImuMotion(t_s=BEGIN_S, climb_steady_since_s=steady_s),
     }
     return at(HANG_Z_M, obs=seen, **{"thrust": PRESSED, **changes})(BEGIN_S)
 
@@ -121,7 +121,12 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     pressing = state_in(Phase.PERCH, z_m=HANG_Z_M)
     above = PositionSetpoint(0.0, 0.0, HANG_Z_M + 0.2, 0.0)
     b = observing(replace(pressing, setpoint=above), obs).belief
-    found = [CONTACT in b.since, BLOCKED in b.since, SUPPORTED_BY_IMU in b.since, is_pressing(b)]
+    found = [
+        CONTACT in b.since,
+        CLIMB_BLOCKED in b.since,
+        SUPPORT_SHOWN_BY_IMU in b.since,
+        is_pressing(b),
+    ]
     assert found == [thrust >= PRESS_THRUST_RATIO] * 4
 
 

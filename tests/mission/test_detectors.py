@@ -14,10 +14,10 @@ from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
     FALL_SINK_MPS,
     FREE_FALL_S,
-    MAX_RISE_MPS,
+    MAX_RISE_BEFORE_FALL_MPS,
     MAX_STEADY_CLIMB_DEVIATION_MPS,
     MIN_PUSH_G,
-    OFFSET_TIME_CONSTANT_S,
+    VERTICAL_OFFSET_TIME_CONSTANT_S,
     FallDetector,
     FreezeDetector,
     Impact,
@@ -50,15 +50,15 @@ def watched(
     return fall
 
 
-LEARNED_S = 4.0 * OFFSET_TIME_CONSTANT_S
+LEARNED_S = 4.0 * VERTICAL_OFFSET_TIME_CONSTANT_S
 
 
 @given(RATES_HZ, BIAS_MPS2)
 def test_a_constant_bias_is_no_fall_and_hides_none(rate_hz: float, bias_mps2: float) -> None:
     hovers = [(0.0, LEARNED_S)]
-    assert watched(hovers, rate_hz, bias_mps2).fell_s < 0.5 * LEARNED_S
+    assert watched(hovers, rate_hz, bias_mps2).last_fall_at_s < 0.5 * LEARNED_S
     falls = [*hovers, (-0.9 * GRAVITY_MPS2, 0.15)]
-    assert watched(falls, rate_hz, bias_mps2).fell_s > LEARNED_S
+    assert watched(falls, rate_hz, bias_mps2).last_fall_at_s > LEARNED_S
 
 
 @given(RATES_HZ, st.floats(0.0, 0.9), st.floats(0.0, 0.5))
@@ -66,10 +66,10 @@ def test_a_deeper_or_longer_fall_is_one_too(rate_hz: float, part: float, more_s:
     """By as much as gravity gives: what falls for a moment falls for longer as well."""
     begins = [(0.0, 1.0)]
     short = watched([*begins, (-part * GRAVITY_MPS2, 0.2)], rate_hz)
-    assume(short.fell_s > 1.0)
+    assume(short.last_fall_at_s > 1.0)
     deep = watched([*begins, (-GRAVITY_MPS2, 0.2)], rate_hz)
     long = watched([*begins, (-part * GRAVITY_MPS2, 0.2 + more_s)], rate_hz)
-    assert min(deep.fell_s, long.fell_s) > 1.0
+    assert min(deep.last_fall_at_s, long.last_fall_at_s) > 1.0
 
 
 @given(st.floats(0.3, 1.0))
@@ -78,7 +78,7 @@ def test_a_fall_is_noticed_after_the_same_time_at_each_rate(part: float) -> None
     for rate_hz in (50.0, 100.0, 200.0):
         for ms in range(20, 400, 20):
             fallen = watched([(0.0, 1.0), (-part * GRAVITY_MPS2, ms / 1e3)], rate_hz)
-            if fallen.fell_s > 1.0:
+            if fallen.last_fall_at_s > 1.0:
                 found.append(ms / 1e3)
                 break
     assert len(found) == 3
@@ -92,7 +92,7 @@ def test_the_rebound_of_an_impact_is_no_fall(rate_hz: float, speed_mps: float) -
     second."""
     lasts_s = max(0.02, 1.0 / rate_hz)
     blow = [(0.0, 1.0), (-0.1 * speed_mps / lasts_s, lasts_s), (0.0, 1.0)]
-    assert watched(blow, rate_hz).fell_s < 1.0
+    assert watched(blow, rate_hz).last_fall_at_s < 1.0
 
 
 @given(RATES_HZ, st.floats(0.1, 0.65), st.floats(1.0, 3.0), st.floats(1.0, 3.0))
@@ -101,7 +101,7 @@ def test_a_climb_that_is_braked_is_no_fall(
 ) -> None:
     climbs = [(0.0, 1.0), (gains_mps2, speed_mps / gains_mps2)]
     stops = [(-brakes_mps2, speed_mps / brakes_mps2), (0.0, 1.0)]
-    assert watched([*climbs, *stops], rate_hz).fell_s < 1.0
+    assert watched([*climbs, *stops], rate_hz).last_fall_at_s < 1.0
 
 
 @given(RATES_HZ, st.floats(0.1, 3.0), st.floats(0.1, 0.3))
@@ -110,9 +110,9 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
 ) -> None:
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
-    late_s = (MAX_RISE_MPS - FALL_SINK_MPS) / (0.8 * falls_mps2)
+    late_s = (MAX_RISE_BEFORE_FALL_MPS - FALL_SINK_MPS) / (0.8 * falls_mps2)
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
-    assert watched(flight, rate_hz).fell_s > 1.0
+    assert watched(flight, rate_hz).last_fall_at_s > 1.0
 
 
 @given(RATES_HZ, st.floats(-1.0, 0.55), st.floats(0.0, 5.0))
@@ -124,7 +124,7 @@ def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_
     for _ in range(round(rate_hz)):
         t_s += dt_s
         fall = fall.update_fall(t_s, up_mps2, reads_g, dt_s)
-        if fall.fell_s > 0.0:
+        if fall.last_fall_at_s > 0.0:
             break
     assert FREE_FALL_S <= t_s - 1.0 <= FREE_FALL_S + 2.1 * dt_s
 
@@ -149,17 +149,17 @@ def test_a_harder_blow_is_a_blow_and_never_softer(
     rate_hz: float, gained_mps: float, more_mps: float
 ) -> None:
     soft, hard = struck(gained_mps, rate_hz), struck(gained_mps + more_mps, rate_hz)
-    assert soft.blow.t_s > 0.4
-    assert hard.blow.t_s > 0.4
-    assert hard.blow.peak_g >= soft.blow.peak_g - 1e-9
+    assert soft.newest_impact.t_s > 0.4
+    assert hard.newest_impact.t_s > 0.4
+    assert hard.newest_impact.peak_g >= soft.newest_impact.peak_g - 1e-9
 
 
 @given(RATES_HZ, st.floats(-1.5, -0.3), st.floats(0.3, 1.5))
 def test_the_speed_of_a_touchdown_is_the_one_before_it(
     rate_hz: float, sinks_mps: float, gained_mps: float
 ) -> None:
-    blow = struck(gained_mps, rate_hz, sinks_mps).blow
-    assert blow.estimated_mps == pytest.approx(sinks_mps, abs=1e-9)
+    blow = struck(gained_mps, rate_hz, sinks_mps).newest_impact
+    assert blow.estimated_climb_before_mps == pytest.approx(sinks_mps, abs=1e-9)
 
 
 @given(RATES_HZ)
@@ -170,7 +170,7 @@ def test_full_thrust_is_no_blow(rate_hz: float) -> None:
         t_s += dt_s
         now = Impact(t_s, 0.0, 0.0, 1.2)
         impact = impact.update_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
-    assert impact.blow_s == -math.inf
+    assert impact.last_impact_at_s == -math.inf
 
 
 # --- Frozen readings -----------------------------------------------------------------------------
@@ -182,13 +182,17 @@ def test_a_frozen_reading_is_as_old_as_its_first(samples: int, rate_hz: float) -
     freeze = freeze.update_freeze(None, last)
     moved = replace(telemetry(0.01), acc_x_g=0.01, roll_rad=0.01, position_m=(0.1, 0.0, 1.0))
     freeze, last = freeze.update_freeze(last, moved), moved
-    assert (freeze.frozen_s, freeze.attitude_frozen_s, freeze.place_frozen_s) == (0.0, 0.0, 0.0)
+    assert (
+        freeze.acceleration_frozen_for_s,
+        freeze.attitude_frozen_for_s,
+        freeze.position_frozen_for_s,
+    ) == (0.0, 0.0, 0.0)
     for k in range(samples):
         now = replace(last, t_s=last.t_s + 1.0 / rate_hz, acc_x_g=0.02 + 1e-6 * k)
         freeze, last = freeze.update_freeze(last, now), now
-    assert freeze.frozen_s == 0.0
-    assert freeze.stuck_attitude_s == pytest.approx(samples / rate_hz)
-    assert freeze.stuck_position_s == pytest.approx(samples / rate_hz)
+    assert freeze.acceleration_frozen_for_s == 0.0
+    assert freeze.only_attitude_frozen_for_s == pytest.approx(samples / rate_hz)
+    assert freeze.only_position_frozen_for_s == pytest.approx(samples / rate_hz)
 
 
 # --- Steady speeds -------------------------------------------------------------------------------
@@ -204,12 +208,15 @@ def test_a_constant_speed_is_steady_whatever_it_is(
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
         speed = speed.update_steady_speed(t_s, velocity, dt_s)
-    assert t_s - min(speed.steady_s, t_s) >= 1.9 or abs(climb_mps) <= MAX_STEADY_CLIMB_DEVIATION_MPS
-    assert t_s - min(speed.steady_aside_s, t_s) >= 1.0 or abs(aside_mps) <= 0.15
+    assert (
+        t_s - min(speed.climb_steady_since_s, t_s) >= 1.9
+        or abs(climb_mps) <= MAX_STEADY_CLIMB_DEVIATION_MPS
+    )
+    assert t_s - min(speed.lateral_steady_since_s, t_s) >= 1.0 or abs(aside_mps) <= 0.15
     jerked = speed.update_steady_speed(
         t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_DEVIATION_MPS), dt_s
     )
-    assert jerked.steady_s == t_s + dt_s
+    assert jerked.climb_steady_since_s == t_s + dt_s
 
 
 # --- Pushes --------------------------------------------------------------------------------------
@@ -236,7 +243,7 @@ def test_a_push_is_one_from_each_side_and_with_each_offset_at_rest(
 ) -> None:
     assume(abs(force_g - MIN_PUSH_G) > 1e-3)
     found = pushed(force_g, heading_rad, rate_hz, (offset_g, -offset_g))
-    assert (found.pushed_s > 0.0) is (force_g > MIN_PUSH_G)
+    assert (found.last_push_at_s > 0.0) is (force_g > MIN_PUSH_G)
 
 
 # --- All of it -----------------------------------------------------------------------------------

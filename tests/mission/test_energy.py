@@ -16,7 +16,7 @@ from perchctl.mission.belief.battery import (
     BRUSHED,
     BRUSHLESS,
     BatteryFit,
-    Drive,
+    PowerTrain,
     update_battery_fit,
 )
 from perchctl.mission.context import Context
@@ -58,7 +58,7 @@ def hovering(
     kind: dict[str, float],
     most_s: float = 120.0,
     hover: float = HOVER,
-    drive: Drive = BRUSHED,
+    drive: PowerTrain = BRUSHED,
     mah: float = MAH,
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""

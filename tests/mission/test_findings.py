@@ -95,12 +95,13 @@ def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
         lateral_offset_m=(0.02, 0.0),
         lateral_sigma_m=0.01,
         distance_below_m=0.0,
-        sighting_s=BEGIN_S - 0.5,
+        last_sighting_at_s=BEGIN_S - 0.5,
     )
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
-        reckoning=reckoning, contact_z_m=1.9, in_reach_since_s=BEGIN_S, stopped_s=BEGIN_S,
-        dead_reckoned_s=BEGIN_S,
+        reckoning=reckoning, last_contact_body_z_m=1.9, in_magnet_reach_since_s=BEGIN_S,
+        stopped_s=BEGIN_S,
+        dead_reckoning_since_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
     rest = [

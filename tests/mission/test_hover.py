@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
-    DESCENT_RANDOM_WALK,
+    DESCENT_HOVER_DRIFT_PER_SQRT_S,
     MAX_DESCENT_CORRECTION_SIGMAS,
-    MIN_DESCENT_SIGMA,
+    MIN_HOVER_THRUST_SIGMA_IN_DESCENT,
     estimate_hover_thrust,
     learn_in_descent,
     learn_in_quiet_flight,
 )
 from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_SIGMA,
-    QUIET_RANDOM_WALK,
+    ACCELEROMETER_HOVER_THRUST_SIGMA,
+    QUIET_HOVER_DRIFT_PER_SQRT_S,
     THRUST_SIGMA,
     HoverThrust,
 )
@@ -38,7 +38,7 @@ from tests.helpers.mission import (
 )
 
 thrusts = st.floats(30_000.0, 62_000.0)
-drifts = st.sampled_from([QUIET_RANDOM_WALK, DESCENT_RANDOM_WALK])
+drifts = st.sampled_from([QUIET_HOVER_DRIFT_PER_SQRT_S, DESCENT_HOVER_DRIFT_PER_SQRT_S])
 DESCENDS = SentOrders(maneuver=Maneuver(descends=True), raw_thrust=48_000)
 
 
@@ -59,7 +59,9 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
     settled_s = 12.0 * THRUST_SIGMA / drift  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
-    found = measured(HoverThrust(first, ACCELEROMETER_SIGMA), [true] * steps, 0.02, drift)
+    found = measured(
+        HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA), [true] * steps, 0.02, drift
+    )
     assert found.thrust == pytest.approx(true, rel=1e-3)
 
 
@@ -73,7 +75,7 @@ def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: f
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
     """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
-    start = HoverThrust(first, ACCELEROMETER_SIGMA)
+    start = HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA)
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
     assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
@@ -101,10 +103,10 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 ) -> None:
     b = believing(Phase.LANDING, thrust, acc_z_g)
     for _ in range(200):
-        b = replace(b, hover=learn_in_descent(b, 0.02))
+        b = replace(b, hover_thrust_estimate=learn_in_descent(b, 0.02))
     assert (
         abs(b.hover_thrust / 50_000.0 - 1.0)
-        <= MAX_DESCENT_CORRECTION_SIGMAS * MIN_DESCENT_SIGMA + 1e-9
+        <= MAX_DESCENT_CORRECTION_SIGMAS * MIN_HOVER_THRUST_SIGMA_IN_DESCENT + 1e-9
     )
     assert (b.hover_thrust > 50_000.0) is (thrust / acc_z_g > 50_000.0)
 
@@ -113,8 +115,8 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
     "hides",
     [
         {"sent": replace(DESCENDS, floor_detected_s=9.9)},
-        {"contact_z_m": 1.0},  # a magnet may hold it
-        {"in_reach_since_s": 9.0},
+        {"last_contact_body_z_m": 1.0},  # a magnet may hold it
+        {"in_magnet_reach_since_s": 9.0},
     ],
     ids=["floor", "contact", "reach"],
 )
@@ -125,7 +127,7 @@ def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> N
 
 
 def test_what_was_never_learned_is_felt_and_rough() -> None:
-    b = replace(believing(Phase.LANDING, 45_000.0), hover=HoverThrust())
+    b = replace(believing(Phase.LANDING, 45_000.0), hover_thrust_estimate=HoverThrust())
     assert estimate_hover_thrust(b).thrust == pytest.approx(45_000.0)
     assert estimate_hover_thrust(b).is_imprecise
     assert not learn_in_quiet_flight(b, 0.02).is_imprecise
@@ -134,7 +136,9 @@ def test_what_was_never_learned_is_felt_and_rough() -> None:
 def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
     """One late packet teaches no more in a second than in a tick."""
     start = remembering(
-        state_in(Phase.LANDING), raw_thrust_order=45_000, hover=HoverThrust(50_000.0, 0.12)
+        state_in(Phase.LANDING),
+        raw_thrust_order=45_000,
+        hover_thrust_estimate=HoverThrust(50_000.0, 0.12),
     )
     sample = replace(telemetry(10.02, 1.0), thrust=45_000.0)
     once = observing(start, observation(10.02, telemetry=sample))
@@ -147,7 +151,7 @@ def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
 def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
     """The rotors follow an order with their lag, and the accelerometer with them: until they have,
     the thrust that is read divided by the specific force is not what hovering takes."""
-    state = remembering(state_in(Phase.LANDING), hover=HoverThrust(50_000.0, 0.12))
+    state = remembering(state_in(Phase.LANDING), hover_thrust_estimate=HoverThrust(50_000.0, 0.12))
     force_g = 1.0
     for i in range(100):
         t_s, read = 10.0 + 0.01 * i, 50_000.0 if i < 50 else step * 50_000.0
@@ -162,7 +166,7 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
     later = HoverThrust(50_000.0, sigma).propagate_unmeasured(dt_s)
-    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_SIGMA)
+    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
@@ -176,4 +180,4 @@ def test_a_tick_without_a_measurement_makes_it_less_sure() -> None:
     start = remembering(state_in(Phase.PERCH), hover_thrust=50_000.0)
     later = observing(start, observation(10.5))
     assert later.belief.hover_thrust == 50_000.0
-    assert later.belief.hover.sigma > start.belief.hover.sigma
+    assert later.belief.hover_thrust_estimate.sigma > start.belief.hover_thrust_estimate.sigma

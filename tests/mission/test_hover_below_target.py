@@ -94,7 +94,7 @@ def test_a_hover_that_ends_on_the_magnet_is_no_hover(seen: str) -> None:
     off = {"thrust": 0.0, "supervisor": READY | (LOCKED if seen == "locked" else 0)}
     state = remembering(
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stopped_s=BEGIN_S - 1.0,
-        contact_z_m=HANG_Z_M, outcome=Outcome.HOVERED,
+        last_contact_body_z_m=HANG_Z_M, outcome=Outcome.HOVERED,
     )  # fmt: skip
     end = fly(state, at(HANG_Z_M, **off), 0.3, HOVERING).state
     assert (end.phase, end.outcome) == (Phase.PERCHED, Outcome.SAFETY)

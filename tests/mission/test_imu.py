@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    CORRECTION_TIMEOUT_S,
     MAX_FROZEN_READING_S,
     MAX_TELEMETRY_GAP_S,
     MIN_PUSH_G,
+    NO_FUSION_TIMEOUT_S,
 )
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
-    MAX_SILENT_CLIMB_MPS,
+    MAX_CLIMB_DURING_SILENCE_MPS,
     DeadReckoning,
     add_sighting,
     advance_reckoning,
@@ -39,13 +39,13 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     """A reading of 0.9 g for ever is neither a fall nor a way down."""
     frozen = [telemetry(0.01 * i, acc_x_g=0.0, acc_z_g=0.9) for i in range(300)]
     motion = flown(frozen)
-    assert motion.frozen_s == pytest.approx(2.99)
-    assert motion.silent_s == pytest.approx(2.99)
-    assert motion.fell_s < 0.0
+    assert motion.acceleration_frozen_for_s == pytest.approx(2.99)
+    assert motion.last_silence_end_s == pytest.approx(2.99)
+    assert motion.last_fall_at_s < 0.0
     assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
-    assert alive.frozen_s == 0.0
-    assert alive.fell_s > 0.0
+    assert alive.acceleration_frozen_for_s == 0.0
+    assert alive.last_fall_at_s > 0.0
 
 
 HUNG = [telemetry(0.01 * i, 1.9) for i in range(100)]
@@ -65,7 +65,7 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
     floor took that, has gone down."""
     t_s = 0.99 + silent_s
     hangs = since_heard(telemetry(t_s, 1.9 + 0.05, velocity_mps=(0.0, 0.0, drift_mps)))
-    assert (hangs.silent_s, hangs.gap_s) == (t_s, -math.inf)
+    assert (hangs.last_silence_end_s, hangs.last_fall_hiding_gap_end_s) == (t_s, -math.inf)
     for z_m, climb_mps, changes in (
         (1.9, drift_mps - 1.0, {}),  # the floor's blow was more than the accelerometer reads
         (0.0, drift_mps, {}),
@@ -73,9 +73,9 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
         (1.9, drift_mps, {"start": 1}),  # and this estimate is another one
     ):
         after = telemetry(t_s, z_m, velocity_mps=(0.0, 0.0, climb_mps), **changes)
-        assert since_heard(after).gap_s == t_s
+        assert since_heard(after).last_fall_hiding_gap_end_s == t_s
     still = telemetry(0.99, 1.9)
-    assert since_heard(replace(still, t_s=t_s), still).gap_s == t_s
+    assert since_heard(replace(still, t_s=t_s), still).last_fall_hiding_gap_end_s == t_s
 
 
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
@@ -84,14 +84,19 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     before = telemetry(1.0, velocity_mps=(0.1, 0.0, 0.15))
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
-    old = DeadReckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
-    heard = imu.with_sample(before, after)
-    new = advance_reckoning(old, heard, after, believed=False)
-    assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
-    assert advance_reckoning(old, heard, after, believed=True).velocity_mps == after.velocity_mps
-    assert advance_reckoning(old, heard, after, believed=False, diverged=True).velocity_mps == (
-        old.velocity_mps
+    old = DeadReckoning(
+        imu, velocity_mps=(0.0, 0.0, 0.05), estimated_velocity_mps=before.velocity_mps
     )
+    heard = imu.with_sample(before, after)
+    new = advance_reckoning(old, heard, after, is_estimate_believed=False)
+    assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
+    assert (
+        advance_reckoning(old, heard, after, is_estimate_believed=True).velocity_mps
+        == after.velocity_mps
+    )
+    assert advance_reckoning(
+        old, heard, after, is_estimate_believed=False, is_position_diverged=True
+    ).velocity_mps == (old.velocity_mps)
 
 
 @given(
@@ -120,8 +125,8 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
         return samples
 
     misled, true = flown(flight(True)), flown(flight(False))
-    assert true.misled_rad == (0.0, 0.0)
-    assert misled.misled_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
+    assert true.roll_pitch_error_rad == (0.0, 0.0)
+    assert misled.roll_pitch_error_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
     assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
 
 
@@ -132,7 +137,7 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = distance_below_m - MAX_SILENT_CLIMB_MPS * silent_s < MAGNET_REACH_M
+    near = distance_below_m - MAX_CLIMB_DURING_SILENCE_MPS * silent_s < MAGNET_REACH_M
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
         (distance_below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),
@@ -142,8 +147,10 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     ):
         imu = flown([before])
         old = add_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
-        new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
-        assert (new.doubtful_gap_s == after.t_s) is unsure
+        new = advance_reckoning(
+            old, imu.with_sample(before, after), after, is_estimate_believed=False
+        )
+        assert (new.last_possible_catch_gap_end_s == after.t_s) is unsure
         assert new.distance_below_m == (z_m if kept else math.inf)
         assert (
             add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_distance_below_m == z_m
@@ -159,9 +166,9 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     for last, new in pairwise([*falls, late]):
         assert new is not late or 0.02 < reckoning.min_distance_below_m < 0.1
         motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
-    assert motion.fell_s > 1.0
-    assert reckoning.doubtful_gap_s == late.t_s
+        reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=False)
+    assert motion.last_fall_at_s > 1.0
+    assert reckoning.last_possible_catch_gap_end_s == late.t_s
 
 
 def estimate_only_mps(
@@ -171,7 +178,11 @@ def estimate_only_mps(
     mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
     many samples show. `offset_g`: what the accelerometer reads too much."""
     lean_rad = 1.0 / 9.81
-    reckoning, motion, last = DeadReckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
+    reckoning, motion, last = (
+        DeadReckoning(),
+        ImuMotion(accelerometer_offset_g=(offset_g, 0.0, 0.0)),
+        None,
+    )
     for i in range(41):
         t_s = 1.0 + 0.01 * i
         new = telemetry(
@@ -179,9 +190,9 @@ def estimate_only_mps(
             acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
         )  # fmt: skip
         motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=True)
+        reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=True)
         last = new
-    return abs(reckoning.estimate_only_mps[0])
+    return abs(reckoning.lateral_gain_of_estimate_only_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
@@ -207,12 +218,12 @@ def uncorrected_s(*growths: tuple[float, float]) -> float:
                 variance += 0.1 * per_s
             new = telemetry(t_s, climb_variance_m2ps2=variance)
             motion, last = motion.with_sample(last, new), new
-    return motion.corrections.age_s(t_s)
+    return motion.fusion_age.age_s(t_s)
 
 
 def test_a_variance_that_grows_on_and_on_is_corrected_no_more() -> None:
     """After 0.5 s it is certain, and then the age counts from the last correction."""
-    assert uncorrected_s((0.0, 1.0), (1e-3, CORRECTION_TIMEOUT_S)) == 0.0
+    assert uncorrected_s((0.0, 1.0), (1e-3, NO_FUSION_TIMEOUT_S)) == 0.0
     assert uncorrected_s((0.0, 1.0), (1e-3, 0.6)) == pytest.approx(0.6, abs=0.11)
     assert uncorrected_s((0.0, 1.0), (1e-3, 5.0)) == pytest.approx(5.0, abs=0.11)
 
@@ -232,4 +243,4 @@ def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
 
 def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
     silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
-    assert flown(silent).corrections.age_s(2.7) == pytest.approx(2.7)
+    assert flown(silent).fusion_age.age_s(2.7) == pytest.approx(2.7)

@@ -24,7 +24,7 @@ from perchctl.mission import (
     planner,
     rest,
 )
-from perchctl.mission.belief.contact import MOTORS_STOPPED, SUPPORTED_BY_IMU
+from perchctl.mission.belief.contact import MOTORS_STOPPED, SUPPORT_SHOWN_BY_IMU
 from perchctl.mission.belief.motion import FusionAge
 from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
 from perchctl.mission.belief.quality import BATTERY_LOW
@@ -76,9 +76,9 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
     "sight": (BY_TARGET, {"position_age_s": 0.05}, {}, PositionSetpoint),
     "onboard": (DECKS, {"link_problem": "gone"}, {}, Land),
     "height": (DECKS, {}, {"heading_lost": True}, RawThrust),
-    "imu": (BY_TARGET, {"position_age_s": 3.0}, {"dead_reckoned_s": NOW_S - 1.0}, RawThrust),
+    "imu": (BY_TARGET, {"position_age_s": 3.0}, {"dead_reckoning_since_s": NOW_S - 1.0}, RawThrust),
     "nothing": (
-        BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"dead_reckoned_s": NOW_S - 1.0},
+        BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"dead_reckoning_since_s": NOW_S - 1.0},
         RawThrust,
     ),
 }  # fmt: skip
@@ -106,14 +106,15 @@ def context(
     profile, observed, remembered, _ = KNOWN[known]
     if changes.get("last_order_s") and profile is BY_TARGET:
         # What once had positions from outside, and was found astray, knows as little.
-        profile, remembered = MOCAP, {"diverged": True}
+        profile, remembered = MOCAP, {"is_position_diverged": True}
     z_m = z_m if z_m is not None else HANG_Z_M if held else MIN_HANGING_HEIGHT_M
     observed = dict(observed)
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
         t_s=NOW_S - TICK_S, last_telemetry=sample, reckoned_height_m=z_m,
-        contact_z_m=z_m if held else None, in_reach_since_s=NOW_S - 2.0 if held else None,
+        last_contact_body_z_m=z_m if held else None,
+        in_magnet_reach_since_s=NOW_S - 2.0 if held else None,
         reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
@@ -214,7 +215,7 @@ def test_each_part_of_what_is_known_has_its_own_age(
 
 def uncorrected(for_s: float) -> dict[str, Any]:
     """A deck that has given no positions for so long."""
-    return {"imu": ImuMotion(t_s=NOW_S, corrections=FusionAge(1e-3, NOW_S, NOW_S - for_s))}
+    return {"imu": ImuMotion(t_s=NOW_S, fusion_age=FusionAge(1e-3, NOW_S, NOW_S - for_s))}
 
 
 @pytest.mark.parametrize(
@@ -225,10 +226,10 @@ def uncorrected(for_s: float) -> dict[str, Any]:
         (DECKS, {}, uncorrected(0.6), False),
         (DECKS, {}, uncorrected(0.3), True),
         # What once came down blindly, or went astray, believes no sight and no position again.
-        (MOCAP, {"dead_reckoned_s": NOW_S - 1.0}, {}, False),
-        (BY_TARGET, {"dead_reckoned_s": NOW_S - 1.0}, {}, False),
-        (MOCAP, {"diverged": True}, {}, False),
-        (MOCAP, {"diverged": True}, {"age_s": 0.6}, False),
+        (MOCAP, {"dead_reckoning_since_s": NOW_S - 1.0}, {}, False),
+        (BY_TARGET, {"dead_reckoning_since_s": NOW_S - 1.0}, {}, False),
+        (MOCAP, {"is_position_diverged": True}, {}, False),
+        (MOCAP, {"is_position_diverged": True}, {"age_s": 0.6}, False),
     ],
 )
 def test_positions_that_end_or_lead_astray_leave_what_is_felt(
@@ -248,7 +249,11 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
-    assert (state.phase, state.row, state.belief.diverged) == (Phase.LANDING, "mounting", astray)
+    assert (state.phase, state.row, state.belief.is_position_diverged) == (
+        Phase.LANDING,
+        "mounting",
+        astray,
+    )
     assert ("motion capture may have swapped axes" in state.reason) is astray
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
 
@@ -293,8 +298,8 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 @pytest.mark.parametrize(("impact_mps", "floor"), [(-0.3, True), (0.3, False)])
 def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, floor: bool) -> None:
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
-    imu = ImuMotion(t_s=NOW_S - 0.01, blow_s=NOW_S - 0.05)
-    struck = DeadReckoning(imu=imu, impact_mps=impact_mps)
+    imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_at_s=NOW_S - 0.05)
+    struck = DeadReckoning(imu=imu, climb_before_impact_mps=impact_mps)
     c = context("imu", z_m=0.15, reckoning=struck)
     c = Context(
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
@@ -335,7 +340,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
         imu=imu,
         bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
         mean_lateral_mps2=(reads_mps2 * cos, reads_mps2 * sin),
-        position_control_s=held_s,
+        time_under_position_control_s=held_s,
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
@@ -369,7 +374,7 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     phase: Phase, since_s: float, is_there: bool
 ) -> None:
     """Late pictures show it lower. On its way down the floor carries it, too."""
-    c = context("sight", phase=phase, since={SUPPORTED_BY_IMU: NOW_S - since_s})
+    c = context("sight", phase=phase, since={SUPPORT_SHOWN_BY_IMU: NOW_S - since_s})
     reckoning = replace(c.state.belief.reckoning, distance_below_m=0.1)
     state = observing(remembering(c.state, reckoning=reckoning), c.obs, c.profile)
     assert (state.belief.reckoning.distance_below_m == 0.0) is is_there
@@ -400,7 +405,7 @@ def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -
     """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
     at the speed that is meant for free air."""
     reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S), velocity_mps=(0.0, 0.0, -0.4))
-    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning, diverged=diverged)
+    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning, is_position_diverged=diverged)
     _, command = descent.act(c)
     assert isinstance(command, RawThrust)
     assert (command.thrust > 0.97 * HOVER_THRUST) is diverged
@@ -429,7 +434,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     held = remembering(state, catch_above_m=None)
     assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
-        assert (after.belief.dead_reckoned_s is not None) is stale
+        assert (after.belief.dead_reckoning_since_s is not None) is stale
 
 
 # --- Where it is, in the end --------------------------------------------------------------------
@@ -438,7 +443,7 @@ UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
 
 
 def ended(
-    in_reach_since_s: float | None = None,
+    in_magnet_reach_since_s: float | None = None,
     imu: ImuMotion = UNMOVED,
     reckoning: DeadReckoning = UNRECKONED,
     floor_detected_s: float | None = None,
@@ -448,14 +453,14 @@ def ended(
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
-        in_reach_since_s=in_reach_since_s, floor_detected_s=floor_detected_s,
+        in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_s=floor_detected_s,
         reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, BY_TARGET))
 
 
 @pytest.mark.parametrize(
-    ("in_reach_since_s", "fell_s", "gap_s", "found"),
+    ("in_magnet_reach_since_s", "fell_s", "gap_s", "found"),
     [
         (4.0, -math.inf, -math.inf, RestState.HANGS),
         (4.0, 3.0, 3.5, RestState.HANGS),  # before it came there
@@ -466,9 +471,15 @@ def ended(
     ],
 )
 def test_what_was_in_reach_and_has_not_fallen_since_hangs(
-    in_reach_since_s: float | None, fell_s: float, gap_s: float, found: RestState
+    in_magnet_reach_since_s: float | None, fell_s: float, gap_s: float, found: RestState
 ) -> None:
-    assert ended(in_reach_since_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
+    assert (
+        ended(
+            in_magnet_reach_since_s,
+            ImuMotion(t_s=NOW_S, last_fall_at_s=fell_s, last_fall_hiding_gap_end_s=gap_s),
+        )
+        is found
+    )
 
 
 @pytest.mark.parametrize("part", [0.35, 1.0])
@@ -485,26 +496,27 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
 
     begun = remembering(
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), order_count=6, last_order_s=BEGIN_S,
-        in_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
+        in_magnet_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
-    assert (state.belief.in_reach_since_s is not None) is (part < 1.0)
+    assert (state.belief.in_magnet_reach_since_s is not None) is (part < 1.0)
 
 
-@pytest.mark.parametrize("in_reach_since_s", [None, NOW_S - 2.0])
+@pytest.mark.parametrize("in_magnet_reach_since_s", [None, NOW_S - 2.0])
 def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
-    in_reach_since_s: float | None,
+    in_magnet_reach_since_s: float | None,
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(doubtful_gap_s=NOW_S - 3.0)
-    assert ended(in_reach_since_s, reckoning=silence) is RestState.UNKNOWN
+    silence = DeadReckoning(last_possible_catch_gap_end_s=NOW_S - 3.0)
+    assert ended(in_magnet_reach_since_s, reckoning=silence) is RestState.UNKNOWN
     assert (
-        ended(in_reach_since_s, reckoning=silence, floor_detected_s=NOW_S - 1.5) is RestState.STANDS
+        ended(in_magnet_reach_since_s, reckoning=silence, floor_detected_s=NOW_S - 1.5)
+        is RestState.STANDS
     )
-    seen = replace(silence, sighting_s=NOW_S - 2.5)
-    told = RestState.STANDS if in_reach_since_s is None else RestState.HANGS
-    assert ended(in_reach_since_s, reckoning=seen) is told
+    seen = replace(silence, last_sighting_at_s=NOW_S - 2.5)
+    told = RestState.STANDS if in_magnet_reach_since_s is None else RestState.HANGS
+    assert ended(in_magnet_reach_since_s, reckoning=seen) is told
 
 
 @pytest.mark.parametrize(
@@ -529,7 +541,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
 
 
 def test_a_target_seen_far_above_tells_that_it_stands() -> None:
-    silent = ImuMotion(t_s=NOW_S, gap_s=6.0)
+    silent = ImuMotion(t_s=NOW_S, last_fall_hiding_gap_end_s=6.0)
     for z_m, found in ((CEILING_M - 1.0, RestState.STANDS), (HANG_Z_M, RestState.UNKNOWN)):
         target = target_at(NOW_S, body_m=(0.0, 0.0, z_m))
         assert ended(4.0, silent, target=target) is found
@@ -566,11 +578,11 @@ BITS = st.lists(BIT, min_size=1, max_size=5)
 REMEMBERED = st.sampled_from(
     [
         {},
-        {"contact_z_m": HANG_Z_M, "in_reach_since_s": 9.0},
-        {"contact_z_m": HANG_Z_M, "in_reach_since_s": 9.0, "released_s": 9.9},
+        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0},
+        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0, "released_s": 9.9},
         {
-            "contact_z_m": HANG_Z_M,
-            "in_reach_since_s": 9.0,
+            "last_contact_body_z_m": HANG_Z_M,
+            "in_magnet_reach_since_s": 9.0,
             "released_s": 9.0,
             "stopped_s": 9.8,
             "order_count": 2,
@@ -578,7 +590,7 @@ REMEMBERED = st.sampled_from(
         {"catch_above_m": 1.0},
         {"pressed": True},
         {"hover_thrust": 0.0},
-        {"dead_reckoned_s": 9.0, "reckoned_height_m": 1.0},
+        {"dead_reckoning_since_s": 9.0, "reckoned_height_m": 1.0},
     ]
 )
 

@@ -88,9 +88,9 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
         1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
     )
     sight = make_mounting_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
-    assert sight.vehicle_m == pytest.approx(0.3 + 0.1j)
-    assert sight.target_m == pytest.approx(0.5 + 0.2j)
-    assert sight.axis_offset_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
+    assert sight.vehicle_world_xy_m == pytest.approx(0.3 + 0.1j)
+    assert sight.target_world_xy_m == pytest.approx(0.5 + 0.2j)
+    assert sight.up_axis_offset_xy_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:

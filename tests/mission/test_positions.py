@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.belief.contact import contact_offset
-from perchctl.mission.belief.quality import MAX_VELOCITY_DISAGREEMENT_MPS
+from perchctl.mission.belief.contact import current_gear_offset
+from perchctl.mission.belief.quality import MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.descent import MIN_LANDING_ORDERS
 from perchctl.mission.planner import step_mission
@@ -182,7 +182,7 @@ class Hangs(Motors):
 
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
-    held = {"contact_z_m": HANG_Z_M, "in_reach_since_s": BEGIN_S - 5.0}
+    held = {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": BEGIN_S - 5.0}
     return remembering(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
@@ -252,8 +252,8 @@ def test_what_nobody_saw_hang_has_not_perched(
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, contact_z_m=0.6, released_s=9.0,
-        stopped_s=9.9, last_stale_s=BEGIN_S, in_reach_since_s=8.0,
+        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, last_contact_body_z_m=0.6, released_s=9.0,
+        stopped_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -268,7 +268,10 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
 
 @pytest.mark.parametrize(
     ("contact", "ends"),
-    [({}, Phase.PERCHED), ({"contact_z_m": None, "in_reach_since_s": None}, Phase.LANDED)],
+    [
+        ({}, Phase.PERCHED),
+        ({"last_contact_body_z_m": None, "in_magnet_reach_since_s": None}, Phase.LANDED),
+    ],
     ids=["contact", "none"],
 )
 def test_what_something_carries_is_put_down_gently_whatever_that_is(
@@ -319,10 +322,10 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.belief.reckoning.position_step_sum_m) == pytest.approx(
+    assert math.hypot(*flight.state.belief.reckoning.position_step_sum_xy_m) == pytest.approx(
         sigma_m, abs=1e-3
     )
-    assert contact_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
+    assert current_gear_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
@@ -399,7 +402,7 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
     (Phase.LANDING, (0.3, 0.0, 1.0), {}, MOCAP, False),
     (Phase.LANDING, (0.5, 0.0, 1.0), {}, MOCAP, True),
     # The magnet may hold what has touched the ceiling aside of its setpoint.
-    (Phase.LANDING, (0.5, 0.0, 1.0), {"contact_z_m": 1.0}, MOCAP, False),
+    (Phase.LANDING, (0.5, 0.0, 1.0), {"last_contact_body_z_m": 1.0}, MOCAP, False),
 ])  # fmt: skip
 def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     phase: Phase,
@@ -452,8 +455,10 @@ def gains_beside(
         state, last_telemetry=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu)
     )
     for t_s in times(lasts_s):
-        if not state.belief.diverged:
-            beside = replace(state.belief.reckoning, estimate_only_mps=(0.0, estimate_only_mps))
+        if not state.belief.is_position_diverged:
+            beside = replace(
+                state.belief.reckoning, lateral_gain_of_estimate_only_mps=(0.0, estimate_only_mps)
+            )
             state = remembering(state, reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
         obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
@@ -462,7 +467,8 @@ def gains_beside(
 
 
 @pytest.mark.parametrize(
-    "estimate_only_mps", [0.9 * MAX_VELOCITY_DISAGREEMENT_MPS, 1.1 * MAX_VELOCITY_DISAGREEMENT_MPS]
+    "estimate_only_mps",
+    [0.9 * MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS, 1.1 * MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS],
 )
 def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     estimate_only_mps: float,
@@ -472,8 +478,10 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
         state_in(Phase.LANDING), order_count=MIN_LANDING_ORDERS, last_order_s=BEGIN_S
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
-    assert state.belief.diverged is (estimate_only_mps > MAX_VELOCITY_DISAGREEMENT_MPS)
-    assert isinstance(command, RawThrust) is state.belief.diverged
+    assert state.belief.is_position_diverged is (
+        estimate_only_mps > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
+    )
+    assert isinstance(command, RawThrust) is state.belief.is_position_diverged
 
 
 def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motion() -> None:

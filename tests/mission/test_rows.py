@@ -135,7 +135,7 @@ def blind(look: Look) -> Look:
 def unknown(t_s: float) -> Observation:
     """Motors off, neither the target nor a position of late, and a silence not long ago."""
     obs = replace(at(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
-    return replace(obs, imu=ImuMotion(t_s=t_s, gap_s=BEGIN_S))
+    return replace(obs, imu=ImuMotion(t_s=t_s, last_fall_hiding_gap_end_s=BEGIN_S))
 
 
 LAND_ON_LOG = changed({"safety.land_on_log_error": True})
@@ -151,7 +151,8 @@ CASES: dict[str, Case] = {
     ),
     "hung-but-locked": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
-        O.PERCHED, state={"stopped_s": BEGIN_S, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+        O.PERCHED, state={"stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
+        z_m=CONTACT_Z_M,
     ),
     "locked": Case(P.ALIGN, P.ABORTED, at(supervisor=AIRBORNE | LOCKED), 0.1, O.SAFETY,
                    StopMotors),
@@ -205,13 +206,15 @@ CASES: dict[str, Case] = {
     ),
     "held": Case(
         P.ASCEND, P.LANDING, at(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
-        state={"entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M - 0.2}, z_m=CONTACT_Z_M - 0.2,
+        state={"entered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M - 0.2},
+        z_m=CONTACT_Z_M - 0.2,
         row="held",
     ),
     "hangs-at-contact": Case(
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
-            "entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M, "contact": ContactOffset(0.01, 0.05),
+            "entered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M,
+            "contact": ContactOffset(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
     ),
@@ -276,15 +279,15 @@ CASES: dict[str, Case] = {
     ),
     "perched": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
-        state={"stopped_s": BEGIN_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+        state={"stopped_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
     "fell-unseen": Case(
         P.COMPLETE, P.LANDING, at(0.02, **OFF), 0.3, O.SAFETY,
-        state={"stopped_s": BEGIN_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+        state={"stopped_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
     "not-stopped": Case(
         P.COMPLETE, P.LANDING, at(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
-        state={"stopped_s": BEGIN_S - 12.0, "order_count": 5, "contact_z_m": CONTACT_Z_M},
+        state={"stopped_s": BEGIN_S - 12.0, "order_count": 5, "last_contact_body_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "attempts-used": Case(
@@ -302,7 +305,7 @@ CASES: dict[str, Case] = {
     "sunk": Case(P.HOVER, P.ASCEND, seen(0.9), 0.5, profile=HOVERING),
     "hung": Case(
         P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.OPERATOR,
-        state={"outcome": O.OPERATOR, "stopped_s": BEGIN_S, "contact_z_m": CONTACT_Z_M},
+        state={"outcome": O.OPERATOR, "stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "landed": Case(
@@ -317,8 +320,8 @@ CASES: dict[str, Case] = {
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
-            "outcome": O.SAFETY, "stopped_s": BEGIN_S, "contact_z_m": CONTACT_Z_M,
-            "in_reach_since_s": BEGIN_S - 1.0,
+            "outcome": O.SAFETY, "stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M,
+            "in_magnet_reach_since_s": BEGIN_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),
@@ -350,7 +353,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     to the landing."""
     state = remembering(
         state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), stopped_s=BEGIN_S - 1.0,
-        contact_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
+        last_contact_body_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
     state, _ = planner.step_mission(state, locked, PROFILE)
@@ -369,7 +372,7 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
     assert row is not None
     text = row.reason_text(context)
     assert text.startswith("not steady 6 s after the attempt: moving at 0.30 m/s, 0.31 m")
-    hangs = context_at(remembering(state, contact_z_m=z_m), sample, PROFILE)
+    hangs = context_at(remembering(state, last_contact_body_z_m=z_m), sample, PROFILE)
     assert row.reason_text(hangs).endswith("still at its contact")
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
-from perchctl.mission.belief.belief import MAX_CORRECTION_AGE_S, MIN_GUST_SPEED_MPS
+from perchctl.mission.belief.belief import GUST_SPEED_THRESHOLD_MPS, MAX_FUSED_POSITION_EXTRA_AGE_S
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import (
     BRAKE_GAIN_RAD_PER_MPS,
@@ -64,7 +64,7 @@ def blinded(
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
     reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
     state = remembering(
-        state_in(Phase.LANDING, z_m=z_m), dead_reckoned_s=BEGIN_S, reckoned_height_m=z_m,
+        state_in(Phase.LANDING, z_m=z_m), dead_reckoning_since_s=BEGIN_S, reckoned_height_m=z_m,
         severity=Severity.LAND, reckoning=reckoning,
     )  # fmt: skip
     return remembering(state, **changes)  # type: ignore[arg-type]
@@ -160,7 +160,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
 ) -> None:
     """For 0.1 s without a sight: sideways the estimate feels none of it."""
     gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
-    assume(abs(gained_mps - MIN_GUST_SPEED_MPS) >= 0.05)
+    assume(abs(gained_mps - GUST_SPEED_THRESHOLD_MPS) >= 0.05)
 
     def look(t_s: float) -> Observation:
         passed_s = t_s - BEGIN_S
@@ -169,10 +169,10 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         return unseen(1.0, for_s=max(0.01, passed_s - 0.1), yaw_rad=yaw_rad, **felt)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
-    assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_GUST_SPEED_MPS)
+    assert (flight.state.phase is Phase.LANDING) is (gained_mps > GUST_SPEED_THRESHOLD_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.row == "position-lost"
-        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_CORRECTION_AGE_S
+        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_FUSED_POSITION_EXTRA_AGE_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3
@@ -197,9 +197,9 @@ def test_a_landing_that_loses_it_goes_on_blindly() -> None:
     ordered = at(obs={"operator": Operator.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
     assert state.phase is Phase.LANDING
-    assert state.belief.dead_reckoned_s is None
+    assert state.belief.dead_reckoning_since_s is None
     state, command = step_mission(state, unseen(0.9, for_s=LAND_S + 0.1)(BEGIN_S + 2.0), PROFILE)
-    assert state.belief.dead_reckoned_s is not None
+    assert state.belief.dead_reckoning_since_s is not None
     assert isinstance(command, RawThrust)
 
 
@@ -208,13 +208,13 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
     estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
     unknown_mps = math.hypot(x_mps, y_mps)
-    assume(abs(unknown_mps - MIN_GUST_SPEED_MPS) > 0.01)
+    assume(abs(unknown_mps - GUST_SPEED_THRESHOLD_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
-        in_reach_since_s=BEGIN_S - 6.0, dead_reckoned_s=BEGIN_S - 3.0,
+        state_in(Phase.LANDING, z_m=1.9), last_contact_body_z_m=1.9, released_s=BEGIN_S - 1.0,
+        in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
         reckoning=DeadReckoning(
-            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), imu_only_mps=(x_mps, y_mps)
+            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), lateral_gain_of_imu_only_mps=(x_mps, y_mps)
         ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
@@ -222,7 +222,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     _, command = step_mission(state, obs, PROFILE)
     assert is_setpoint(command, above_m=1.85)
     assert isinstance(command, PositionSetpoint)
-    if unknown_mps > MIN_GUST_SPEED_MPS:
+    if unknown_mps > GUST_SPEED_THRESHOLD_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
             braked_mps = max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps))
             assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)

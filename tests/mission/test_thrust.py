@@ -66,7 +66,9 @@ def flown(
 def test_how_little_thrust_proves_that_the_magnet_holds(
     hover: float, thrust: float, holds: bool
 ) -> None:
-    hangs = remembering(state_in(Phase.COMPLETE), hover_thrust=hover, contact_z_m=CONTACT_Z_M)
+    hangs = remembering(
+        state_in(Phase.COMPLETE), hover_thrust=hover, last_contact_body_z_m=CONTACT_Z_M
+    )
     c = context_at(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
     assert MAGNET_HOLDS.holds(c.belief) is holds
 
@@ -86,7 +88,7 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
     ids=["quiet", "climbs", "pressed", "speeds up", "brakes", "climbs hard", "journey", "stale"],
 )
 def test_only_quiet_flight_teaches_the_hover_thrust(how: dict[str, Any], learns: bool) -> None:
-    start = remembering(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_spread_m=1.0)
+    start = remembering(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_position_scatter_m=1.0)
     after = flown(start, 0.3, thrust=50000.0, **how)
     assert after.belief.hover_thrust == (50000.0 if learns else 0.0)
 

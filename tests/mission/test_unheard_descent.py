@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Observation, Phase, PlannerState, VisualInertialMotion
-from perchctl.mission.belief.target import TargetMotion
+from perchctl.mission.belief.target import VisualMotion
 from perchctl.mission.planner import step_mission
 from perchctl.values import replace
 from perchctl.vehicle import Command, RawThrust
@@ -44,9 +44,9 @@ def watched(
     velocity_mps: tuple[float, float, float],
     rate_hz: float,
     lasts_s: float = 1.0,
-) -> TargetMotion:
+) -> VisualMotion:
     """The motion of a vehicle that leaves `place_m` below a target at this velocity."""
-    motion = TargetMotion()
+    motion = VisualMotion()
     for i in range(int(lasts_s * rate_hz) + 1):
         t_s = BEGIN_S + i / rate_hz
         e_m = np.array(place_m) - np.array(velocity_mps) * (t_s - BEGIN_S)
@@ -61,7 +61,7 @@ def test_the_velocity_is_that_of_the_target_turned_round(
     """Wherever the target is and however often it is seen; e^-10 is left of the low pass."""
     motion = watched(place_m, velocity_mps, rate_hz)
     assert motion.is_known
-    assert motion.velocity_mps == pytest.approx(velocity_mps, abs=1e-3)
+    assert motion.vehicle_velocity_mps == pytest.approx(velocity_mps, abs=1e-3)
 
 
 @given(velocity_mps=speeds_mps, step_m=st.floats(0.1, 1.0))
@@ -71,17 +71,17 @@ def test_a_step_of_the_pose_is_no_motion(
     """As when the small marker takes over from the large one."""
     before = watched((0.0, 0.0, 1.0), velocity_mps, 30.0)
     t_s = before.t_s + 1 / 30
-    stepped = np.add(before.e_m, (0.0, 0.0, step_m))
+    stepped = np.add(before.target_from_gear_m, (0.0, 0.0, step_m))
     after = before.with_detection(replace(target_at(t_s), e_m=stepped))
-    assert after.velocity_mps == before.velocity_mps
-    assert after.e_m == pytest.approx(tuple(stepped))
+    assert after.vehicle_velocity_mps == before.vehicle_velocity_mps
+    assert after.target_from_gear_m == pytest.approx(tuple(stepped))
 
 
 def test_after_a_gap_the_motion_has_to_be_seen_again() -> None:
     seen = watched((0.0, 0.0, 1.0), (0.0, 0.0, -0.5), 30.0)
     again = seen.with_detection(target_at(seen.t_s + 1.1))
     assert not again.is_known
-    assert again.velocity_mps == (0.0, 0.0, 0.0)
+    assert again.vehicle_velocity_mps == (0.0, 0.0, 0.0)
 
 
 # --- How it comes down by that --------------------------------------------------------------------
@@ -255,8 +255,8 @@ def test_what_hangs_right_below_the_target_does_not() -> None:
 def test_pictures_that_show_it_below_its_contact_clear_that() -> None:
     """Once, and not the time since which it has been without a position."""
     vehicle = Falling(HANG_Z_M, 0.0, 1.0)
-    come_down(vehicle, 5.0, contact_z_m=HANG_Z_M, in_reach_since_s=BEGIN_S - 1.5)
+    come_down(vehicle, 5.0, last_contact_body_z_m=HANG_Z_M, in_magnet_reach_since_s=BEGIN_S - 1.5)
     assert vehicle.state is not None
-    assert vehicle.state.belief.contact_z_m is None
-    assert vehicle.state.belief.dead_reckoned_s is not None
-    assert vehicle.state.belief.dead_reckoned_s < BEGIN_S + 4.0
+    assert vehicle.state.belief.last_contact_body_z_m is None
+    assert vehicle.state.belief.dead_reckoning_since_s is not None
+    assert vehicle.state.belief.dead_reckoning_since_s < BEGIN_S + 4.0

@@ -62,7 +62,7 @@ def landing(z_m: float = HANG_Z_M, phase: Phase = Phase.LANDING, **changes: Any)
 
 def hanging(phase: Phase = Phase.LANDING, **changes: Any) -> PlannerState:
     """The same, where the magnet may hold it."""
-    return landing(HANG_Z_M, phase, **{"contact_z_m": HANG_Z_M, **changes})
+    return landing(HANG_Z_M, phase, **{"last_contact_body_z_m": HANG_Z_M, **changes})
 
 
 # --- What presses, and what is on the floor ------------------------------------------------------
@@ -101,8 +101,8 @@ BITS = st.tuples(
 )
 STATES: tuple[dict[str, Any], ...] = (
     {},
-    {"contact_z_m": HANG_Z_M},
-    {"contact_z_m": HANG_Z_M, "released_s": 9.9},
+    {"last_contact_body_z_m": HANG_Z_M},
+    {"last_contact_body_z_m": HANG_Z_M, "released_s": 9.9},
     {"order_count": 2, "last_order_s": 9.9},
     {"hover_thrust": 0.0},
 )
@@ -293,7 +293,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
 ) -> None:
     """Not even where it was pressed before, and a contact seemed to be there; nor once the target
     that tells it is out of sight."""
-    begin = landing(HANG_Z_M - 0.2, phase, contact_z_m=HANG_Z_M - 0.2)
+    begin = landing(HANG_Z_M - 0.2, phase, last_contact_body_z_m=HANG_Z_M - 0.2)
     hand = InAHand(0.2, seen_until_s=seen_until_s)
     flight = fly(begin, hand, 20.0, PROFILES[positioning], feels=True)
     state = flight.state
@@ -319,7 +319,9 @@ def test_only_what_hangs_at_the_target_is_caught(
     distance_below_m: float, lateral_offset_m: float, sigma_m: float, to: Phase
 ) -> None:
     begin = landing(
-        HANG_Z_M - distance_below_m, Phase.RECOVER, contact_z_m=HANG_Z_M - distance_below_m
+        HANG_Z_M - distance_below_m,
+        Phase.RECOVER,
+        last_contact_body_z_m=HANG_Z_M - distance_below_m,
     )
     assert (
         fly(
@@ -395,7 +397,7 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     pressing = landing(phase=Phase.PERCH, since={CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
-    obs = observation(10.02, telemetry=tel, imu=ImuMotion(steady_s=steady_s))
+    obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_steady_since_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
     assert (after.belief.contact is not None) is touched
@@ -405,7 +407,7 @@ def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_reco
     """Steady because it sticks there, the next attempt would begin pressed."""
     touched = hanging(Phase.RECOVER, contact=ContactOffset(0.01, 0.02))
     state = fly(touched, at(HANG_Z_M - 0.1)).state
-    assert (state.belief.contact_z_m, state.belief.contact) == (None, None)
+    assert (state.belief.last_contact_body_z_m, state.belief.contact) == (None, None)
     assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
@@ -453,7 +455,7 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     """The supervisor's word, or the thrust, reads as before the stop. Nothing spins up again."""
     stopped = hanging(
         Phase.COMPLETE,
-        in_reach_since_s=9.0,
+        in_magnet_reach_since_s=9.0,
         released_s=9.0,
         stopped_s=10.0,
         last_order_s=10.0,

@@ -138,7 +138,9 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
         )
         imu = imu.with_sample(last, sample)
         last = sample
-        reckoning = advance_reckoning(reckoning, imu, sample, believed=True, corrected=True)
+        reckoning = advance_reckoning(
+            reckoning, imu, sample, is_estimate_believed=True, is_position_correcting_velocity=True
+        )
     (bx, by, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_lateral_mps2
     assert (bx - x_mps2) / 9.81 == pytest.approx(-wind_g * math.cos(towards_rad), abs=0.01)
     assert (by - y_mps2) / 9.81 == pytest.approx(-wind_g * math.sin(towards_rad), abs=0.01)

@@ -206,9 +206,9 @@ def test_a_log_keeps_its_keys_whatever_the_program_calls_a_field() -> None:
     now = turn_fields()
     for owner, keys in read_log(CORPUS / "hovered.jsonl.gz").header["turn_fields"].items():
         assert set(keys) <= set(now[owner])
-    written = {each.owner: set[str]() for each in exact_fields(Turn)}
-    for each in exact_fields(Turn):
-        written[each.owner].add(each.name)
+    written: dict[str, set[str]] = {}
+    for each in exact_fields(Turn) + exact_fields(SentCommand):
+        written.setdefault(each.owner, set()).add(each.name)
     for kind, keys in FIELD_KEYS.items():
         assert set(keys.values()) <= written[CLASS_KEYS.get(kind, kind)]
     assert set(CLASS_KEYS.values()) <= written.keys()

@@ -1,13 +1,13 @@
 """Estimate the battery's charge from its voltage readings.
 
 A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
-voltage as a function of its charge (`REST_VOLTAGES_V`) and the current at full thrust (`Drive`). It
-fits two parameters by least squares with exponential forgetting: the voltage sag at full thrust,
-and `discharge_factor`, the factor by which this battery discharges faster than the assumed current
-predicts:
+voltage as a function of its charge (`REST_VOLTAGES_V`) and the current at full thrust
+(`PowerTrain`). It fits two parameters by least squares with exponential forgetting: the voltage sag
+at full thrust, and `discharge_rate_factor`, the factor by which this battery discharges faster than
+the assumed current predicts:
 
     reading = rest voltage(charge) - sag * load
-    d charge / dt = -discharge_factor * load * current / capacity
+    d charge / dt = -discharge_rate_factor * load * current / capacity
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ CHARGE_FRACTIONS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9
 REST_VOLTAGES_V = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
 """Resting voltage of a cell, V, at each charge in `CHARGE_FRACTIONS` (0..1); slightly below the
 table in the firmware."""
-TYPICAL_SAG_V = 0.63
+TYPICAL_FULL_THRUST_SAG_V = 0.63
 """Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
 battery could finish."""
-SAG_SIGMA_V = 0.3
+FULL_THRUST_SAG_SIGMA_V = 0.3
 """Standard deviation of the sag between batteries, V. Smaller: the fit recognizes a worn battery
 late."""
-MIN_SAG_V = 0.2
+MIN_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
-TYPICAL_DISCHARGE_FACTOR = 1.1
+TYPICAL_DISCHARGE_RATE_FACTOR = 1.1
 """Factor by which a typical battery discharges faster than the assumed current predicts."""
-DISCHARGE_FACTOR_SIGMA = 0.3
+DISCHARGE_RATE_FACTOR_SIGMA = 0.3
 """Standard deviation of that factor between batteries."""
-MIN_DISCHARGE_FACTOR = 1.0
+MIN_DISCHARGE_RATE_FACTOR = 1.0
 """Lower bound of the fitted discharge factor."""
-MAX_DISCHARGE_FACTOR = 3.0
+MAX_DISCHARGE_RATE_FACTOR = 3.0
 """Upper bound of the fitted discharge factor."""
 VOLTAGE_READING_SIGMA_V = 0.02
 """Standard deviation of one second of averaged voltage readings, V."""
@@ -47,17 +47,17 @@ BATTERY_FIT_TIME_CONSTANT_S = 40.0
 temperature late."""
 REST_VOLTAGE_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
-VOLTAGE_LAG_S = 0.3
+VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 """Time constant with which the voltage reading follows a change of thrust, s."""
-MAX_LOAD_DEVIATION = 0.06
+MAX_STEADY_THRUST_DEVIATION_FRACTION = 0.06
 """Largest difference between the current load and the filtered load, as a share of full thrust. A
 reading with a larger difference belongs to an earlier thrust and is not used."""
-MIN_COUNTED_CHARGE = 0.05
+MIN_CHARGE_FOR_COUNTING_FRACTION = 0.05
 """Charge below which the count of the consumed charge is not used: the voltage curve is so steep
 there that the readings alone determine the consumed charge."""
-MIN_FIT_LOAD = 0.2
+MIN_FIT_THRUST_FRACTION = 0.2
 """Smallest load, as a share of full thrust, at which a reading contributes to the fitted sag."""
-MIN_LOADED_S = 1.0
+MIN_TIME_UNDER_LOAD_S = 1.0
 """Time of readings under load that an estimate requires, s."""
 MAX_BATTERY_READING_AGE_S = 1.0
 """Age at which a voltage reading is no longer used, s."""
@@ -68,26 +68,27 @@ class BatteryFit:
     """State of the battery fit after the newest reading.
 
     Charges are shares of the full charge; loads are shares of full thrust. `fit_sums` holds the
-    normal equations of the least-squares fit: the sums of sag^2, sag * discharge_factor and
-    discharge_factor^2, then the two right-hand sides.
+    normal equations of the least-squares fit: the sums of sag^2, sag * discharge_rate_factor and
+    discharge_rate_factor^2, then the two right-hand sides.
     """
 
     # resting voltage before take-off, estimated if the first reading was under load
     takeoff_rest_v: float | None = None
-    counted_discharge: float = 0.0  # charge consumed by the assumed current alone
-    load: float = 0.0  # load, low-pass filtered with `VOLTAGE_LAG_S` as the reading is
-    mean_load: float = 0.0  # mean over the last seconds in the air
+    counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
+    # load, low-pass filtered with `VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
+    filtered_thrust_fraction: float = 0.0
+    mean_thrust_fraction: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
-    loaded_s: float = 0.0  # total time of readings under load
+    time_under_load_s: float = 0.0  # total time of readings under load
     no_reading_s: float = 0.0  # time since the last reading
-    fit_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    normal_equation_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # --- Brushed and brushless motors ---
 
 
 @dataclass(frozen=True)
-class Drive:
+class PowerTrain:
     """Motor type and its power supply.
 
     Attributes:
@@ -98,18 +99,18 @@ class Drive:
     """
 
     full_thrust_current_a: float
-    low_power_v: float
+    low_power_warning_v: float
 
 
-BRUSHED = Drive(full_thrust_current_a=4.4, low_power_v=3.2)
+BRUSHED = PowerTrain(full_thrust_current_a=4.4, low_power_warning_v=3.2)
 """Drive of the vehicles with brushed motors, which arm themselves."""
-BRUSHLESS = Drive(full_thrust_current_a=7.3, low_power_v=3.35)
+BRUSHLESS = PowerTrain(full_thrust_current_a=7.3, low_power_warning_v=3.35)
 """The current of the brushless motors is not published. The value assumes the same current per
 newton as the brushed motors (0.80 N at full thrust, 0.48 N brushed). It is an upper bound because
 brushless motors are designed to be more efficient."""
 
 
-def identify_drive(telemetry: Telemetry) -> Drive:
+def identify_power_train(telemetry: Telemetry) -> PowerTrain:
     """Return the vehicle's drive: motors that start only after an arming request are brushless."""
     return BRUSHED if telemetry.has_bit(AUTO_ARM) else BRUSHLESS
 
@@ -118,13 +119,13 @@ def identify_drive(telemetry: Telemetry) -> Drive:
 
 
 def update_from_telemetry(
-    old: BatteryFit, telemetry: Telemetry, age_s: float, dt_s: float, battery_mah: float
+    old: BatteryFit, telemetry: Telemetry, reading_age_s: float, dt_s: float, battery_mah: float
 ) -> BatteryFit:
     """Return the state after the battery reading in a sample that follows the previous one by
     `dt_s`. A reading whose age `age_s` exceeds `MAX_BATTERY_READING_AGE_S` counts as missing."""
-    reading_v = telemetry.battery_v if age_s <= MAX_BATTERY_READING_AGE_S else math.nan
-    drive = identify_drive(telemetry)
-    return update_battery_fit(old, dt_s, reading_v, telemetry.thrust, battery_mah, drive)
+    reading_v = telemetry.battery_v if reading_age_s <= MAX_BATTERY_READING_AGE_S else math.nan
+    power_train = identify_power_train(telemetry)
+    return update_battery_fit(old, dt_s, reading_v, telemetry.thrust, battery_mah, power_train)
 
 
 def update_battery_fit(
@@ -133,7 +134,7 @@ def update_battery_fit(
     battery_v: float,
     thrust: float,
     battery_mah: float,
-    drive: Drive,
+    power_train: PowerTrain,
 ) -> BatteryFit:
     """Return the state `dt_s` later, with the commanded thrust (0..65535) and a capacity of
     `battery_mah`.
@@ -141,16 +142,21 @@ def update_battery_fit(
     A `battery_v` that is NaN or that no cell can have counts as missing. The estimate then falls
     with the charge that the thrust consumes.
     """
-    load = max(0.0, min(1.0, thrust / FULL_THRUST))
+    thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
-        counted_discharge=state.counted_discharge
-        + load * full_thrust_discharge_per_s(battery_mah, drive) * dt_s,
-        load=_low_pass(state.load, load, dt_s / VOLTAGE_LAG_S),
+        counted_discharge_fraction=state.counted_discharge_fraction
+        + thrust_fraction * full_thrust_discharge_per_s(battery_mah, power_train) * dt_s,
+        filtered_thrust_fraction=_low_pass(
+            state.filtered_thrust_fraction, thrust_fraction, dt_s / VOLTAGE_LAG_TIME_CONSTANT_S
+        ),
     )
-    if load >= MIN_FIT_LOAD:
-        known = dt_s / 3.0 if state.mean_load else 1.0
-        state = replace(state, mean_load=_low_pass(state.mean_load, load, known))
+    if thrust_fraction >= MIN_FIT_THRUST_FRACTION:
+        known = dt_s / 3.0 if state.mean_thrust_fraction else 1.0
+        state = replace(
+            state,
+            mean_thrust_fraction=_low_pass(state.mean_thrust_fraction, thrust_fraction, known),
+        )
     # reduce the last estimate by the charge that the thrust consumes
     if not is_battery_reading(battery_v):
         state = replace(state, no_reading_s=state.no_reading_s + dt_s)
@@ -158,22 +164,27 @@ def update_battery_fit(
             return state
         spent = (
             fit_sag_model(state)[1]
-            * state.load
-            * full_thrust_discharge_per_s(battery_mah, drive)
+            * state.filtered_thrust_fraction
+            * full_thrust_discharge_per_s(battery_mah, power_train)
             * dt_s
         )
         return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
     state = replace(state, no_reading_s=0.0)
-    if load == 0.0 and not state.loaded_s:
+    if thrust_fraction == 0.0 and not state.time_under_load_s:
         return replace(state, takeoff_rest_v=battery_v, rest_v=battery_v)
-    if abs(load - state.load) > MAX_LOAD_DEVIATION:
+    if abs(thrust_fraction - state.filtered_thrust_fraction) > MAX_STEADY_THRUST_DEVIATION_FRACTION:
         return state
     if state.takeoff_rest_v is None:
-        state = replace(state, takeoff_rest_v=battery_v + TYPICAL_SAG_V * state.load)
-    if state.load >= MIN_FIT_LOAD:
-        fit = _add_reading(state, dt_s, battery_v)
-        state = replace(state, fit_sums=fit, loaded_s=state.loaded_s + dt_s)
-    now_v = battery_v + fit_sag_model(state)[0] * state.load
+        state = replace(
+            state,
+            takeoff_rest_v=battery_v + TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction,
+        )
+    if state.filtered_thrust_fraction >= MIN_FIT_THRUST_FRACTION:
+        fit = _add_reading_to_fit_sums(state, dt_s, battery_v)
+        state = replace(
+            state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
+        )
+    now_v = battery_v + fit_sag_model(state)[0] * state.filtered_thrust_fraction
     rest_v = (
         now_v
         if state.rest_v is None
@@ -186,14 +197,14 @@ def fit_sag_model(state: BatteryFit) -> tuple[float, float]:
     """Return the sag at full thrust, V, and the discharge factor by which the charge falls
     faster than counted: a least-squares fit to the readings, regularized by the typical values and
     bounded."""
-    a, b, c, p, q = state.fit_sums
-    a += SAG_SIGMA_V**-2
-    c += DISCHARGE_FACTOR_SIGMA**-2
+    a, b, c, p, q = state.normal_equation_sums
+    a += FULL_THRUST_SAG_SIGMA_V**-2
+    c += DISCHARGE_RATE_FACTOR_SIGMA**-2
     det = a * c - b * b
-    sag_v = TYPICAL_SAG_V + (c * p - b * q) / det
-    discharge_factor = TYPICAL_DISCHARGE_FACTOR + (a * q - b * p) / det
-    return max(MIN_SAG_V, sag_v), min(
-        MAX_DISCHARGE_FACTOR, max(MIN_DISCHARGE_FACTOR, discharge_factor)
+    sag_v = TYPICAL_FULL_THRUST_SAG_V + (c * p - b * q) / det
+    discharge_rate_factor = TYPICAL_DISCHARGE_RATE_FACTOR + (a * q - b * p) / det
+    return max(MIN_FULL_THRUST_SAG_V, sag_v), min(
+        MAX_DISCHARGE_RATE_FACTOR, max(MIN_DISCHARGE_RATE_FACTOR, discharge_rate_factor)
     )
 
 
@@ -202,9 +213,9 @@ def charge_from_rest_v(rest_v: float) -> float:
     return min(1.0, max(0.0, _interpolate(REST_VOLTAGES_V, CHARGE_FRACTIONS, rest_v)))
 
 
-def rest_v_from_charge(share: float) -> float:
+def rest_v_from_charge(charge_fraction: float) -> float:
     """Return the resting voltage, V, of a cell with the charge `share` (0..1)."""
-    return _interpolate(CHARGE_FRACTIONS, REST_VOLTAGES_V, share)
+    return _interpolate(CHARGE_FRACTIONS, REST_VOLTAGES_V, charge_fraction)
 
 
 def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
@@ -212,36 +223,38 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
     return ys[i - 1] + (x - xs[i - 1]) * (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
 
 
-def _add_reading(
+def _add_reading_to_fit_sums(
     state: BatteryFit, dt_s: float, battery_v: float
 ) -> tuple[float, float, float, float, float]:
     """Return `BatteryFit.fit_sums` after one more reading, as deviations from the typical
     values."""
     assert state.takeoff_rest_v is not None
     begun = charge_from_rest_v(state.takeoff_rest_v)
-    counted = max(min(begun, MIN_COUNTED_CHARGE), begun - state.counted_discharge)
+    counted = max(
+        min(begun, MIN_CHARGE_FOR_COUNTING_FRACTION), begun - state.counted_discharge_fraction
+    )
     spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
     off_v = (
         state.takeoff_rest_v
         - battery_v
-        - TYPICAL_SAG_V * state.load
-        - TYPICAL_DISCHARGE_FACTOR * spent_v
+        - TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction
+        - TYPICAL_DISCHARGE_RATE_FACTOR * spent_v
     )
     weight, keep = dt_s / VOLTAGE_READING_SIGMA_V**2, math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S)
-    a, b, c, p, q = (keep * each for each in state.fit_sums)
+    a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
     return (
-        a + weight * state.load * state.load,
-        b + weight * state.load * spent_v,
+        a + weight * state.filtered_thrust_fraction * state.filtered_thrust_fraction,
+        b + weight * state.filtered_thrust_fraction * spent_v,
         c + weight * spent_v * spent_v,
-        p + weight * state.load * off_v,
+        p + weight * state.filtered_thrust_fraction * off_v,
         q + weight * spent_v * off_v,
     )
 
 
-def full_thrust_discharge_per_s(battery_mah: float, drive: Drive) -> float:
+def full_thrust_discharge_per_s(battery_mah: float, power_train: PowerTrain) -> float:
     """Return the share of the full charge that one second of full thrust consumes."""
-    return drive.full_thrust_current_a / (3.6 * battery_mah)
+    return power_train.full_thrust_current_a / (3.6 * battery_mah)
 
 
-def _low_pass(value: float, goal: float, part: float) -> float:
-    return value + min(1.0, part) * (goal - value)
+def _low_pass(value: float, new_value: float, weight: float) -> float:
+    return value + min(1.0, weight) * (new_value - value)

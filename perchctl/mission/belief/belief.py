@@ -19,24 +19,24 @@ from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.belief.target import TargetBelief, TargetMotion
+from perchctl.mission.belief.target import TargetBelief, VisualMotion
 from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.observation import Mismatch, Observation
 from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
-POSITION_SETTLING_S = 0.5
+POSITION_SETTLING_AFTER_GAP_S = 0.5
 """Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
 trusted before it has converged."""
-MAX_CORRECTION_AGE_S = 0.13
+MAX_FUSED_POSITION_EXTRA_AGE_S = 0.13
 """How much older than the camera's latency the newest position may be while it still corrects the
 estimate, s: three pictures at 30 per second. Larger: `is_displaced` reacts to a blow later."""
-MIN_GUST_SPEED_MPS = 0.2
+GUST_SPEED_THRESHOLD_MPS = 0.2
 """Speed gained without a sighting that counts as a blow or gust, m/s; flights without a fault show
 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
-GUST_SPEED_PER_LATENCY_SIGMA_MPS2 = 2.0
-"""Increase of the `MIN_GUST_SPEED_MPS` threshold, in m/s per second of the latency's standard
+GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
+"""Increase of the `GUST_SPEED_THRESHOLD_MPS` threshold, in m/s per second of the latency's standard
 deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
 uncertain latency, blows go unnoticed."""
 THRUST_REPORT_DELAY_S = 0.2
@@ -79,34 +79,36 @@ class Belief:
 
     # --- world frame of the state estimate, and how far to trust it ---
     takeoff_position_m: Vector | None = None  #: position where the flight started
-    first_jump_s: float | None = None  #: first jump of the state estimate
-    frame_shift_m: Vector = ZERO  #: motion of the estimate's world frame in this tick
-    last_stale_s: float | None = None  #: last time at which the position was stale
+    first_estimate_jump_at_s: float | None = None  #: first jump of the state estimate
+    world_frame_shift_m: Vector = ZERO  #: motion of the estimate's world frame in this tick
+    position_last_stale_at_s: float | None = None  #: last time at which the position was stale
     #: external positions lead away from the setpoint and count as no evidence from then on
-    diverged: bool = False
+    is_position_diverged: bool = False
     #: heading is so wrong that position control would leave its setpoint
     heading_lost: bool = False
     #: time since which only accelerometer and attitude are used
-    dead_reckoned_s: float | None = None
-    reckoned_height_m: float = 0.0  #: height above the ground, integrated since `dead_reckoned_s`
+    dead_reckoning_since_s: float | None = None
+    #: height above the ground, integrated since `dead_reckoning_since_s`
+    reckoned_height_m: float = 0.0
 
     # --- motion, target and contact ---
     reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     last_target_world_m: Array | None = None  #: target's world position in its last measured frame
-    target_spread_m: float = 0.0  #: distance between the targets of successive frames
+    target_position_scatter_m: float = 0.0  #: distance between the targets of successive frames
     #: vehicle's velocity from pictures alone
-    target_motion: TargetMotion = field(default_factory=TargetMotion)
+    visual_motion: VisualMotion = field(default_factory=VisualMotion)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     #: low-passed `lean`, with the time constant `LEAN_TIME_CONSTANT_S`
-    mean_lean: tuple[float, float] = (0.0, 0.0)
-    contact_z_m: float | None = None  #: height of the body where the magnet may hold it
+    mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
+    last_contact_body_z_m: float | None = None  #: height of the body where the magnet may hold it
     contact: ContactOffset | None = None  #: offset at the last contact
-    in_reach_since_s: float | None = None  #: time since which the gear is within the magnet's reach
+    #: time since which the gear is within the magnet's reach
+    in_magnet_reach_since_s: float | None = None
     #: start time of each true condition
     since: dict[Condition[Any], float] = field(default_factory=dict)
 
     # --- thrust and battery ---
-    hover: HoverThrust = field(default_factory=HoverThrust)
+    hover_thrust_estimate: HoverThrust = field(default_factory=HoverThrust)
     #: thrust that the rotors produce, 0..65535; None before a sample
     rotor_thrust: float | None = None
     #: time since which the reported thrust differs from the ordered one
@@ -158,7 +160,7 @@ class Belief:
         """Age of the oldest part of the telemetry, s; a frozen reading is as old as its first
         sample."""
         tel, imu = self.obs.telemetry, self.obs.imu
-        oldest_s = max(tel.behind_s, imu.stuck_attitude_s, imu.stuck_position_s)
+        oldest_s = max(tel.behind_s, imu.only_attitude_frozen_for_s, imu.only_position_frozen_for_s)
         return self.obs.t_s - tel.t_s + oldest_s
 
     @cached_property
@@ -169,7 +171,7 @@ class Belief:
     # --- Reliability of the position ---
 
     @cached_property
-    def is_target_positioned(self) -> bool:
+    def is_positioned_by_target(self) -> bool:
         """True if the positions come from the target itself, without a deck or motion capture."""
         return self.profile.positioning.source.is_target
 
@@ -196,7 +198,7 @@ class Belief:
         return variance if variance >= 0.0 else math.inf
 
     @cached_property
-    def is_variance_too_large(self) -> bool:
+    def is_estimate_variance_too_large(self) -> bool:
         """True if the variance of velocity or position is too large for position control."""
         safety = self.profile.safety
         return (
@@ -209,7 +211,7 @@ class Belief:
         """Age, s, of the newest external position sent to the vehicle; with decks, age of the
         newest correction of the state estimate."""
         if self.profile.positioning.source.is_deck:
-            return max(self.obs.position_age_s, self.obs.imu.corrections.age_s(self.obs.t_s))
+            return max(self.obs.position_age_s, self.obs.imu.fusion_age.age_s(self.obs.t_s))
         return self.obs.position_age_s
 
     @cached_property
@@ -220,12 +222,14 @@ class Belief:
     @cached_property
     def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `POSITION_SETTLING_S`, have not diverged and, if they come from pictures, agree with the
-        accelerometer."""
-        doubted = self.diverged or (self.is_target_positioned and self.obs.mismatch is not None)
+        `POSITION_SETTLING_AFTER_GAP_S`, have not diverged and, if they come from pictures, agree
+        with the accelerometer."""
+        doubted = self.is_position_diverged or (
+            self.is_positioned_by_target and self.obs.mismatch is not None
+        )
         returns = (
-            self.last_stale_s is not None
-            and self.obs.t_s - self.last_stale_s <= POSITION_SETTLING_S
+            self.position_last_stale_at_s is not None
+            and self.obs.t_s - self.position_last_stale_at_s <= POSITION_SETTLING_AFTER_GAP_S
         )
         return not (doubted or self.is_position_stale or returns)
 
@@ -236,25 +240,32 @@ class Belief:
         return self.is_position_trusted and self.is_telemetry_fresh
 
     @cached_property
-    def latency_s(self) -> float:
+    def camera_latency_s(self) -> float:
         """Age of a frame on arrival, s: the camera latency in use."""
         return self.profile.camera.start_latency_s + self.obs.delay_s
 
     @cached_property
-    def is_velocity_corrected(self) -> bool:
+    def is_position_correcting_velocity(self) -> bool:
         """True while the newest position still corrects the estimated velocity: it is at most
-        `MAX_CORRECTION_AGE_S` older than the latency."""
-        return self.position_age_s <= self.latency_s + MAX_CORRECTION_AGE_S
+        `MAX_FUSED_POSITION_EXTRA_AGE_S` older than the latency."""
+        return self.position_age_s <= self.camera_latency_s + MAX_FUSED_POSITION_EXTRA_AGE_S
 
     @cached_property
-    def is_displaced(self) -> bool:
+    def has_uncorrected_gust(self) -> bool:
         """True after a blow or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
         is_reckoned = self.reckoning.imu is not None
-        if not (self.is_target_positioned and is_reckoned and not self.is_velocity_corrected):
+        if not (
+            self.is_positioned_by_target
+            and is_reckoned
+            and not self.is_position_correcting_velocity
+        ):
             return False
-        least_mps = MIN_GUST_SPEED_MPS + GUST_SPEED_PER_LATENCY_SIGMA_MPS2 * self.obs.delay_sigma_s
-        return math.hypot(*self.reckoning.imu_only_mps) > least_mps
+        least_mps = (
+            GUST_SPEED_THRESHOLD_MPS
+            + GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.delay_sigma_s
+        )
+        return math.hypot(*self.reckoning.lateral_gain_of_imu_only_mps) > least_mps
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
@@ -263,7 +274,7 @@ class Belief:
         return (
             self.obs.link_problem is not None
             or self.telemetry_age_s > safety.telemetry_hold_s
-            or self.first_jump_s is not None
+            or self.first_estimate_jump_at_s is not None
             or self.obs.loop_late_s > safety.loop_late_hold_s
         )
 
@@ -272,26 +283,26 @@ class Belief:
         """True if the position from the target is good enough for a descent."""
         return (
             self.is_position_trusted
-            and not self.is_displaced
+            and not self.has_uncorrected_gust
             and not self.is_flight_data_unreliable
         )
 
     @cached_property
-    def has_lost_position(self) -> bool:
+    def has_no_position_for_descent(self) -> bool:
         """True if only accelerometer and attitude remain for a descent."""
-        if self.is_target_positioned:
+        if self.is_positioned_by_target:
             return not self.can_descend_by_target
-        return not (self.is_position_trusted or self.diverged)
+        return not (self.is_position_trusted or self.is_position_diverged)
 
     @cached_property
     def can_descend_by_position(self) -> bool:
         """True if the vehicle can descend under position control."""
-        lost = self.diverged or self.dead_reckoned_s is not None
-        if lost or (self.is_target_positioned and not self.can_descend_by_target):
+        lost = self.is_position_diverged or self.dead_reckoning_since_s is not None
+        if lost or (self.is_positioned_by_target and not self.can_descend_by_target):
             return False
         # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
-        return not (self.heading_lost and (self.is_target_positioned or heard))
+        return not (self.heading_lost and (self.is_positioned_by_target or heard))
 
     # --- Motion ---
 
@@ -329,7 +340,7 @@ class Belief:
         return vx_mps, vy_mps, vz_mps
 
     @cached_property
-    def lean(self) -> tuple[float, float]:
+    def lean_sine_world_xy(self) -> tuple[float, float]:
         """Level part (x, y) of the direction of thrust in world axes: the sine of the tilt, towards
         where the vehicle leans."""
         tel = self.obs.telemetry
@@ -339,12 +350,12 @@ class Belief:
         return cos_yaw * level_x - sin_yaw * level_y, sin_yaw * level_x + cos_yaw * level_y
 
     @cached_property
-    def lean_acceleration_mps2(self) -> tuple[float, float]:
+    def acceleration_from_lean_mps2(self) -> tuple[float, float]:
         """Lateral acceleration (x, y) in world axes, m/s^2, of a hovering vehicle that leans away
         from its mean lean. The mean lean causes no acceleration: it balances the wind, an
         unbalanced vehicle, or an error of the estimated attitude. After a change of the wind, the
         result is wrong until the mean has followed."""
-        (x, y), (mean_x, mean_y) = self.lean, self.mean_lean
+        (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
     @cached_property
@@ -357,17 +368,17 @@ class Belief:
         """Vertical speed, m/s: from the state estimate while it is valid, otherwise from the
         accelerometer."""
         is_reckoned = self.reckoning.imu is not None
-        if is_reckoned and (self.dead_reckoned_s is not None or not self.is_position_valid):
+        if is_reckoned and (self.dead_reckoning_since_s is not None or not self.is_position_valid):
             return self.reckoning.velocity_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 
-    def is_sinking(self, mps: float) -> bool:
+    def is_sinking(self, min_sink_mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`.
 
         Without a valid position, the speed counts only while the accelerometer also reads less than
         the weight.
         """
-        if self.climb_mps >= -mps:
+        if self.climb_mps >= -min_sink_mps:
             return False
         light_g = 1.0 - self.profile.planner.perch.contact_acc_g
         return self.is_position_valid or self.obs.telemetry.acc_z_g < light_g
@@ -375,7 +386,7 @@ class Belief:
     @property
     def hover_thrust(self) -> float:
         """The estimated hover thrust, 0..65535; 0 while unknown."""
-        return self.hover.thrust
+        return self.hover_thrust_estimate.thrust
 
     @cached_property
     def is_thrust_known(self) -> bool:
@@ -391,7 +402,7 @@ class Belief:
     def target(self) -> TargetBelief:
         """The belief about the target, from the pipeline's newest estimate."""
         return TargetBelief.from_estimate(
-            self.obs.target, self.obs.t_s, self.latency_s, self.profile
+            self.obs.target, self.obs.t_s, self.camera_latency_s, self.profile
         )
 
     @cached_property
@@ -403,18 +414,18 @@ class Belief:
     @cached_property
     def sighting_age_s(self) -> float:
         """Seconds since the exposure of the last picture that shows the target."""
-        return max(0.0, self.obs.t_s - self.reckoning.sighting_s)
+        return max(0.0, self.obs.t_s - self.reckoning.last_sighting_at_s)
 
     @cached_property
-    def is_camera_consistent(self) -> bool:
+    def is_camera_motion_consistent(self) -> bool:
         """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
         the target is the positioning system, otherwise with its state estimate."""
-        if self.is_target_positioned:
+        if self.is_positioned_by_target:
             return self.obs.felt is not None and self.obs.mismatch is None
-        return not (self.mounting.is_unconfirmed or self.mounting.is_wrong)
+        return not (self.mounting.is_awaiting_evidence or self.mounting.is_wrong)
 
     @property
     def is_in_magnet_reach(self) -> bool:
         """True if the magnet may hold the vehicle: after a contact, or once dead reckoning places
         the gear within its reach."""
-        return self.contact_z_m is not None or self.in_reach_since_s is not None
+        return self.last_contact_body_z_m is not None or self.in_magnet_reach_since_s is not None

@@ -8,12 +8,11 @@ distinguish the magnet from the floor, and both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
-height (`CONTACT`), against an obstacle if its setpoint is above it (`BLOCKED`), and against an
-unknown object without a position (`SUPPORTED_BY_IMU`). The last one also covers too little thrust,
-by the same threshold below hover thrust as the other is above it: `PRESS_THRUST_RATIO` moves all of
-these, and `Support.AIR`.
-`HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
-(`is_thrust_too_low_to_fly`).
+height (`CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and against
+an unknown object without a position (`SUPPORT_SHOWN_BY_IMU`). The last one also covers too little
+thrust, by the same threshold below hover thrust as the other is above it: `PRESS_THRUST_RATIO`
+moves all of these, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too
+small to support the vehicle (`is_thrust_too_low_to_fly`).
 
 `find_support` says in one word what these conditions show: the vehicle flies, presses, hangs on the
 magnet, hangs on something else, stands, or it is unknown. How long the evidence has lasted is the
@@ -26,7 +25,7 @@ import math
 from enum import Enum
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
-from perchctl.mission.belief.evidence import Condition, Dependency
+from perchctl.mission.belief.evidence import Condition, RequiredData
 from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
@@ -36,24 +35,24 @@ PRESS_THRUST_RATIO = 1.08
 """Multiple of hover thrust above which a vehicle at rest is pressing: more than five standard
 deviations of the hover thrust learned in quiet flight. Larger: a weak press goes undetected.
 Smaller: a gust or a sagging battery looks like a press."""
-PRESS_SATURATION_FRACTION = 0.98
+SATURATED_FRACTION_OF_FULL_THRUST = 0.98
 """Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
 much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-PRESS_PROOF_FRACTION = 0.99
+PRESSING_FRACTION_OF_RAW_THRUST = 0.99
 """Share of a raw press's ordered thrust that always counts as pressing. Larger: a reading just
 below the ordered thrust goes undetected. Smaller: a heavy vehicle seems to press while it
 hovers."""
-MAX_PROVABLE_HOVER_FRACTION = 0.93
+MAX_HOVER_FRACTION_TO_PROVE_PRESS = 0.93
 """Hover thrust, as a share of full thrust, above which more thrust is no evidence of a press.
 Smaller: a press is never detected on a heavy vehicle."""
-MAX_NON_LIFTING_FRACTION = 0.8
+MAX_NON_LIFTING_HOVER_FRACTION = 0.8
 """Share of hover thrust up to which thrust cannot hold the vehicle in the air; above it, the ground
 effect of the ceiling may."""
 MAX_MOTORS_STOPPED_THRUST = 5000
 """Largest raw thrust, 0..65535, at which the motors stand still."""
-MIN_HOVER_THRUST = 1000
+MIN_FLYING_THRUST = 1000
 """Raw thrust, 0..65535, below which nothing flies."""
 
 # --- motion and position ---
@@ -64,25 +63,25 @@ MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
 MAX_HOVER_CLIMB_MPS = 0.27
 """Largest vertical speed at which the thrust is hover thrust, m/s."""
-MAX_HOVER_ACCELERATION_G = 0.1
+MAX_HOVER_DEVIATION_FROM_1G_G = 0.1
 """Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
-PRESS_HEIGHT_DRIFT_MPS = 0.1
+MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
-MIN_PRESS_SETPOINT_HEIGHT_M = 0.08
+MIN_SETPOINT_ABOVE_TO_PRESS_M = 0.08
 """Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
 climb is detected late."""
-TOUCH_SIGMA_M = 0.001
+TOUCH_OFFSET_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
-DECK_IMPACT_SIGMA_M = 0.002
+POSITION_DECK_IMPACT_SIGMA_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
-DECK_SIGMA_GROWTH_MPS = 0.01
+POSITION_DECK_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-MAX_UPWARD_DRIFT_M = 0.02
+MAX_UPWARD_DRIFT_DURING_SLIP_M = 0.02
 """Upward drift of the estimate in spite of which a slip is still detected, m."""
-MIN_DESCENT_M = 0.1
+MIN_DESCENT_BEFORE_FLOOR_M = 0.1
 """Distance below its start at which a descent counts as under way, m."""
-MAX_HELD_DESCENT_M = 0.1
+MAX_DESCENT_WHILE_HELD_M = 0.1
 """Distance from its start within which a vehicle in a descent may still be held there, m."""
 MAX_FLOOR_SUPPORT_HEIGHT_M = 0.3
 """Height above which the floor cannot be the support, m."""
@@ -96,12 +95,12 @@ MIN_ON_FLOOR_ERROR_Z_M = 0.3
 """Least height difference to the target of a vehicle that stands on the floor, m."""
 RELEASED_FALL_MPS = -0.05
 """Vertical speed below which a released vehicle with a low specific force is falling, m/s."""
-FULL_THRUST_FALL_MPS = -0.15
+FALLING_AT_FULL_THRUST_MPS = -0.15
 """Vertical speed below which a vehicle at full thrust is falling instead of being too weak to
 climb, m/s."""
 
 # --- time ---
-MOTORS_OFF_TIMEOUT_S = 5.0
+MOTORS_OFF_AFTER_STOP_ORDER_S = 5.0
 """Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
 s."""
 MOTORS_OFF_DWELL_S = 0.1
@@ -114,19 +113,23 @@ HANGING_DWELL_S = 1.0
 # --- Offset of the gear from the target ---
 
 
-def contact_offset(b: Belief) -> ContactOffset:
+def current_gear_offset(b: Belief) -> ContactOffset:
     """Return the gear's offset from the target's axis, with its standard deviation. With decks, the
     deviation grows after the last sighting because the estimate drifts and the impact on the
     ceiling disturbs it."""
     reckoning = b.reckoning
-    sigma_m = math.hypot(reckoning.lateral_sigma_m, TOUCH_SIGMA_M, *reckoning.position_step_sum_m)
+    sigma_m = math.hypot(
+        reckoning.lateral_sigma_m, TOUCH_OFFSET_SIGMA_M, *reckoning.position_step_sum_xy_m
+    )
     if b.profile.positioning.source.is_deck and b.is_position_valid:
-        sigma_m = math.hypot(sigma_m, DECK_IMPACT_SIGMA_M, DECK_SIGMA_GROWTH_MPS * b.sighting_age_s)
+        sigma_m = math.hypot(
+            sigma_m, POSITION_DECK_IMPACT_SIGMA_M, POSITION_DECK_SIGMA_GROWTH_MPS * b.sighting_age_s
+        )
     return ContactOffset(math.hypot(*reckoning.lateral_offset_m), sigma_m)
 
 
-def last_touch_offset(b: Belief) -> ContactOffset | None:
-    """Return the `contact_offset` of the last touch, during a retreat only. None with a fresh
+def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
+    """Return the `current_gear_offset` of the last touch, during a retreat only. None with a fresh
     sighting, or once motion capture shows that the vehicle has left the position of that touch."""
     if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
         return None
@@ -138,12 +141,12 @@ def last_touch_offset(b: Belief) -> ContactOffset | None:
     return b.contact
 
 
-def newest_contact_offset(b: Belief) -> ContactOffset:
+def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
     """Return the offset of the last touch while it is valid, otherwise the current offset."""
-    return last_touch_offset(b) or contact_offset(b)
+    return gear_offset_at_last_touch(b) or current_gear_offset(b)
 
 
-def possible_contact_tolerance_m(b: Belief) -> float:
+def contact_height_tolerance_m(b: Belief) -> float:
     """Return the height difference (m) between gear and target up to which a support may be a
     contact.
 
@@ -152,18 +155,20 @@ def possible_contact_tolerance_m(b: Belief) -> float:
     drift of the estimated height.
     """
     planner = b.profile.planner
-    drift_mps = PRESS_HEIGHT_DRIFT_MPS if b.is_target_positioned else planner.landing.drift_mps
+    drift_mps = (
+        MAX_HEIGHT_DRIFT_IN_PRESS_MPS if b.is_positioned_by_target else planner.landing.drift_mps
+    )
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
 
 
 def is_at_contact_height(b: Belief) -> bool:
-    """True if the gear is at the target's height, within `possible_contact_tolerance_m`."""
-    return abs(b.target.error_z_m) <= possible_contact_tolerance_m(b)
+    """True if the gear is at the target's height, within `contact_height_tolerance_m`."""
+    return abs(b.target.error_z_m) <= contact_height_tolerance_m(b)
 
 
 def is_at_target(b: Belief) -> bool:
     """True if the gear is certainly within the magnet's reach."""
-    near = contact_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
+    near = current_gear_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
 
 
@@ -176,23 +181,23 @@ def max_press_thrust(profile: Profile) -> float:
     return min(float(perch.thrust), MAX_RAW_THRUST) if perch.mode == "raw" else FULL_THRUST
 
 
-def is_hover_thrust(b: Belief) -> bool:
+def is_flying_at_hover_thrust(b: Belief) -> bool:
     """True if the thrust equals hover thrust: nothing supports, presses or accelerates the
     vehicle."""
     tel, setpoint = b.telemetry, b.sent.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
         setpoint is not None
-        and setpoint.z_m - tel.position_m[2] > MIN_PRESS_SETPOINT_HEIGHT_M
+        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_ABOVE_TO_PRESS_M
         and vz < MAX_MOTIONLESS_CLIMB_MPS
     )
     return (
         b.is_telemetry_fresh
         and b.is_position_valid
-        and MIN_HOVER_THRUST <= tel.thrust < PRESS_SATURATION_FRACTION * FULL_THRUST
+        and MIN_FLYING_THRUST <= tel.thrust < SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
         and b.speed_mps < MAX_HOVER_SPEED_MPS
         and abs(vz) < MAX_HOVER_CLIMB_MPS
-        and abs(tel.acc_z_g - 1.0) < MAX_HOVER_ACCELERATION_G
+        and abs(tel.acc_z_g - 1.0) < MAX_HOVER_DEVIATION_FROM_1G_G
         and not stuck
     )
 
@@ -204,7 +209,7 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
     this is more than `hold_ratio` times the hover thrust, and then it is the limit.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
-    if MAX_NON_LIFTING_FRACTION * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
+    if MAX_NON_LIFTING_HOVER_FRACTION * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
         most = max(most, MIN_POSITION_MODE_THRUST)
     return b.is_thrust_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
@@ -212,9 +217,9 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 def is_above_hover_thrust(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust or is close to its limit. The limit is the ordered
     thrust during a press by raw thrust, otherwise full thrust."""
-    most = PRESS_SATURATION_FRACTION * FULL_THRUST
+    most = SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
-        most = PRESS_PROOF_FRACTION * max_press_thrust(b.profile)
+        most = PRESSING_FRACTION_OF_RAW_THRUST * max_press_thrust(b.profile)
     least = min(PRESS_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
     return b.telemetry.thrust >= least
 
@@ -234,11 +239,13 @@ def is_pressing(b: Belief) -> bool:
 def is_slipping(b: Belief) -> bool:
     """True if the vehicle falls away from the proven contact, by position or by acceleration."""
     complete, tel = b.profile.planner.complete, b.telemetry
-    if b.contact_z_m is None or not b.is_sinking(complete.slip_mps):
+    if b.last_contact_body_z_m is None or not b.is_sinking(complete.slip_mps):
         return False
-    above_m = tel.position_m[2] - b.contact_z_m
+    above_m = tel.position_m[2] - b.last_contact_body_z_m
     return (
-        not b.is_position_valid or above_m < MAX_UPWARD_DRIFT_M or tel.acc_z_g < complete.slip_acc_g
+        not b.is_position_valid
+        or above_m < MAX_UPWARD_DRIFT_DURING_SLIP_M
+        or tel.acc_z_g < complete.slip_acc_g
     )
 
 
@@ -257,11 +264,11 @@ def _is_in_contact(b: Belief) -> bool:
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS and b.is_position_valid
-    motionless_s = b.obs.t_s - b.imu.steady_s
+    motionless_s = b.obs.t_s - b.imu.climb_steady_since_s
     return (
         abs(b.target.error_z_m)
         <= perch.contact_z_m
-        + (PRESS_HEIGHT_DRIFT_MPS * b.sighting_age_s if b.is_target_positioned else 0)
+        + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_positioned_by_target else 0)
         and (steady or motionless_s >= perch.contact_dwell_s)
         and b.is_reading_one_g
         and b.hover_thrust > 0
@@ -297,11 +304,12 @@ def _is_hanging(b: Belief) -> bool:
     if not b.sent.maneuver.descends:
         return held
     at_contact = (
-        b.contact_z_m is not None and abs(tel.position_m[2] - b.contact_z_m) <= complete.slip_m
+        b.last_contact_body_z_m is not None
+        and abs(tel.position_m[2] - b.last_contact_body_z_m) <= complete.slip_m
     )
     at_target = b.obs.target is not None and abs(b.target.error_z_m) <= MAX_HANGING_ERROR_Z_M
     stayed = (
-        b.sent.maneuver_start_m[2] - tel.position_m[2] < MAX_HELD_DESCENT_M
+        b.sent.maneuver_start_m[2] - tel.position_m[2] < MAX_DESCENT_WHILE_HELD_M
         and not b.target.is_far_above
     )
     return held and (at_contact or at_target or stayed)
@@ -310,7 +318,7 @@ def _is_hanging(b: Belief) -> bool:
 def _are_motors_off(b: Belief) -> bool:
     """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
     stopped_s = b.sent.stopped_s
-    long_off = stopped_s is not None and b.obs.t_s - stopped_s > MOTORS_OFF_TIMEOUT_S
+    long_off = stopped_s is not None and b.obs.t_s - stopped_s > MOTORS_OFF_AFTER_STOP_ORDER_S
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
 
@@ -331,9 +339,9 @@ def _is_on_floor(b: Belief) -> bool:
     down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
     near_target = b.obs.target is not None and abs(b.target.error_z_m) <= MIN_ON_FLOOR_ERROR_Z_M
     came_down_m = b.sent.maneuver_start_m[2] - b.telemetry.position_m[2]
-    came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_M
+    came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_BEFORE_FLOOR_M
     handover_m = b.profile.planner.landing.handover_m
-    low = b.height_m < handover_m or (came_down and b.contact_z_m is None)
+    low = b.height_m < handover_m or (came_down and b.last_contact_body_z_m is None)
     return is_thrust_too_low_to_fly(b) and low and not near_target and is_still(b)
 
 
@@ -341,62 +349,70 @@ def _is_blocked(b: Belief) -> bool:
     """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
     hover thrust or is at its limit, and nothing moves."""
     setpoint, tel = b.sent.setpoint, b.telemetry
-    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_PRESS_SETPOINT_HEIGHT_M:
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_ABOVE_TO_PRESS_M:
         return False
-    strong = b.hover_thrust < MAX_PROVABLE_HOVER_FRACTION * FULL_THRUST and is_above_hover_thrust(b)
+    strong = (
+        b.hover_thrust < MAX_HOVER_FRACTION_TO_PROVE_PRESS * FULL_THRUST
+        and is_above_hover_thrust(b)
+    )
     return strong and b.height_m > MIN_BLOCKED_HEIGHT_M and is_still(b)
 
 
-def _is_supported_by_imu(b: Belief) -> bool:
+def _shows_support_by_imu(b: Belief) -> bool:
     """True if accelerometer and thrust alone show that something supports or presses the vehicle:
     in the air, thrust this far above or below hover thrust would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
-        0 < hover < MAX_PROVABLE_HOVER_FRACTION * FULL_THRUST
+        0 < hover < MAX_HOVER_FRACTION_TO_PROVE_PRESS * FULL_THRUST
         and b.is_thrust_known
         and (is_above_hover_thrust(b) or tel.thrust <= (2.0 - PRESS_THRUST_RATIO) * hover)
         and b.is_reading_one_g
-        and b.obs.t_s - b.imu.steady_s >= perch.contact_dwell_s
+        and b.obs.t_s - b.imu.climb_steady_since_s >= perch.contact_dwell_s
     )
 
 
-def _is_saturated(b: Belief) -> bool:
-    full = b.telemetry.thrust >= PRESS_SATURATION_FRACTION * FULL_THRUST
-    return full and FULL_THRUST_FALL_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
+def _is_thrust_saturated(b: Belief) -> bool:
+    full = b.telemetry.thrust >= SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
+    return full and FALLING_AT_FULL_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
 
 
-CONTACT = Condition("contact", _is_in_contact, depends_on=Dependency.POSITION)
+CONTACT = Condition("contact", _is_in_contact, depends_on=RequiredData.POSITION)
 """Contact with the target, proven by position, acceleration and thrust."""
-MAGNET_HOLDS = Condition("magnet holds", _is_magnet_holding, depends_on=Dependency.TELEMETRY)
+MAGNET_HOLDS = Condition("magnet holds", _is_magnet_holding, depends_on=RequiredData.TELEMETRY)
 """The magnet holds the vehicle: low thrust, and no slip."""
 SLIPPING = Condition("slipping", is_slipping)
 """The vehicle falls away from the proven contact."""
 FULL_WEIGHT_HANGS = Condition(
-    "the whole weight hangs", _is_weight_hanging, depends_on=Dependency.TELEMETRY
+    "the whole weight hangs", _is_weight_hanging, depends_on=RequiredData.TELEMETRY
 )
 """The whole weight hangs: the motors stand still, and nothing slips."""
-HANGING = Condition("hanging", _is_hanging, depends_on=Dependency.POSITION)
+HANGING = Condition("hanging", _is_hanging, depends_on=RequiredData.POSITION)
 """Something holds the vehicle up, off the floor."""
-MOTORS_STOPPED = Condition("motors stopped", _have_motors_stopped, depends_on=Dependency.TELEMETRY)
+MOTORS_STOPPED = Condition(
+    "motors stopped", _have_motors_stopped, depends_on=RequiredData.TELEMETRY
+)
 """The motors are off, and the last order does not let them turn."""
 MOTORS_OFF_DESPITE_ORDER = Condition(
-    "motors off despite an order", _are_motors_off_despite_order, depends_on=Dependency.TELEMETRY
+    "motors off despite an order", _are_motors_off_despite_order, depends_on=RequiredData.TELEMETRY
 )
 """The motors are off although the last order was raw thrust: the supervisor has ended the flight.
 It soon lets them turn by that order again (docs/firmware.md, "Supervisor")."""
-ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=Dependency.POSITION)
+ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=RequiredData.POSITION)
 """The vehicle stands on the floor."""
-BLOCKED = Condition("blocked", _is_blocked)
+CLIMB_BLOCKED = Condition("blocked", _is_blocked)
 """The vehicle presses against an obstacle below its setpoint."""
-SUPPORTED_BY_IMU = Condition(
+SUPPORT_SHOWN_BY_IMU = Condition(
     "supported, by accelerometer and thrust",
-    _is_supported_by_imu,
-    is_phase_independent=True,
-    depends_on=Dependency.TELEMETRY,
+    _shows_support_by_imu,
+    persists_across_phases=True,
+    depends_on=RequiredData.TELEMETRY,
 )
 """Something supports or presses the vehicle, proven by accelerometer and thrust alone."""
 SATURATED_THRUST = Condition(
-    "thrust at its limit", _is_saturated, is_phase_independent=True, depends_on=Dependency.TELEMETRY
+    "thrust at its limit",
+    _is_thrust_saturated,
+    persists_across_phases=True,
+    depends_on=RequiredData.TELEMETRY,
 )
 """The thrust is at its limit, and the vehicle does not climb."""
 SUPPORT_CONDITIONS = (
@@ -408,8 +424,8 @@ SUPPORT_CONDITIONS = (
     MOTORS_STOPPED,
     MOTORS_OFF_DESPITE_ORDER,
     ON_FLOOR,
-    BLOCKED,
-    SUPPORTED_BY_IMU,
+    CLIMB_BLOCKED,
+    SUPPORT_SHOWN_BY_IMU,
     SATURATED_THRUST,
 )
 """All conditions of this module."""
@@ -436,21 +452,25 @@ def find_support(b: Belief) -> Support:
     maneuver begins.
     """
     if HANGING in b.since:
-        return _find_support_of_hanging(b)
+        return _find_what_vehicle_hangs_on(b)
     if ON_FLOOR in b.since:
         return Support.FLOOR
-    if CONTACT in b.since or BLOCKED in b.since:
+    if CONTACT in b.since or CLIMB_BLOCKED in b.since:
         return Support.PRESSED
-    flies = is_hover_thrust(b) and not is_thrust_too_low_to_fly(b) and not is_above_hover_thrust(b)
+    flies = (
+        is_flying_at_hover_thrust(b)
+        and not is_thrust_too_low_to_fly(b)
+        and not is_above_hover_thrust(b)
+    )
     return Support.AIR if flies else Support.UNKNOWN
 
 
-def _find_support_of_hanging(b: Belief) -> Support:
-    touched, radius_m = last_touch_offset(b), b.profile.planner.perch.contact_xy_m
+def _find_what_vehicle_hangs_on(b: Belief) -> Support:
+    touched, radius_m = gear_offset_at_last_touch(b), b.profile.planner.perch.contact_xy_m
     was_near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
     if was_near or is_at_target(b):
         return Support.MAGNET
-    offset = newest_contact_offset(b)
+    offset = gear_offset_at_last_touch_or_now(b)
     is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > radius_m
     at_its_height = touched is not None or is_at_contact_height(b)
     return Support.UNKNOWN if at_its_height and not is_off_axis else Support.HELD_BY_OTHER
@@ -467,12 +487,12 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     if condition is HANGING and b.sent.maneuver.descends:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
     match condition.depends_on:
-        case Dependency.NOTHING:
+        case RequiredData.NOTHING:
             return True
-        case Dependency.TELEMETRY:
+        case RequiredData.TELEMETRY:
             return b.is_imu_fresh
-        case Dependency.POSITION:
-            reckons = condition is CONTACT and b.is_target_positioned and b.sent.maneuver.presses
+        case RequiredData.POSITION:
+            reckons = condition is CONTACT and b.is_positioned_by_target and b.sent.maneuver.presses
             return b.is_imu_fresh and (b.is_position_valid or reckons)
 
 

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 Knowledge = TypeVar("Knowledge", contravariant=True)
 
 
-class Dependency(Enum):
+class RequiredData(Enum):
     """Data that a condition depends on. The condition does not count while that data is old or
     unknown."""
 
@@ -39,8 +39,8 @@ class Condition(Generic[Knowledge]):
 
     name: str
     holds: Callable[[Knowledge], bool]
-    is_phase_independent: bool = False
-    depends_on: Dependency = Dependency.NOTHING
+    persists_across_phases: bool = False
+    depends_on: RequiredData = RequiredData.NOTHING
 
     def __repr__(self) -> str:
         return f"<condition: {self.name}>"
@@ -50,13 +50,13 @@ StartTimes = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions o
 
 
 def update_start_times(
-    old: StartTimes, conditions: Iterable[Condition[Knowledge]], seen: Knowledge, now_s: float
+    old: StartTimes, conditions: Iterable[Condition[Knowledge]], knowledge: Knowledge, now_s: float
 ) -> dict[Condition[Knowledge], float]:
     """Return the start time of each condition that is true for `seen`: the time in `old` if the
     condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
-    return {each: old.get(each, now_s) for each in conditions if each.holds(seen)}
+    return {each: old.get(each, now_s) for each in conditions if each.holds(knowledge)}
 
 
-def keep_independent(since: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
+def keep_persistent_start_times(since: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the entries that survive a change of phase or a hold."""
-    return {each: began_s for each, began_s in since.items() if each.is_phase_independent}
+    return {each: began_s for each, began_s in since.items() if each.persists_across_phases}

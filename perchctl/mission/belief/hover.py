@@ -14,27 +14,27 @@ import math
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_SIGMA,
+    ACCELEROMETER_HOVER_THRUST_SIGMA,
     MIN_POSITION_MODE_THRUST,
     HoverThrust,
 )
 from perchctl.values import replace
 
-DESCENT_RANDOM_WALK = 0.067
+DESCENT_HOVER_DRIFT_PER_SQRT_S = 0.067
 """Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
 second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
 longer."""
-FALLBACK_SIGMA = 0.12
+FALLBACK_HOVER_THRUST_SIGMA = 0.12
 """Standard deviation, as a share, of an estimate from the accelerometer alone while the vehicle may
 have been supported. Larger: a descent may correct the estimate further. Smaller: a wrong estimate
 persists."""
-MIN_DESCENT_SIGMA = 0.04
+MIN_HOVER_THRUST_SIGMA_IN_DESCENT = 0.04
 """Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
 MAX_DESCENT_CORRECTION_SIGMAS = 3.0
 """Largest correction during a descent, in standard deviations at its start. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
-MAX_QUIET_DEVIATION = 0.2
+MAX_QUIET_THRUST_DEVIATION_FRACTION = 0.2
 """Largest difference, as a share, between the thrust in quiet flight and the estimate; a larger one
 means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
 Smaller: a real change is rejected."""
@@ -49,24 +49,25 @@ Smaller: a fall corrupts the estimate."""
 MAX_SPECIFIC_FORCE_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: a blow corrupts the estimate."""
-MIN_PROPORTIONAL_FRACTION = 0.5
+MIN_PROPORTIONAL_THRUST_FRACTION = 0.5
 """Share of the first hover thrust below which thrust is not proportional to force."""
-MIN_DIVISOR_G = 0.75
+MIN_CLAMPED_SPECIFIC_FORCE_G = 0.75
 """Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
-MAX_DIVISOR_G = 1.5
+MAX_CLAMPED_SPECIFIC_FORCE_G = 1.5
 """Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
 it."""
 
 
 def estimate_hover_thrust(b: Belief) -> HoverThrust:
     """Return the filter's estimate; without one, the accelerometer's mean; without that, the value
-    of the newest sample. The fallbacks have the standard deviation `FALLBACK_SIGMA`."""
-    if b.hover.thrust > 0.0:
-        return b.hover
+    of the newest sample. The fallbacks have the standard deviation
+    `FALLBACK_HOVER_THRUST_SIGMA`."""
+    if b.hover_thrust_estimate.thrust > 0.0:
+        return b.hover_thrust_estimate
     tel = b.telemetry
-    divisor_g = min(MAX_DIVISOR_G, max(MIN_DIVISOR_G, tel.acc_z_g))
+    divisor_g = min(MAX_CLAMPED_SPECIFIC_FORCE_G, max(MIN_CLAMPED_SPECIFIC_FORCE_G, tel.acc_z_g))
     sample = max(MIN_POSITION_MODE_THRUST, tel.thrust / divisor_g)
-    return HoverThrust(b.imu.hover_thrust or sample, FALLBACK_SIGMA)
+    return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA)
 
 
 def rotor_thrust(b: Belief, dt_s: float) -> float:
@@ -81,10 +82,10 @@ def rotor_thrust(b: Belief, dt_s: float) -> float:
 def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     """Return the estimate after a tick in which the thrust equals hover thrust. `dt_s` is the time
     since the previous sample, 0 if the telemetry has no new one."""
-    thrust, old = b.telemetry.thrust, b.hover
+    thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
     if old.thrust == 0.0:
-        return HoverThrust(b.imu.hover_thrust or thrust, ACCELEROMETER_SIGMA)
-    if abs(thrust / old.thrust - 1.0) > MAX_QUIET_DEVIATION:
+        return HoverThrust(b.imu.mean_hover_thrust or thrust, ACCELEROMETER_HOVER_THRUST_SIGMA)
+    if abs(thrust / old.thrust - 1.0) > MAX_QUIET_THRUST_DEVIATION_FRACTION:
         return old  # the ceiling or a hand holds the vehicle
     return old.with_measurement(thrust, dt_s)
 
@@ -96,15 +97,20 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     proportional to force."""
     tel, old = b.telemetry, estimate_hover_thrust(b)
     thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
-    first, sigma = old.before_descent or (old.thrust, max(MIN_DESCENT_SIGMA, old.sigma))
-    old = replace(old, before_descent=(first, sigma))
+    first, sigma = old.thrust_sigma_before_descent or (
+        old.thrust,
+        max(MIN_HOVER_THRUST_SIGMA_IN_DESCENT, old.sigma),
+    )
+    old = replace(old, thrust_sigma_before_descent=(first, sigma))
     shows = (
         MIN_SPECIFIC_FORCE_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_G
-        and thrust >= MIN_PROPORTIONAL_FRACTION * first
+        and thrust >= MIN_PROPORTIONAL_THRUST_FRACTION * first
     )
     is_on_floor = b.sent.floor_detected_s is not None
     if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or is_on_floor:
         return old
-    new = old.propagate(dt_s, DESCENT_RANDOM_WALK).with_measurement(thrust / tel.acc_z_g, dt_s)
+    new = old.propagate(dt_s, DESCENT_HOVER_DRIFT_PER_SQRT_S).with_measurement(
+        thrust / tel.acc_z_g, dt_s
+    )
     most = MAX_DESCENT_CORRECTION_SIGMAS * sigma
     return replace(new, thrust=min((1.0 + most) * first, max((1.0 - most) * first, new.thrust)))

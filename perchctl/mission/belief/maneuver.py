@@ -74,10 +74,14 @@ class SentOrders:
         """True until the release by raw thrust begins or the motors are stopped."""
         return self.released_s is None and self.stopped_s is None
 
-    def with_frame_shift(self, setpoint: PositionSetpoint | None, by_m: Vector) -> SentOrders:
+    def with_frame_shift(
+        self, shifted_setpoint: PositionSetpoint | None, by_m: Vector
+    ) -> SentOrders:
         """Return the same orders with the start of the maneuver shifted by `by_m`, the motion
         of the estimate's world frame, and with `setpoint` in the new frame."""
         x, y, z = self.maneuver_start_m
         return replace(
-            self, setpoint=setpoint, maneuver_start_m=(x + by_m[0], y + by_m[1], z + by_m[2])
+            self,
+            setpoint=shifted_setpoint,
+            maneuver_start_m=(x + by_m[0], y + by_m[1], z + by_m[2]),
         )

@@ -43,10 +43,10 @@ count as a silence."""
 MAX_GAP_SPEED_CHANGE_MPS = 0.25
 """Largest speed that noise of the estimate can add to a hanging vehicle across a silence, m/s.
 Larger: a short fall goes undetected."""
-MAX_GAP_UNEXPLAINED_M = 0.25
+MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
 """Largest distance across a silence that the speed before it does not explain, m. Larger: a short
 fall goes undetected."""
-GAP_FALL_MPS = -0.3
+FALL_ACROSS_TELEMETRY_GAP_MPS = -0.3
 """Vertical speed that a hanging vehicle never reaches, m/s; a fall reaches it after 5 cm. Closer to
 0: noise counts as a fall."""
 MAX_FROZEN_READING_S = 0.2
@@ -61,14 +61,14 @@ a fall is detected 5 cm later."""
 FALL_SINK_MPS = -0.25
 """Downward speed, gained within `SINK_TIME_CONSTANT_S`, at which the vehicle falls whatever the
 accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
-MAX_RISE_MPS = 0.5
+MAX_RISE_BEFORE_FALL_MPS = 0.5
 """Largest upward speed, gained within `SINK_TIME_CONSTANT_S`, that a vehicle must lose before it
 falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a climb that is braked
 counts as a fall."""
 SINK_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
-OFFSET_TIME_CONSTANT_S = 3.0
+VERTICAL_OFFSET_TIME_CONSTANT_S = 3.0
 """Time constant with which the vertical offset is learned, s. Smaller: a slow fall is learned as an
 offset."""
 CEILING_IMPACT_G = -0.3
@@ -89,38 +89,38 @@ MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
 counts as standing still."""
 MAX_STEADY_LATERAL_DEVIATION_MPS = 0.15
-"""Largest difference between the lateral velocity and its mean over `LATERAL_MEAN_TIME_CONSTANT_S`
-that counts as constant, m/s; larger than `MAX_STEADY_CLIMB_DEVIATION_MPS` because the wind shakes
-the vehicle."""
-LATERAL_MEAN_TIME_CONSTANT_S = 0.15
+"""Largest difference between the lateral velocity and its mean over
+`LATERAL_VELOCITY_TIME_CONSTANT_S` that counts as constant, m/s; larger than
+`MAX_STEADY_CLIMB_DEVIATION_MPS` because the wind shakes the vehicle."""
+LATERAL_VELOCITY_TIME_CONSTANT_S = 0.15
 """Time constant of the mean lateral velocity, s."""
 REST_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
 of the floor is learned."""
 MIN_PUSH_G = 0.06
 """Lateral specific force that only a push causes, g. Smaller: drag in flight counts as a push."""
-MAX_PUSH_DELAY_S = 1.5
+MAX_PUSH_TO_ESTIMATE_DELAY_S = 1.5
 """Longest delay with which a push shows in the state estimate, s."""
 PUSH_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: running motors shake single samples as hard as a
 push."""
-MIN_ESTIMATE_CORRECTION_MPS = 0.08
+MIN_ESTIMATE_VELOCITY_STEP_MPS = 0.08
 """Lateral speed gained between two samples above which the gain is a correction of the estimate and
 not a motion, m/s."""
-MIN_ESTIMATE_CORRECTION_MPS2 = 5.0
+ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 = 5.0
 """Increase of that threshold for each second between the two samples, m/s^2."""
 TILT_ERROR_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes a wrong tilt, s."""
 HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
-MIN_HOVER_FRACTION = 0.4
+MIN_HOVER_FRACTION_OF_FULL_THRUST = 0.4
 """Share of full thrust below which no vehicle hovers."""
-HOVER_SATURATION_FRACTION = 0.95
+HOVER_THRUST_SATURATION_FRACTION = 0.95
 """Share of full thrust above which the motors are saturated and the thrust for 1 g is unknown."""
 MIN_VARIANCE_GROWTH_M2PS2_PER_S = 5e-4
 """Least growth of the variance of the vertical speed that shows a missing correction, (m/s)^2 per
 second: half of its growth without any corrections."""
-CORRECTION_TIMEOUT_S = 0.45
+NO_FUSION_TIMEOUT_S = 0.45
 """Time of uninterrupted growth after which corrections have certainly stopped, s. Smaller: a pause
 between two range measurements counts."""
 
@@ -131,23 +131,25 @@ class FusionAge:
     without measurements, the variance only grows."""
 
     variance_m2ps2: float | None = None  # newest variance
-    changed_s: float = -math.inf  # time at which that variance arrived
-    none_since_s: float = math.inf  # time since which the variance has only grown
+    variance_changed_at_s: float = -math.inf  # time at which that variance arrived
+    no_fusion_since_s: float = math.inf  # time since which the variance has only grown
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
-        certain = self.changed_s - self.none_since_s >= CORRECTION_TIMEOUT_S
-        return now_s - self.none_since_s if certain else 0.0
+        certain = self.variance_changed_at_s - self.no_fusion_since_s >= NO_FUSION_TIMEOUT_S
+        return now_s - self.no_fusion_since_s if certain else 0.0
 
     def update(self, sample: Telemetry) -> FusionAge:
         """Return the age after one more sample; unchanged if the sample has no new variance."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
-        least = MIN_VARIANCE_GROWTH_M2PS2_PER_S * (sample.t_s - self.changed_s)
+        least = MIN_VARIANCE_GROWTH_M2PS2_PER_S * (sample.t_s - self.variance_changed_at_s)
         grows = before is not None and variance - before >= least
-        none_since_s = min(self.none_since_s, self.changed_s) if grows else math.inf
-        return FusionAge(variance, sample.t_s, none_since_s)
+        no_fusion_since_s = (
+            min(self.no_fusion_since_s, self.variance_changed_at_s) if grows else math.inf
+        )
+        return FusionAge(variance, sample.t_s, no_fusion_since_s)
 
 
 @dataclass(frozen=True)
@@ -155,8 +157,10 @@ class Impact:
     """A blow from below, for example at a touchdown."""
 
     t_s: float = -math.inf  # -inf: no impact yet
-    estimated_mps: float = 0.0  # vertical speed just before the blow, from the state estimate
-    felt_mps: float = 0.0  # vertical speed just before the blow, from `ImuMotion.velocity_mps`
+    # vertical speed just before the blow, from the state estimate
+    estimated_climb_before_mps: float = 0.0
+    # vertical speed just before the blow, from `ImuMotion.velocity_mps`
+    imu_climb_before_mps: float = 0.0
     peak_g: float = 0.0  # largest specific force during the blow along the body's z axis
     z_m: float = 0.0  # height in the state estimate at the blow
 
@@ -169,29 +173,33 @@ class FreezeDetector:
     """Time for which readings have not changed. A vehicle in the air never reads identical values
     twice."""
 
-    frozen_s: float = 0.0  # time of identical accelerometer readings
+    acceleration_frozen_for_s: float = 0.0  # time of identical accelerometer readings
     # time of identical attitude readings; -inf before the first change
-    attitude_frozen_s: float = -math.inf
-    place_frozen_s: float = -math.inf  # time of identical position and velocity readings
+    attitude_frozen_for_s: float = -math.inf
+    position_frozen_for_s: float = -math.inf  # time of identical position and velocity readings
 
     @property
-    def stuck_attitude_s(self) -> float:
+    def only_attitude_frozen_for_s(self) -> float:
         """Time, s, for which the attitude has not changed while the accelerometer has."""
-        return max(0.0, self.attitude_frozen_s - self.frozen_s)
+        return max(0.0, self.attitude_frozen_for_s - self.acceleration_frozen_for_s)
 
     @property
-    def stuck_position_s(self) -> float:
+    def only_position_frozen_for_s(self) -> float:
         """Time, s, for which position and velocity have not changed while the accelerometer has."""
-        return max(0.0, self.place_frozen_s - self.frozen_s)
+        return max(0.0, self.position_frozen_for_s - self.acceleration_frozen_for_s)
 
     def update_freeze(self, last: Telemetry | None, new: Telemetry) -> Self:
         """Return the detector after one more sample; the first sample has no predecessor to
         compare."""
         return replace(
             self,
-            frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
-            attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
-            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _POSITION_AND_VELOCITY),
+            acceleration_frozen_for_s=_frozen_for_s(
+                self.acceleration_frozen_for_s, last, new, _ACCELERATION
+            ),
+            attitude_frozen_for_s=_frozen_for_s(self.attitude_frozen_for_s, last, new, _ATTITUDE),
+            position_frozen_for_s=_frozen_for_s(
+                self.position_frozen_for_s, last, new, _POSITION_AND_VELOCITY
+            ),
         )
 
 
@@ -202,37 +210,37 @@ class FallDetector:
     Let a be the vertical acceleration minus its slowly learned offset, with decelerations harder
     than `CEILING_IMPACT_G` cut off. The vertical speed gained recently is
 
-        sink' = min(MAX_RISE_MPS, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
+        sink' = min(MAX_RISE_BEFORE_FALL_MPS, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
 
     so that braking a climb is no fall. The vehicle fell if that speed is beyond `FALL_SINK_MPS`, or
     if the accelerometer has read less than `FREE_FALL_G` for longer than a rebound lasts. A sink
     that is slow enough for the offset to learn it goes undetected.
     """
 
-    fell_s: float = -math.inf  # last fall, or descent to the floor
+    last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
     # time since which the accelerometer has read less than `FREE_FALL_G`
-    light_since_s: float = math.inf
+    low_g_since_s: float = math.inf
     sink_mps: float = 0.0
-    offset_mps2: float = 0.0
+    vertical_offset_mps2: float = 0.0
 
-    def update_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
+    def update_fall(self, t_s: float, up_mps2: float, acc_z_g: float, dt_s: float) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `reads_g` is the
         specific force along the body's z axis at the end of that time."""
-        offset = self.offset_mps2 + (
+        offset = self.vertical_offset_mps2 + (
             max(CEILING_IMPACT_G * GRAVITY_MPS2, min(-CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2))
-            - self.offset_mps2
-        ) * min(1.0, dt_s / OFFSET_TIME_CONSTANT_S)
+            - self.vertical_offset_mps2
+        ) * min(1.0, dt_s / VERTICAL_OFFSET_TIME_CONSTANT_S)
         corrected_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
         sink = self.sink_mps + corrected_mps2 * dt_s
-        sink = min(MAX_RISE_MPS, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
-        light = min(self.light_since_s, t_s) if reads_g < FREE_FALL_G else math.inf
+        sink = min(MAX_RISE_BEFORE_FALL_MPS, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
+        light = min(self.low_g_since_s, t_s) if acc_z_g < FREE_FALL_G else math.inf
         fell = sink < FALL_SINK_MPS or t_s - light >= FREE_FALL_S
         return replace(
             self,
-            fell_s=t_s if fell else self.fell_s,
-            light_since_s=light,
+            last_fall_at_s=t_s if fell else self.last_fall_at_s,
+            low_g_since_s=light,
             sink_mps=sink,
-            offset_mps2=offset,
+            vertical_offset_mps2=offset,
         )
 
 
@@ -241,41 +249,53 @@ class ImpactDetector:
     """The newest blow from below, for example at a touchdown: in a short time it adds more upward
     speed than any thrust can. The peak force is the hardest of the blow and its bounces."""
 
-    blow_mps: float = 0.0
-    blow_s: float = -math.inf
-    last_moment: tuple[Impact, ...] = ()  # states just before a blow that begins now
-    blow: Impact = Impact()  # newest blow from below
+    speed_gained_in_impact_mps: float = 0.0
+    last_impact_at_s: float = -math.inf
+    recent_samples: tuple[Impact, ...] = ()  # states just before a blow that begins now
+    newest_impact: Impact = Impact()  # newest blow from below
 
-    def update_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
+    def update_impact(self, current: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `now` is the state
         at that time, which a blow may have ended; `z_m` is the height in the state estimate."""
-        gained_mps = max(
-            0.0, self.blow_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S) + up_mps2 * dt_s
+        speed_gained_in_impact_mps = max(
+            0.0,
+            self.speed_gained_in_impact_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S)
+            + up_mps2 * dt_s,
         )
-        recent = (m for m in self.last_moment if now.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S)
-        last_moment = (*recent, now)
+        recent = (
+            m for m in self.recent_samples if current.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S
+        )
+        recent_samples = (*recent, current)
         return replace(
             self,
-            blow_mps=gained_mps,
-            blow_s=now.t_s if gained_mps > FLOOR_IMPACT_MPS else self.blow_s,
-            last_moment=last_moment,
-            blow=_newest_impact(self.blow, now, z_m, last_moment, gained_mps),
+            speed_gained_in_impact_mps=speed_gained_in_impact_mps,
+            last_impact_at_s=current.t_s
+            if speed_gained_in_impact_mps > FLOOR_IMPACT_MPS
+            else self.last_impact_at_s,
+            recent_samples=recent_samples,
+            newest_impact=_newest_impact(
+                self.newest_impact, current, z_m, recent_samples, speed_gained_in_impact_mps
+            ),
         )
 
 
 def _newest_impact(
-    old: Impact, now: Impact, z_m: float, last_moment: tuple[Impact, ...], gained_mps: float
+    old: Impact,
+    current: Impact,
+    z_m: float,
+    recent_samples: tuple[Impact, ...],
+    speed_gained_in_impact_mps: float,
 ) -> Impact:
     """Return the newest blow, which has gained `gained_mps` so far, with the hardest peak of its
     bounces. The speeds are minima over the last moment because the onboard estimate already
     includes the whole blow before its second sample arrives."""
-    follows = now.t_s - old.t_s <= BOUNCE_WINDOW_S
-    if gained_mps > FLOOR_IMPACT_MPS:
+    follows = current.t_s - old.t_s <= BOUNCE_WINDOW_S
+    if speed_gained_in_impact_mps > FLOOR_IMPACT_MPS:
         begun = Impact(
-            now.t_s,
-            min(moment.estimated_mps for moment in last_moment),
-            min(moment.felt_mps for moment in last_moment),
-            max(moment.peak_g for moment in last_moment),
+            current.t_s,
+            min(moment.estimated_climb_before_mps for moment in recent_samples),
+            min(moment.imu_climb_before_mps for moment in recent_samples),
+            max(moment.peak_g for moment in recent_samples),
             z_m,
         )
         if not follows:
@@ -283,10 +303,12 @@ def _newest_impact(
         return replace(
             old,
             peak_g=max(old.peak_g, begun.peak_g),
-            estimated_mps=min(old.estimated_mps, begun.estimated_mps),
-            felt_mps=min(old.felt_mps, begun.felt_mps),
+            estimated_climb_before_mps=min(
+                old.estimated_climb_before_mps, begun.estimated_climb_before_mps
+            ),
+            imu_climb_before_mps=min(old.imu_climb_before_mps, begun.imu_climb_before_mps),
         )
-    return replace(old, peak_g=max(old.peak_g, now.peak_g)) if follows else old
+    return replace(old, peak_g=max(old.peak_g, current.peak_g)) if follows else old
 
 
 @dataclass(frozen=True)
@@ -294,28 +316,33 @@ class SteadySpeed:
     """Time since which the vertical speed has been constant and the lateral velocity close to its
     mean."""
 
-    steady_s: float = math.inf  # time since which the vertical speed has been constant
-    steady_mps: float = 0.0
-    steady_aside_s: float = math.inf  # time since which the lateral velocity has been constant
-    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # mean over `LATERAL_MEAN_TIME_CONSTANT_S`
+    climb_steady_since_s: float = math.inf  # time since which the vertical speed has been constant
+    steady_climb_mps: float = 0.0
+    # time since which the lateral velocity has been constant
+    lateral_steady_since_s: float = math.inf
+    # mean over `LATERAL_VELOCITY_TIME_CONSTANT_S`
+    mean_lateral_mps: tuple[float, float] = (0.0, 0.0)
 
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, at a velocity in world axes."""
         x, y, z = velocity_mps
-        steady_s, steady_mps = self.steady_s, self.steady_mps
-        if abs(z - steady_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
-            steady_s, steady_mps = t_s, z
-        steady_aside_s, (mean_x, mean_y) = self.steady_aside_s, self.steady_aside_mps
-        keeps = math.exp(-dt_s / LATERAL_MEAN_TIME_CONSTANT_S)
-        steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-        if math.dist((x, y), steady_aside_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
-            steady_aside_s = t_s
+        climb_steady_since_s, steady_climb_mps = self.climb_steady_since_s, self.steady_climb_mps
+        if abs(z - steady_climb_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
+            climb_steady_since_s, steady_climb_mps = t_s, z
+        lateral_steady_since_s, (mean_x, mean_y) = (
+            self.lateral_steady_since_s,
+            self.mean_lateral_mps,
+        )
+        keeps = math.exp(-dt_s / LATERAL_VELOCITY_TIME_CONSTANT_S)
+        mean_lateral_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
+        if math.dist((x, y), mean_lateral_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
+            lateral_steady_since_s = t_s
         return replace(
             self,
-            steady_s=steady_s,
-            steady_mps=steady_mps,
-            steady_aside_s=steady_aside_s,
-            steady_aside_mps=steady_aside_mps,
+            climb_steady_since_s=climb_steady_since_s,
+            steady_climb_mps=steady_climb_mps,
+            lateral_steady_since_s=lateral_steady_since_s,
+            mean_lateral_mps=mean_lateral_mps,
         )
 
 
@@ -324,20 +351,24 @@ class PushDetector:
     """Time of the last lateral push: the mean specific force across the body's z axis exceeded the
     drag of any flight."""
 
-    aside_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
-    pushed_s: float = -math.inf  # time of the last lateral push
+    mean_lateral_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
+    last_push_at_s: float = -math.inf  # time of the last lateral push
 
     def update_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
         """Return the detector after `dt_s`; `offset_g` is the accelerometer's offset at rest."""
         keeps = math.exp(-dt_s / PUSH_TIME_CONSTANT_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
-        mean_x_g, mean_y_g = self.aside_g
-        aside_g = (
+        mean_x_g, mean_y_g = self.mean_lateral_g
+        mean_lateral_g = (
             x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
             y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
         )
-        pushes = math.hypot(*aside_g) > MIN_PUSH_G
-        return replace(self, aside_g=aside_g, pushed_s=new.t_s if pushes else self.pushed_s)
+        pushes = math.hypot(*mean_lateral_g) > MIN_PUSH_G
+        return replace(
+            self,
+            mean_lateral_g=mean_lateral_g,
+            last_push_at_s=new.t_s if pushes else self.last_push_at_s,
+        )
 
 
 # --- All detectors together ---
@@ -350,17 +381,19 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
 
     t_s: float = -math.inf  # time of the newest sample
     velocity_mps: Vector = ZERO  # velocity gained since the first sample, world axes
-    offset_g: Vector = ZERO  # offset of the accelerometer at rest, body axes
-    silent_s: float = -math.inf  # end of the newest silence
-    gap_s: float = -math.inf  # end of the newest silence that may hide a fall
-    started_s: float = -math.inf  # first sample after the vehicle restarted
-    sunk_m: float = 0.0  # descent by the estimate while the accelerometer was frozen
-    hover_thrust: float = 0.0  # mean thrust per measured g in flight
-    misled_rad: tuple[float, float] = (0.0, 0.0)  # errors of roll and pitch due to corrections
-    turning_radps: tuple[float, float] = (0.0, 0.0)
+    accelerometer_offset_g: Vector = ZERO  # offset of the accelerometer at rest, body axes
+    last_silence_end_s: float = -math.inf  # end of the newest silence
+    last_fall_hiding_gap_end_s: float = -math.inf  # end of the newest silence that may hide a fall
+    restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
+    sunk_while_frozen_m: float = 0.0  # descent by the estimate while the accelerometer was frozen
+    mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
+    # errors of roll and pitch due to corrections
+    roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
+    roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
     # corrections of the state estimate, which this motion does not use
-    corrections: FusionAge = FusionAge()
-    off_s: float = math.inf  # time since which the motors have been off; inf while they turn
+    fusion_age: FusionAge = FusionAge()
+    # time since which the motors have been off; inf while they turn
+    motors_off_since_s: float = math.inf
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
         """Return the motion after one more sample; `last` is the previous sample, None at the
@@ -370,26 +403,28 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         motion = replace(
             self.update_freeze(last, new),
             t_s=new.t_s,
-            started_s=new.t_s if started_anew else self.started_s,
-            corrections=self.corrections.update(new),
-            off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
+            restarted_at_s=new.t_s if started_anew else self.restarted_at_s,
+            fusion_age=self.fusion_age.update(new),
+            motors_off_since_s=min(self.motors_off_since_s, new.t_s)
+            if new.thrust < 1
+            else math.inf,
         )
         if (
             last is None
             or not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S
-            or motion.frozen_s > MAX_FROZEN_READING_S
+            or motion.acceleration_frozen_for_s > MAX_FROZEN_READING_S
         ):
             return _restart_after_gap(motion, last, new)
-        motion, up_mps2 = _integrate(motion, last, new, dt_s)
+        motion, up_mps2 = _integrate_acceleration(motion, last, new, dt_s)
         now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
         motion = (
             motion.update_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
             .update_impact(now, new.position_m[2], up_mps2, dt_s)
             .update_steady_speed(new.t_s, motion.velocity_mps, dt_s)
-            .update_push(new, motion.offset_g, dt_s)
+            .update_push(new, motion.accelerometer_offset_g, dt_s)
         )
-        hover_thrust = _filter_hover_thrust(motion.hover_thrust, new, dt_s)
-        return replace(motion, sunk_m=0.0, hover_thrust=hover_thrust)
+        hover_thrust = _filter_hover_thrust(motion.mean_hover_thrust, new, dt_s)
+        return replace(motion, sunk_while_frozen_m=0.0, mean_hover_thrust=hover_thrust)
 
     @staticmethod
     def acceleration_mps2(
@@ -423,21 +458,26 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     one."""
     motion = replace(
         motion,
-        steady_s=new.t_s,
-        steady_mps=motion.velocity_mps[2],
-        steady_aside_s=new.t_s,
-        steady_aside_mps=motion.velocity_mps[:2],
+        climb_steady_since_s=new.t_s,
+        steady_climb_mps=motion.velocity_mps[2],
+        lateral_steady_since_s=new.t_s,
+        mean_lateral_mps=motion.velocity_mps[:2],
         sink_mps=0.0,
-        blow_mps=0.0,
-        light_since_s=math.inf,
+        speed_gained_in_impact_mps=0.0,
+        low_g_since_s=math.inf,
     )
     if last is None:
-        return replace(motion, sunk_m=0.0)
-    sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
-    alive = 0.0 <= motion.place_frozen_s <= MAX_FROZEN_READING_S and new.start == last.start
+        return replace(motion, sunk_while_frozen_m=0.0)
+    sunk_m = min(0.0, motion.sunk_while_frozen_m + new.position_m[2] - last.position_m[2])
+    alive = 0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_S and new.start == last.start
     if alive and _excludes_fall(last, new, sunk_m):
-        return replace(motion, silent_s=new.t_s, sunk_m=sunk_m)
-    return replace(motion, silent_s=new.t_s, gap_s=new.t_s, sunk_m=0.0)
+        return replace(motion, last_silence_end_s=new.t_s, sunk_while_frozen_m=sunk_m)
+    return replace(
+        motion,
+        last_silence_end_s=new.t_s,
+        last_fall_hiding_gap_end_s=new.t_s,
+        sunk_while_frozen_m=0.0,
+    )
 
 
 def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
@@ -447,32 +487,36 @@ def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     if max(last.behind_s, new.behind_s) > MAX_TELEMETRY_GAP_S:
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
-        return new.velocity_mps[2] > GAP_FALL_MPS and sunk_m > -MAX_GAP_UNEXPLAINED_M
+        return (
+            new.velocity_mps[2] > FALL_ACROSS_TELEMETRY_GAP_MPS
+            and sunk_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
+        )
     return (
-        abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS and abs(unexplained_m) <= MAX_GAP_UNEXPLAINED_M
+        abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS
+        and abs(unexplained_m) <= MAX_UNEXPLAINED_MOVE_IN_GAP_M
     )
 
 
-def _integrate(
+def _integrate_acceleration(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[ImuMotion, float]:
     """Return the motion with its velocity integrated by the trapezoid rule, and the mean vertical
     acceleration between the two samples, m/s^2. The accelerometer's offsets are learned while the
     motors are off and the vehicle does not fly."""
-    offset_g = motion.offset_g
+    offset_g = motion.accelerometer_offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
         offset_g = _filter_rest_offset(offset_g, new, min(1.0, dt_s / REST_OFFSET_TIME_CONSTANT_S))
-    misled_rad, turning_radps = _estimate_tilt_error(motion, last, new, dt_s)
-    before = ImuMotion.acceleration_mps2(last, offset_g, motion.misled_rad)
-    after = ImuMotion.acceleration_mps2(new, offset_g, misled_rad)
+    roll_pitch_error_rad, roll_pitch_rate_radps = _estimate_tilt_error(motion, last, new, dt_s)
+    before = ImuMotion.acceleration_mps2(last, offset_g, motion.roll_pitch_error_rad)
+    after = ImuMotion.acceleration_mps2(new, offset_g, roll_pitch_error_rad)
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
     x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
     motion = replace(
         motion,
         velocity_mps=(x, y, z),
-        offset_g=offset_g,
-        misled_rad=misled_rad,
-        turning_radps=turning_radps,
+        accelerometer_offset_g=offset_g,
+        roll_pitch_error_rad=roll_pitch_error_rad,
+        roll_pitch_rate_radps=roll_pitch_rate_radps,
     )
     return motion, dv[2] / dt_s
 
@@ -487,8 +531,8 @@ def _estimate_tilt_error(
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
-    (roll, pitch), rates = motion.misled_rad, motion.turning_radps
-    if gained_mps <= MIN_ESTIMATE_CORRECTION_MPS + MIN_ESTIMATE_CORRECTION_MPS2 * dt_s:
+    (roll, pitch), rates = motion.roll_pitch_error_rad, motion.roll_pitch_rate_radps
+    if gained_mps <= MIN_ESTIMATE_VELOCITY_STEP_MPS + ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 * dt_s:
         return (kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s)
     return (
         kept * roll + turned[0] - rates[0] * dt_s,
@@ -501,19 +545,24 @@ _ATTITUDE = attrgetter("roll_rad", "pitch_rad", "yaw_rad")
 _POSITION_AND_VELOCITY = attrgetter("position_m", "velocity_mps")
 
 
-def _frozen_s(
-    before_s: float, last: Telemetry | None, new: Telemetry, reading: Callable[[Telemetry], object]
+def _frozen_for_s(
+    frozen_so_far_s: float,
+    last: Telemetry | None,
+    new: Telemetry,
+    reading: Callable[[Telemetry], object],
 ) -> float:
     if last is None:
-        return before_s
-    return 0.0 if reading(last) != reading(new) else before_s + max(0.0, new.t_s - last.t_s)
+        return frozen_so_far_s
+    return 0.0 if reading(last) != reading(new) else frozen_so_far_s + max(0.0, new.t_s - last.t_s)
 
 
 def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    flies = sample.has_bit(FLYING) and sample.thrust < HOVER_SATURATION_FRACTION * FULL_THRUST
+    flies = (
+        sample.has_bit(FLYING) and sample.thrust < HOVER_THRUST_SATURATION_FRACTION * FULL_THRUST
+    )
     if (
         not flies
-        or sample.thrust < MIN_HOVER_FRACTION * FULL_THRUST
+        or sample.thrust < MIN_HOVER_FRACTION_OF_FULL_THRUST * FULL_THRUST
         or not 0.8 <= sample.acc_z_g <= 1.2
     ):
         return old

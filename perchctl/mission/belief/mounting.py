@@ -26,8 +26,8 @@ MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
 the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 MIN_TARGET_SPREAD_M = 0.05
 """Least spread of the target's positions that shows a motion, m."""
-MAX_UNEXPLAINED_FRACTION = 0.45  # share of the target's spread
-MIN_ROTATION_MAGNITUDE = 0.5  # magnitude of M; near 0, the world frame drifts
+MAX_ROTATION_FIT_RESIDUAL_FRACTION = 0.45  # share of the target's spread
+MIN_FITTED_ROTATION_MAGNITUDE = 0.5  # magnitude of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 MIN_WRONG_ROTATION_RAD = math.radians(65.0)
 REQUIRED_CONTRADICTIONS = 4
@@ -38,9 +38,9 @@ TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 distance plus twice the vehicle's motion within the time was moved. `JUMP_PAUSE_S` is the pause
 after a move, s."""
 ESTIMATE_JUMP_M = 0.05
-"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_GROWTH_MPS`, above which
-the estimate has jumped. Larger: sightings from before and after a jump are compared."""
-ESTIMATE_JUMP_GROWTH_MPS = 1.5
+"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS`,
+above which the estimate has jumped. Larger: sightings from before and after a jump are compared."""
+ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
 """Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
 fast vehicle are dropped."""
 _MAX_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
@@ -55,25 +55,28 @@ class MountingSample:
     """
 
     t_s: float
-    vehicle_m: complex
-    target_m: complex
-    axis_offset_m: complex = 0j
+    vehicle_world_xy_m: complex
+    target_world_xy_m: complex
+    up_axis_offset_xy_m: complex = 0j
 
     @property
-    def axis_intersection_m(self) -> complex:
+    def up_axis_intersection_xy_m(self) -> complex:
         """Point where the vehicle's upward axis meets the target's plane."""
-        return self.vehicle_m + self.axis_offset_m
+        return self.vehicle_world_xy_m + self.up_axis_offset_xy_m
 
 
-def make_mounting_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountingSample:
+def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array) -> MountingSample:
     """Return the sample for a target at `target_m` (3,), world, and the vehicle's pose in
     `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
-    axis_offset_m = (float(target_m[2]) - z) * up
-    place = complex(float(target_m[0]), float(target_m[1]))
+    up_axis_offset_xy_m = (float(target_world_m[2]) - z) * up
+    place = complex(float(target_world_m[0]), float(target_world_m[1]))
     return MountingSample(
-        t_s, complex(x, y), place, complex(float(axis_offset_m[0]), float(axis_offset_m[1]))
+        t_s,
+        complex(x, y),
+        place,
+        complex(float(up_axis_offset_xy_m[0]), float(up_axis_offset_xy_m[1])),
     )
 
 
@@ -95,21 +98,21 @@ class MountingMonitor:
         return self.contradictions >= REQUIRED_CONTRADICTIONS
 
     @property
-    def is_unconfirmed(self) -> bool:
+    def is_awaiting_evidence(self) -> bool:
         """True while no motion has shown yet that the target stands still."""
         return not (self.is_confirmed or self.is_target_stationary)
 
 
-def update_monitor(old: MountingMonitor, sight: MountingSample) -> MountingMonitor:
+def update_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
     """Return the monitor after one more sighting of a measured target."""
     if old.is_confirmed or old.is_wrong:
         return old
-    kept = tuple(s for s in old.sightings if sight.t_s - s.t_s <= MOUNTING_WINDOW_S)
-    if kept and _is_jump(kept, sight):
-        return MountingMonitor(paused_until_s=sight.t_s + JUMP_PAUSE_S)
-    if sight.t_s < old.paused_until_s:
+    kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_WINDOW_S)
+    if kept and _is_jump(kept, sample):
+        return MountingMonitor(paused_until_s=sample.t_s + JUMP_PAUSE_S)
+    if sample.t_s < old.paused_until_s:
         return old
-    new = replace(old, sightings=(*kept, sight), is_target_stationary=False, contradictions=0)
+    new = replace(old, sightings=(*kept, sample), is_target_stationary=False, contradictions=0)
     return (
         new
         if len(new.sightings) < MIN_MOUNTING_SIGHTINGS
@@ -117,18 +120,18 @@ def update_monitor(old: MountingMonitor, sight: MountingSample) -> MountingMonit
     )
 
 
-def _is_jump(before: tuple[MountingSample, ...], sight: MountingSample) -> bool:
+def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool:
     last = before[-1]
-    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_GROWTH_MPS * (sight.t_s - last.t_s)
-    if abs(sight.vehicle_m - last.vehicle_m) > far:
+    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (sample.t_s - last.t_s)
+    if abs(sample.vehicle_world_xy_m - last.vehicle_world_xy_m) > far:
         return True
     for s in reversed(before):
-        age_s = sight.t_s - s.t_s
+        age_s = sample.t_s - s.t_s
         if age_s > _MAX_JUMP_DURATION_S:
             return False
         target_m, vehicle_m = (
-            abs(sight.target_m - s.target_m),
-            abs(sight.axis_intersection_m - s.axis_intersection_m),
+            abs(sample.target_world_xy_m - s.target_world_xy_m),
+            abs(sample.up_axis_intersection_xy_m - s.up_axis_intersection_xy_m),
         )
         for jump_m, within_s in TARGET_JUMPS:
             if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
@@ -136,31 +139,33 @@ def _is_jump(before: tuple[MountingSample, ...], sight: MountingSample) -> bool:
     return False
 
 
-def _judge_mounting(watch: MountingMonitor, against: int) -> MountingMonitor:
+def _judge_mounting(monitor: MountingMonitor, previous_contradictions: int) -> MountingMonitor:
     aims, targets = (
-        [s.axis_intersection_m for s in watch.sightings],
-        [s.target_m for s in watch.sightings],
+        [s.up_axis_intersection_xy_m for s in monitor.sightings],
+        [s.target_world_xy_m for s in monitor.sightings],
     )
     n, first = len(aims), aims[0]
     moved_m = max(abs(aim - first) for aim in aims)
     if moved_m < MIN_JUDGED_MOTION_M:
-        return watch
+        return monitor
     p0, q0 = sum(aims) / n, sum(targets) / n
     pairs = [(aim - p0, target - q0) for aim, target in zip(aims, targets, strict=True)]
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
     if abs(along) < MAX_STATIONARY_RATIO:
         return replace(
-            watch, is_confirmed=moved_m >= MIN_PROVEN_MOTION_M, is_target_stationary=True
+            monitor, is_confirmed=moved_m >= MIN_PROVEN_MOTION_M, is_target_stationary=True
         )
     spread_m = math.sqrt(sum(abs(q) ** 2 for _, q in pairs) / n)
     unexplained_m = math.sqrt(sum(abs(q - along * p) ** 2 for p, q in pairs) / n)
     turn = 1.0 - along
     if (
         abs(along) >= MIN_MOVING_RATIO
-        and abs(turn) >= MIN_ROTATION_MAGNITUDE
+        and abs(turn) >= MIN_FITTED_ROTATION_MAGNITUDE
         and abs(cmath.phase(turn)) >= MIN_WRONG_ROTATION_RAD
         and spread_m >= MIN_TARGET_SPREAD_M
-        and unexplained_m <= MAX_UNEXPLAINED_FRACTION * spread_m
+        and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_FRACTION * spread_m
     ):
-        return replace(watch, contradictions=against + 1, rotation_rad=-cmath.phase(turn))
-    return watch
+        return replace(
+            monitor, contradictions=previous_contradictions + 1, rotation_rad=-cmath.phase(turn)
+        )
+    return monitor

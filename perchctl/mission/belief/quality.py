@@ -12,18 +12,22 @@ from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
 MAX_DRAUGHT_SPEED_MPS = 0.5
 """Lateral speed that no draught causes, m/s. Larger: a blow during the press is noticed late."""
-MAX_VELOCITY_DISAGREEMENT_MPS = 0.15
+MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS = 0.15
 """Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
-TARGET_BELOW_M = 0.3
+MIN_TARGET_BELOW_M = 0.3
 """Distance below the vehicle that excludes a target on the ceiling, m."""
 NO_CORRECTION_TEXT = "the estimate's variance keeps growing; the positioning system may have failed"
 
 
-def _has_velocity_disagreement(b: Belief) -> bool:
+def _does_estimate_contradict_imu(b: Belief) -> bool:
     """True if the estimate follows motion-capture positions that contradict the accelerometer."""
     by_capture = b.profile.positioning.source.is_mocap
-    return by_capture and math.hypot(*b.reckoning.estimate_only_mps) > MAX_VELOCITY_DISAGREEMENT_MPS
+    return (
+        by_capture
+        and math.hypot(*b.reckoning.lateral_gain_of_estimate_only_mps)
+        > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
+    )
 
 
 def _is_tilted(b: Belief) -> bool:
@@ -38,7 +42,7 @@ def _is_battery_low(b: Belief) -> bool:
     return tel.battery_state == LOW_POWER or low
 
 
-TILTED = Condition("tilted", _is_tilted, is_phase_independent=True)
+TILTED = Condition("tilted", _is_tilted, persists_across_phases=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
 LATERAL_BLOW = Condition[Belief](
     "lateral blow",
@@ -46,17 +50,17 @@ LATERAL_BLOW = Condition[Belief](
 )
 """The vehicle moves laterally faster than any draught moves it."""
 VARIANCE_TOO_LARGE = Condition[Belief](
-    "variance too large", lambda b: b.is_variance_too_large, is_phase_independent=True
+    "variance too large", lambda b: b.is_estimate_variance_too_large, persists_across_phases=True
 )
 """The variance of the state estimate is too large for position control."""
 TARGET_BELOW = Condition[Belief](
-    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -TARGET_BELOW_M
+    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -MIN_TARGET_BELOW_M
 )
 """The target appears below the vehicle, so the mounting must be wrong."""
-BATTERY_LOW = Condition("battery low", _is_battery_low, is_phase_independent=True)
+BATTERY_LOW = Condition("battery low", _is_battery_low, persists_across_phases=True)
 """The battery is low under load."""
-VELOCITY_DISAGREES = Condition(
-    "velocity disagrees", _has_velocity_disagreement, is_phase_independent=True
+ESTIMATE_CONTRADICTS_IMU = Condition(
+    "velocity disagrees", _does_estimate_contradict_imu, persists_across_phases=True
 )
 """The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (
@@ -65,7 +69,7 @@ QUALITY_CONDITIONS = (
     VARIANCE_TOO_LARGE,
     TARGET_BELOW,
     BATTERY_LOW,
-    VELOCITY_DISAGREES,
+    ESTIMATE_CONTRADICTS_IMU,
 )
 """All conditions of this module."""
 
@@ -80,9 +84,9 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
         return ""
     if b.telemetry_age_s > safety.telemetry_hold_s:
         return f"the newest telemetry is {b.telemetry_age_s:.1f} s old"
-    if b.first_jump_s is not None:
+    if b.first_estimate_jump_at_s is not None:
         return "the state estimate jumped"
-    if b.is_variance_too_large:
+    if b.is_estimate_variance_too_large:
         return f"the state estimate is uncertain ({variance_text(b)})"
     if b.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {b.obs.loop_late_s:.1f} s late"
@@ -93,7 +97,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 def position_loss_text(b: Belief) -> str:
     """Return for how long no external position was sent, and why."""
-    if b.is_displaced:
+    if b.has_uncorrected_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:

@@ -4,7 +4,7 @@ While positions correct the state estimate, the reckoned velocity v is drawn to 
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                                each sample
-    v += (e - v) dt / VELOCITY_TIME_CONSTANT_S          while e is believed
+    v += (e - v) dt / RECKONED_VELOCITY_TIME_CONSTANT_S          while e is believed
     b += (dv_imu - de - b dt) / BIAS_TIME_CONSTANT_S    while e is believed
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
     MAX_FROZEN_READING_S,
-    MAX_PUSH_DELAY_S,
+    MAX_PUSH_TO_ESTIMATE_DELAY_S,
     MAX_TELEMETRY_GAP_S,
     REST_OFFSET_TIME_CONSTANT_S,
     ZERO,
@@ -33,7 +33,7 @@ from perchctl.mission.belief.motion import (
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-VELOCITY_TIME_CONSTANT_S = 3.0
+RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a believed estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 BIAS_TIME_CONSTANT_S = 4.0
@@ -45,10 +45,10 @@ wrong positions can add a bias that no attitude error has."""
 MAX_BIAS_INNOVATION_MPS2 = 2.0
 """Largest difference in one sample from which the bias is learned, m/s^2; a larger one is a blow or
 a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not learned."""
-CLIMB_MARGIN_MPS = 0.1
+CLIMB_UNCERTAINTY_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
-MAX_SILENT_CLIMB_MPS = 1.0
+MAX_CLIMB_DURING_SILENCE_MPS = 1.0
 """Largest climb rate during a silence, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
@@ -58,7 +58,7 @@ MAX_BOUNCE_DISTANCE_M = 0.1
 bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
 Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
 to 0.3 m/s."""
-MISSED_VELOCITY_TIME_CONSTANT_S = 1.0
+IMU_ONLY_VELOCITY_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like a blow. Smaller: a blow just
 before the last sighting is forgotten."""
@@ -69,17 +69,17 @@ VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
-UNMEASURED_VELOCITY_TIME_CONSTANT_S = 0.5
+ESTIMATE_ONLY_VELOCITY_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
 MIN_POSITION_STEP_M = 0.005
 """Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
 counts as a step."""
-MIN_POSITION_STEP_GROWTH_MPS = 0.2
+POSITION_STEP_THRESHOLD_GROWTH_MPS = 0.2
 """Increase of that threshold for each second between two samples, m/s."""
-MAX_STEP_INTERVAL_S = 0.15
+MAX_POSITION_STEP_INTERVAL_S = 0.15
 """Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
 motion."""
-MAX_CURRENT_POSITION_LAG_S = 0.05
+MAX_UP_TO_DATE_POSITION_LAG_S = 0.05
 """Longest time for which the position in a sample is regarded as current, s."""
 BIAS_SIGMA_MPS2 = 0.06
 """Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
@@ -87,13 +87,13 @@ is claimed too precisely."""
 VELOCITY_SIGMA_MPS = 0.01
 """Standard deviation of the velocity at the last sighting, m/s. Smaller: the offset of a contact is
 claimed too precisely."""
-DISTANCE_SIGMA_FRACTION = 0.3
+SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
-WRONG_POSITION_BIAS_GAIN_PER_S = 1.5
+WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
 `estimate_only_mps`."""
-MAX_HEIGHT_STEP_S = 0.5
+MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a silence."""
 
 
@@ -106,29 +106,30 @@ class DeadReckoning:
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO  # error of accelerometer and attitude
     mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # mean lateral reading of the accelerometer
-    estimated_mps: Vector = ZERO
+    estimated_velocity_mps: Vector = ZERO
     # lateral velocity gained recently by the state estimate alone
-    estimate_only_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_gain_of_estimate_only_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
-    imu_only_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_gain_of_imu_only_mps: tuple[float, float] = (0.0, 0.0)
     # distance of the gear below the target; inf if unseen or fallen
     distance_below_m: float = math.inf
     # lower bound of `distance_below_m`: allows for climbs in silences, and falls only add to it
     min_distance_below_m: float = math.inf
     # end of the newest silence after which the magnet may hold the vehicle
-    doubtful_gap_s: float = -math.inf
+    last_possible_catch_gap_end_s: float = -math.inf
     # lateral offset from the gear to the target's axis
     lateral_offset_m: tuple[float, float] = (0.0, 0.0)
     lateral_sigma_m: float = math.inf  # standard deviation of `lateral_offset_m`; inf if unknown
-    sighting_s: float = -math.inf  # exposure of the sighting from which the offset is integrated
+    # exposure of the sighting from which the offset is integrated
+    last_sighting_at_s: float = -math.inf
     # sum of the steps of the estimated position since that sighting
-    position_step_sum_m: tuple[float, float] = (0.0, 0.0)
+    position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
     last_position_step_s: float = -math.inf  # time of the newest step
-    impact_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
+    climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
     mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
-    position_control_s: float = 0.0  # total time in free air under position control
+    time_under_position_control_s: float = 0.0  # total time in free air under position control
 
 
 def advance_reckoning(
@@ -136,10 +137,10 @@ def advance_reckoning(
     imu: ImuMotion,
     sample: Telemetry,
     *,
-    believed: bool,
-    diverged: bool = False,
-    corrected: bool = False,
-    pushed: bool = False,
+    is_estimate_believed: bool,
+    is_position_diverged: bool = False,
+    is_position_correcting_velocity: bool = False,
+    ignores_lateral_estimate: bool = False,
 ) -> DeadReckoning:
     """Return the reckoning one tick later.
 
@@ -148,62 +149,84 @@ def advance_reckoning(
     estimator does not see a lateral push until a position corrects it. `diverged`: the estimated
     velocity may be in wrong axes, so the reckoned velocity is kept even after a silence.
     """
-    estimated, blow = sample.velocity_mps, imu.blow
-    if old.imu is not None and blow.t_s > old.imu.blow.t_s:
-        carried = not old.imu.t_s < imu.silent_s <= blow.t_s
-        carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
-        old = replace(old, impact_mps=carried_mps if carried else blow.estimated_mps)
-    frozen = imu.attitude_frozen_s > MAX_FROZEN_READING_S
-    if old.imu is None or imu.silent_s > old.imu.t_s or frozen:
-        return _restart(old, imu, estimated, believed=believed, diverged=diverged)
+    estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
+    if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
+        carried = not old.imu.t_s < imu.last_silence_end_s <= impact.t_s
+        carried_mps = old.velocity_mps[2] + impact.imu_climb_before_mps - old.imu.velocity_mps[2]
+        old = replace(
+            old,
+            climb_before_impact_mps=carried_mps if carried else impact.estimated_climb_before_mps,
+        )
+    frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_S
+    if old.imu is None or imu.last_silence_end_s > old.imu.t_s or frozen:
+        return _restart(
+            old,
+            imu,
+            estimated_velocity_mps,
+            is_estimate_believed=is_estimate_believed,
+            is_position_diverged=is_position_diverged,
+        )
     return _integrate_sample(
-        old, old.imu, imu, sample, believed=believed, corrected=corrected, pushed=pushed
+        old,
+        old.imu,
+        imu,
+        sample,
+        is_estimate_believed=is_estimate_believed,
+        is_position_correcting_velocity=is_position_correcting_velocity,
+        ignores_lateral_estimate=ignores_lateral_estimate,
     )
 
 
 def _restart(
-    old: DeadReckoning, imu: ImuMotion, estimated: Vector, *, believed: bool, diverged: bool
+    old: DeadReckoning,
+    imu: ImuMotion,
+    estimated_velocity_mps: Vector,
+    *,
+    is_estimate_believed: bool,
+    is_position_diverged: bool,
 ) -> DeadReckoning:
     """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
     The velocity is the estimated one if believed; otherwise it changes by as much as the estimate
     has since."""
-    velocity_mps = estimated if believed else ZERO
-    if diverged:
+    velocity_mps = estimated_velocity_mps if is_estimate_believed else ZERO
+    if is_position_diverged:
         vx, vy, vz = old.velocity_mps
-        if old.imu is not None and imu.silent_s <= old.imu.t_s:
+        if old.imu is not None and imu.last_silence_end_s <= old.imu.t_s:
             vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
         velocity_mps = (vx, vy, vz)
-    elif not believed and old.imu is not None:
+    elif not is_estimate_believed and old.imu is not None:
         vx, vy, vz = (
             v + e - o
-            for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
+            for v, e, o in zip(
+                old.velocity_mps, estimated_velocity_mps, old.estimated_velocity_mps, strict=True
+            )
         )
         velocity_mps = (vx, vy, vz)
     unknown = replace(
         old,
         imu=imu,
         velocity_mps=velocity_mps,
-        estimated_mps=estimated,
-        estimate_only_mps=(0.0, 0.0),
-        imu_only_mps=(0.0, 0.0),
+        estimated_velocity_mps=estimated_velocity_mps,
+        lateral_gain_of_estimate_only_mps=(0.0, 0.0),
+        lateral_gain_of_imu_only_mps=(0.0, 0.0),
     )
     if old.imu is None:
         return unknown
-    if imu.silent_s > old.imu.t_s:
+    if imu.last_silence_end_s > old.imu.t_s:
         # Motors that were off on both sides of the silence, or a restarted vehicle, cannot have
         # climbed under power.
-        off = old.imu.off_s <= old.imu.t_s and imu.off_s <= imu.t_s
-        flew = not (off or imu.started_s > old.imu.t_s)
-        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_MARGIN_MPS
+        off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
+        flew = not (off or imu.restarted_at_s > old.imu.t_s)
+        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_UNCERTAINTY_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MAX_SILENT_CLIMB_MPS * (imu.t_s - old.imu.t_s)
+            climb_m = MAX_CLIMB_DURING_SILENCE_MPS * (imu.t_s - old.imu.t_s)
         min_distance_below_m = old.min_distance_below_m - climb_m
         near = min_distance_below_m < MAGNET_REACH_M
         unknown = replace(
             unknown,
             min_distance_below_m=min_distance_below_m,
-            doubtful_gap_s=imu.t_s if near else old.doubtful_gap_s,
+            last_possible_catch_gap_end_s=imu.t_s if near else old.last_possible_catch_gap_end_s,
             distance_below_m=old.distance_below_m if near or flew else math.inf,
         )
     return replace(unknown, lateral_sigma_m=math.inf)
@@ -215,20 +238,24 @@ def _integrate_sample(
     imu: ImuMotion,
     sample: Telemetry,
     *,
-    believed: bool,
-    corrected: bool,
-    pushed: bool,
+    is_estimate_believed: bool,
+    is_position_correcting_velocity: bool,
+    ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
     """Return the reckoning one sample after `before`, by the equations in the module docstring."""
-    estimated, dt_s = sample.velocity_mps, imu.t_s - before.t_s
+    estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - before.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, estimate_only_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
-    remembers = math.exp(-dt_s / MISSED_VELOCITY_TIME_CONSTANT_S) if corrected else 1.0
-    keeps = math.exp(-dt_s / UNMEASURED_VELOCITY_TIME_CONSTANT_S)
-    calm = believed and imu.t_s - imu.pushed_s > MAX_PUSH_DELAY_S
+    velocity, bias, lateral_gain_of_estimate_only_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    remembers = (
+        math.exp(-dt_s / IMU_ONLY_VELOCITY_TIME_CONSTANT_S)
+        if is_position_correcting_velocity
+        else 1.0
+    )
+    keeps = math.exp(-dt_s / ESTIMATE_ONLY_VELOCITY_TIME_CONSTANT_S)
+    calm = is_estimate_believed and imu.t_s - imu.last_push_at_s > MAX_PUSH_TO_ESTIMATE_DELAY_S
     cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
-    ahead_g, left_g = imu.aside_g
+    ahead_g, left_g = imu.mean_lateral_g
     reads_mps2 = (
         GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
         GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
@@ -236,18 +263,24 @@ def _integrate_sample(
     mean_lateral_mps2 = [*old.mean_lateral_mps2]
     for i in range(3):
         gained = imu.velocity_mps[i] - before.velocity_mps[i]
-        if i == 2 and believed and old.distance_below_m < MAX_BOUNCE_DISTANCE_M:
-            gained = estimated[2] - old.estimated_mps[2] + old.bias_mps2[2] * dt_s
+        if i == 2 and is_estimate_believed and old.distance_below_m < MAX_BOUNCE_DISTANCE_M:
+            gained = (
+                estimated_velocity_mps[2] - old.estimated_velocity_mps[2] + old.bias_mps2[2] * dt_s
+            )
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
         if i < 2:
-            alone = gained - b * dt_s - (estimated[i] - old.estimated_mps[i])
-            missed[i] = remembers * old.imu_only_mps[i] + alone
-        if believed and (i == 2 or not pushed):
-            v += (estimated[i] - v) * min(1.0, dt_s / VELOCITY_TIME_CONSTANT_S)
-            wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
+            alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
+            missed[i] = remembers * old.lateral_gain_of_imu_only_mps[i] + alone
+        if is_estimate_believed and (i == 2 or not ignores_lateral_estimate):
+            v += (estimated_velocity_mps[i] - v) * min(
+                1.0, dt_s / RECKONED_VELOCITY_TIME_CONSTANT_S
+            )
+            wrong = (gained - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])) / dt_s
             if calm and i < 2:
-                more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
-                estimate_only_mps[i] = keeps * old.estimate_only_mps[i] + more
+                more = estimated_velocity_mps[i] - old.estimated_velocity_mps[i] - gained + b * dt_s
+                lateral_gain_of_estimate_only_mps[i] = (
+                    keeps * old.lateral_gain_of_estimate_only_mps[i] + more
+                )
             if abs(wrong) <= MAX_BIAS_INNOVATION_MPS2:
                 share = min(1.0, dt_s / BIAS_TIME_CONSTANT_S)
                 b = max(-MAX_BIAS_MPS2, min(MAX_BIAS_MPS2, b + share * (wrong - b)))
@@ -256,12 +289,12 @@ def _integrate_sample(
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity
-    unseen_s = max(0.0, imu.t_s - old.sighting_s)
-    fell = imu.fell_s > max(before.fell_s, old.sighting_s)
+    unseen_s = max(0.0, imu.t_s - old.last_sighting_at_s)
+    fell = imu.last_fall_at_s > max(before.last_fall_at_s, old.last_sighting_at_s)
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
         VELOCITY_SIGMA_MPS + BIAS_SIGMA_MPS2 * unseen_s
-    ) * dt_s + DISTANCE_SIGMA_FRACTION * step_m
+    ) * dt_s + SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
     ex, ey = old.lateral_offset_m
     return replace(
         old,
@@ -269,12 +302,15 @@ def _integrate_sample(
         velocity_mps=(vx, vy, vz),
         bias_mps2=(bias[0], bias[1], bias[2]),
         mean_lateral_mps2=(mean_lateral_mps2[0], mean_lateral_mps2[1]),
-        estimated_mps=estimated,
-        estimate_only_mps=(estimate_only_mps[0], estimate_only_mps[1]),
-        imu_only_mps=(missed[0], missed[1]),
+        estimated_velocity_mps=estimated_velocity_mps,
+        lateral_gain_of_estimate_only_mps=(
+            lateral_gain_of_estimate_only_mps[0],
+            lateral_gain_of_estimate_only_mps[1],
+        ),
+        lateral_gain_of_imu_only_mps=(missed[0], missed[1]),
         distance_below_m=math.inf
         if fell
-        else old.distance_below_m - (vz + CLIMB_MARGIN_MPS) * dt_s,
+        else old.distance_below_m - (vz + CLIMB_UNCERTAINTY_MPS) * dt_s,
         min_distance_below_m=old.min_distance_below_m - vz * dt_s,
         lateral_offset_m=(ex - vx * dt_s, ey - vy * dt_s),
         lateral_sigma_m=old.lateral_sigma_m + growth_m,
@@ -292,7 +328,7 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
     """
     dt_s = new.t_s - last.t_s
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
-        return reset_means(old)
+        return reset_velocity_bias_means(old)
     share = 1.0 - math.exp(-dt_s / VELOCITY_BIAS_TIME_CONSTANT_S)
     before_m = old.mean_position_m or new.position_m[:2]
     before_mps = old.velocity_bias_mps if old.mean_position_m is None else old.mean_velocity_mps
@@ -308,7 +344,7 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
         velocity_bias_mps=(part * bias[0], part * bias[1]),
         mean_velocity_mps=(velocity[0], velocity[1]),
         mean_position_m=(position[0], position[1]),
-        position_control_s=old.position_control_s + dt_s,
+        time_under_position_control_s=old.time_under_position_control_s + dt_s,
     )
 
 
@@ -321,7 +357,7 @@ def learn_bias_at_rest(
     if (
         before is None
         or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
-        or now.silent_s > before.t_s
+        or now.last_silence_end_s > before.t_s
     ):
         return old
     dt_s = now.t_s - before.t_s
@@ -332,7 +368,7 @@ def learn_bias_at_rest(
     return replace(old, bias_mps2=(*bias, bz))
 
 
-def reset_means(old: DeadReckoning) -> DeadReckoning:
+def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning after an interruption of the velocity-bias learning: the bias is kept,
     and the low-pass filters restart."""
     return old if old.mean_position_m is None else replace(old, mean_position_m=None)
@@ -340,23 +376,25 @@ def reset_means(old: DeadReckoning) -> DeadReckoning:
 
 def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning with its bias corrected for the tilt error due to wrong positions."""
-    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.estimate_only_mps
+    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_gain_of_estimate_only_mps
     return replace(
         old,
         bias_mps2=(
-            bx + WRONG_POSITION_BIAS_GAIN_PER_S * x_mps,
-            by + WRONG_POSITION_BIAS_GAIN_PER_S * y_mps,
+            bx + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * x_mps,
+            by + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * y_mps,
             bz,
         ),
     )
 
 
-def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
+def accumulate_position_step(
+    old: DeadReckoning, last: Telemetry, sample: Telemetry
+) -> DeadReckoning:
     """Return the reckoning with one more step of the estimated position: the part of its motion
     between two samples that the velocity does not explain. After a gap in the samples, no step is
     added."""
     dt_s = _position_time_s(sample) - _position_time_s(last)
-    if not 0.0 < dt_s <= MAX_STEP_INTERVAL_S:
+    if not 0.0 < dt_s <= MAX_POSITION_STEP_INTERVAL_S:
         return old
     x_m, y_m = (
         sample.position_m[i]
@@ -364,18 +402,18 @@ def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) ->
         - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
         for i in range(2)
     )
-    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + MIN_POSITION_STEP_GROWTH_MPS * dt_s:
+    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s:
         return old
-    sx_m, sy_m = old.position_step_sum_m
+    sx_m, sy_m = old.position_step_sum_xy_m
     return replace(
-        old, position_step_sum_m=(sx_m + x_m, sy_m + y_m), last_position_step_s=sample.t_s
+        old, position_step_sum_xy_m=(sx_m + x_m, sy_m + y_m), last_position_step_s=sample.t_s
     )
 
 
 def _position_time_s(sample: Telemetry) -> float:
-    """Return the time of the sample's position; a lag of up to `MAX_CURRENT_POSITION_LAG_S` counts
-    as none."""
-    return sample.t_s - max(0.0, sample.behind_s - MAX_CURRENT_POSITION_LAG_S)
+    """Return the time of the sample's position; a lag of up to `MAX_UP_TO_DATE_POSITION_LAG_S`
+    counts as none."""
+    return sample.t_s - max(0.0, sample.behind_s - MAX_UP_TO_DATE_POSITION_LAG_S)
 
 
 def add_sighting(
@@ -390,7 +428,7 @@ def add_sighting(
     target."""
     return replace(
         old,
-        sighting_s=t_s,
+        last_sighting_at_s=t_s,
         lateral_offset_m=lateral_offset_m,
         distance_below_m=distance_below_m,
         min_distance_below_m=distance_below_m,

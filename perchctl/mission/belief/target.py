@@ -38,7 +38,7 @@ class TargetBelief:
             None while unknown.
         error_xy_m, error_z_m, error_yaw_rad: offset from the gear to the target in the level frame;
             infinite while unknown.
-        contact_body_z_m: height of the body at which the gear touches the target.
+        body_z_touching_target_m: height of the body at which the gear touches the target.
         age_s: time since the exposure of the last frame that measured the target.
         is_tracked: the target is visible, or the filter coasts for at most n_max frames.
         is_fresh: the last measurement is as recent as the latency allows.
@@ -51,7 +51,7 @@ class TargetBelief:
     error_xy_m: float = math.inf
     error_z_m: float = math.inf
     error_yaw_rad: float = math.inf
-    contact_body_z_m: float = math.inf
+    body_z_touching_target_m: float = math.inf
     age_s: float = math.inf
     is_tracked: bool = False
     is_fresh: bool = False
@@ -64,7 +64,7 @@ class TargetBelief:
 
     @classmethod
     def from_estimate(
-        cls, target: TargetEstimate | None, t_s: float, latency_s: float, profile: Profile
+        cls, target: TargetEstimate | None, t_s: float, camera_latency_s: float, profile: Profile
     ) -> TargetBelief:
         """Return the belief at `t_s` from the pipeline's estimate; `latency_s` is the age of a
         picture on arrival."""
@@ -73,7 +73,7 @@ class TargetBelief:
         goal_z_m = math.inf
         if target.world_m is not None:
             goal_z_m = float(target.world_m[2]) - profile.vehicle.gear_body_m[2]
-        limit_s = profile.planner.ascend.fresh_s + latency_s
+        limit_s = profile.planner.ascend.fresh_s + camera_latency_s
         age_s = t_s - target.measured_s
         return cls(
             world_m=target.world_m,
@@ -81,7 +81,7 @@ class TargetBelief:
             error_xy_m=math.hypot(target.e_m[0], target.e_m[1]),
             error_z_m=float(target.e_m[2]),
             error_yaw_rad=target.e_yaw_rad,
-            contact_body_z_m=goal_z_m,
+            body_z_touching_target_m=goal_z_m,
             age_s=age_s,
             is_tracked=target.tracked,
             is_fresh=target.tracked and age_s <= limit_s,
@@ -90,7 +90,7 @@ class TargetBelief:
 
 
 @dataclass(frozen=True)
-class TargetMotion:
+class VisualMotion:
     """The vehicle's velocity from pictures of a stationary target, for use without telemetry.
 
     The vehicle moves by -de/dt, where e is the target's position from the gear in the level frame;
@@ -107,16 +107,16 @@ class TargetMotion:
     """
 
     t_s: float = -math.inf
-    since_s: float = -math.inf
-    e_m: Vector = ZERO
-    velocity_mps: Vector = ZERO
+    detected_since_s: float = -math.inf
+    target_from_gear_m: Vector = ZERO
+    vehicle_velocity_mps: Vector = ZERO
 
     @property
     def is_known(self) -> bool:
         """True if the target was detected for long enough to determine the velocity."""
-        return self.t_s - self.since_s >= MIN_DETECTED_S
+        return self.t_s - self.detected_since_s >= MIN_DETECTED_S
 
-    def with_detection(self, target: TargetEstimate) -> TargetMotion:
+    def with_detection(self, target: TargetEstimate) -> VisualMotion:
         """Return the motion after a frame that measured the target."""
         x_m, y_m, z_m = (float(v) for v in target.e_m)
         e_m, t_s = (x_m, y_m, z_m), target.measured_s
@@ -124,12 +124,15 @@ class TargetMotion:
         if dt_s <= 0.0:
             return self
         if dt_s > MAX_DETECTION_GAP_S:
-            return TargetMotion(t_s, t_s, e_m)
-        moved_mps = [(before - now) / dt_s for before, now in zip(self.e_m, e_m, strict=True)]
+            return VisualMotion(t_s, t_s, e_m)
+        moved_mps = [
+            (before - now) / dt_s for before, now in zip(self.target_from_gear_m, e_m, strict=True)
+        ]
         if math.hypot(*moved_mps) > MAX_CAMERA_VELOCITY_MPS:
-            return replace(self, t_s=t_s, e_m=e_m)
+            return replace(self, t_s=t_s, target_from_gear_m=e_m)
         share = 1.0 - math.exp(-dt_s / CAMERA_VELOCITY_TIME_CONSTANT_S)
         ahead, left, up = (
-            old + share * (new - old) for old, new in zip(self.velocity_mps, moved_mps, strict=True)
+            old + share * (new - old)
+            for old, new in zip(self.vehicle_velocity_mps, moved_mps, strict=True)
         )
-        return TargetMotion(t_s, self.since_s, e_m, (ahead, left, up))
+        return VisualMotion(t_s, self.detected_since_s, e_m, (ahead, left, up))

@@ -21,10 +21,10 @@ THRUST_SIGMA = 0.02
 """Standard deviation, as a share, of measurements averaged over one second; position control varies
 the thrust by 1 to 2 % for half a second. Larger: the filter follows a sagging battery late.
 Smaller: the filter learns these variations."""
-QUIET_RANDOM_WALK = 0.01
+QUIET_HOVER_DRIFT_PER_SQRT_S = 0.01
 """Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
 the filter learns a lasting push. Smaller: it follows a sagging battery late."""
-ACCELEROMETER_SIGMA = 0.03
+ACCELEROMETER_HOVER_THRUST_SIGMA = 0.03
 """Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
 error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
 MAX_PRECISE_THRUST_SIGMA = 0.05
@@ -44,22 +44,22 @@ class HoverThrust:
 
     thrust: float = 0.0
     sigma: float = math.inf
-    before_descent: tuple[float, float] | None = None
+    thrust_sigma_before_descent: tuple[float, float] | None = None
 
     @property
     def is_imprecise(self) -> bool:
         """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
         return self.sigma > MAX_PRECISE_THRUST_SIGMA
 
-    def propagate(self, dt_s: float, drift: float) -> HoverThrust:
+    def propagate(self, dt_s: float, drift_per_sqrt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later, with a random walk of `drift` in between."""
-        return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
+        return replace(self, sigma=math.sqrt(self.sigma**2 + drift_per_sqrt_s**2 * dt_s))
 
     def propagate_unmeasured(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
-        sigma = self.propagate(dt_s, QUIET_RANDOM_WALK).sigma
-        return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_SIGMA)))
+        sigma = self.propagate(dt_s, QUIET_HOVER_DRIFT_PER_SQRT_S).sigma
+        return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)))
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
         """Return the estimate after a measurement of weight `dt_s`, in seconds; unchanged for 0."""

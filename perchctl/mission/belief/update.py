@@ -21,34 +21,38 @@ import numpy as np
 
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.battery import update_from_telemetry
-from perchctl.mission.belief.belief import POSITION_SETTLING_S, Belief
+from perchctl.mission.belief.belief import POSITION_SETTLING_AFTER_GAP_S, Belief
 from perchctl.mission.belief.contact import (
     HANGING_DWELL_S,
     MAX_RAW_THRUST,
     MAX_STANDING_HEIGHT_M,
     MOTORS_STOPPED,
     SUPPORT_CONDITIONS,
-    SUPPORTED_BY_IMU,
+    SUPPORT_SHOWN_BY_IMU,
     is_evidence_fresh,
-    is_hover_thrust,
+    is_flying_at_hover_thrust,
     is_thrust_too_low_to_fly,
 )
-from perchctl.mission.belief.evidence import Condition, keep_independent, update_start_times
+from perchctl.mission.belief.evidence import (
+    Condition,
+    keep_persistent_start_times,
+    update_start_times,
+)
 from perchctl.mission.belief.maneuver import SentOrders
 from perchctl.mission.belief.motion import ZERO, Vector
 from perchctl.mission.belief.mounting import MountingMonitor, make_mounting_sample, update_monitor
 from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
-    MAX_HEIGHT_STEP_S,
-    MAX_STEP_INTERVAL_S,
+    MAX_HEIGHT_INTEGRATION_STEP_S,
+    MAX_POSITION_STEP_INTERVAL_S,
     DeadReckoning,
-    add_position_step,
+    accumulate_position_step,
     add_sighting,
     advance_reckoning,
     learn_bias_at_rest,
     learn_velocity_bias,
-    reset_means,
+    reset_velocity_bias_means,
 )
 from perchctl.mission.observation import Observation
 from perchctl.profile import Profile
@@ -61,7 +65,7 @@ MAX_TARGET_SUPPORT_DISTANCE_M = 0.3
 """Distance below the target within which any support is the target, m."""
 REST_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
-MAX_SAMPLE_WEIGHT_S = 0.1
+MAX_SAMPLE_DURATION_S = 0.1
 """Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
 single sample has the weight of many."""
 MAX_THRUST_MISMATCH_FRACTION = 0.12
@@ -71,7 +75,7 @@ KEEPALIVE_THRUST = 1000
 LEAN_TIME_CONSTANT_S = 0.5
 """Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
-SPREAD_DECAY_FACTOR = 0.9
+TARGET_SCATTER_DECAY_PER_FRAME = 0.9
 """Share of the target's spread that remains after each frame."""
 
 
@@ -81,20 +85,20 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
     A wrong observation makes the belief wrong for some seconds; each part documents the data it
     depends on.
     """
-    b = replace(belief, obs=obs, profile=profile, sent=sent, frame_shift_m=ZERO)
+    b = replace(belief, obs=obs, profile=profile, sent=sent, world_frame_shift_m=ZERO)
     b = _update_target(b)
     if has_gap(belief, obs, profile):
         b = _reset_after_gap(b)
     if b.is_position_stale:
-        b = replace(b, last_stale_s=obs.t_s)
+        b = replace(b, position_last_stale_at_s=obs.t_s)
     if obs.jumped:
         b = _shift_belief_frame(b)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        b = replace(b, heading_lost=True, hover=hover.estimate_hover_thrust(b))
+        b = replace(b, heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
     b = _compare_ordered_thrust(b)
     b = _update_dead_reckoning(b)
     comes_down = sent.maneuver.descends and sent.is_under_power
-    if comes_down and b.dead_reckoned_s is None and b.has_lost_position:
+    if comes_down and b.dead_reckoning_since_s is None and b.has_no_position_for_descent:
         b = start_dead_reckoning(b)
     return _update_estimators(b)
 
@@ -108,16 +112,16 @@ def start_dead_reckoning(b: Belief) -> Belief:
     """Return the belief that, permanently, uses only accelerometer and attitude."""
     return replace(
         b,
-        dead_reckoned_s=b.obs.t_s,
+        dead_reckoning_since_s=b.obs.t_s,
         reckoned_height_m=b.height_m,
-        hover=hover.estimate_hover_thrust(b),
+        hover_thrust_estimate=hover.estimate_hover_thrust(b),
     )
 
 
 def reset_evidence(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: all conditions restart, except for those that
     are independent of the phase."""
-    return replace(b, since=keep_independent(b.since))
+    return replace(b, since=keep_persistent_start_times(b.since))
 
 
 def update_after_command(b: Belief, command: Command) -> Belief:
@@ -137,27 +141,31 @@ def _update_target(b: Belief) -> Belief:
     target = b.obs.target
     if not b.obs.new_frame or target is None or not target.measured:
         return b
-    b = replace(b, target_motion=b.target_motion.with_detection(target))
+    b = replace(b, visual_motion=b.visual_motion.with_detection(target))
     if target.world_m is None:
         return b
     spread_m = 0.0
     if b.last_target_world_m is not None:
         moved_m = float(np.linalg.norm(target.world_m - b.last_target_world_m))
-        spread_m = max(moved_m, SPREAD_DECAY_FACTOR * b.target_spread_m)
-    return replace(b, last_target_world_m=target.world_m, target_spread_m=spread_m)
+        spread_m = max(moved_m, TARGET_SCATTER_DECAY_PER_FRAME * b.target_position_scatter_m)
+    return replace(b, last_target_world_m=target.world_m, target_position_scatter_m=spread_m)
 
 
 def _reset_after_gap(b: Belief) -> Belief:
     """Return the belief after a gap in which the planner did not run: all conditions restart."""
     imu = b.obs.imu
-    kept: dict[Condition[Any], float] = keep_independent(b.since)
-    off_s = max(imu.off_s, imu.silent_s)
+    kept: dict[Condition[Any], float] = keep_persistent_start_times(b.since)
+    off_s = max(imu.motors_off_since_s, imu.last_silence_end_s)
     if MOTORS_STOPPED in b.since and math.isfinite(off_s):
         # All samples from the gap have arrived, and the motors are off in each. Without this
         # exception, a loop with a gap in every tick would never see the end of a landing.
         kept[MOTORS_STOPPED] = max(off_s, b.since[MOTORS_STOPPED])
     return replace(
-        b, since=kept, last_stale_s=b.obs.t_s if b.is_target_positioned else b.last_stale_s
+        b,
+        since=kept,
+        position_last_stale_at_s=b.obs.t_s
+        if b.is_positioned_by_target
+        else b.position_last_stale_at_s,
     )
 
 
@@ -167,32 +175,39 @@ def _shift_belief_frame(b: Belief) -> Belief:
     samples are missing before the jump, since the vehicle may have moved, or if external positions
     have just returned and the jump ends a drift."""
     obs, last = b.obs, b.last_telemetry
-    first_jump_s = obs.t_s if b.first_jump_s is None else b.first_jump_s
+    first_estimate_jump_at_s = (
+        obs.t_s if b.first_estimate_jump_at_s is None else b.first_estimate_jump_at_s
+    )
     if last is None:
-        return replace(b, first_jump_s=first_jump_s)
+        return replace(b, first_estimate_jump_at_s=first_estimate_jump_at_s)
     tel = obs.telemetry
     x, y, z = tel.position_m
     vx, vy, vz = tel.velocity_mps
     dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
     lx, ly, lz = last.position_m
     moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
-    returns = b.last_stale_s is not None and obs.t_s - b.last_stale_s <= POSITION_SETTLING_S
-    if dt_s > MAX_STEP_INTERVAL_S or returns:
+    returns = (
+        b.position_last_stale_at_s is not None
+        and obs.t_s - b.position_last_stale_at_s <= POSITION_SETTLING_AFTER_GAP_S
+    )
+    if dt_s > MAX_POSITION_STEP_INTERVAL_S or returns:
         moved_m = (0.0, 0.0, 0.0)
     setpoint = b.sent.setpoint
     if setpoint is not None:
-        z_m = z if b.contact_z_m is None else setpoint.z_m + moved_m[2]
+        z_m = z if b.last_contact_body_z_m is None else setpoint.z_m + moved_m[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
     return replace(
         b,
-        reckoning=reset_means(b.reckoning),
+        reckoning=reset_velocity_bias_means(b.reckoning),
         takeoff_position_m=None
         if b.takeoff_position_m is None
         else _translate(b.takeoff_position_m, moved_m),
-        contact_z_m=None if b.contact_z_m is None else b.contact_z_m + moved_m[2],
+        last_contact_body_z_m=None
+        if b.last_contact_body_z_m is None
+        else b.last_contact_body_z_m + moved_m[2],
         sent=b.sent.with_frame_shift(setpoint, moved_m),
-        frame_shift_m=moved_m,
-        first_jump_s=first_jump_s,
+        world_frame_shift_m=moved_m,
+        first_estimate_jump_at_s=first_estimate_jump_at_s,
     )
 
 
@@ -220,14 +235,14 @@ def _update_dead_reckoning(b: Belief) -> Belief:
     """Return the belief with the reckoning one tick later, the time within the magnet's reach, and
     the height of a vehicle without a position."""
     new = _integrate_reckoning(b)
-    new = _stop_at_contact(b, new)
+    new = _stop_reckoning_at_contact(b, new)
     new = _adopt_camera_velocity(b, new)
     new = _restart_at_sighting(b, new)
     new = _correct_supported_height(b, new)
     return replace(
         b,
         reckoning=new,
-        in_reach_since_s=_find_in_reach_since_s(b, new),
+        in_magnet_reach_since_s=_find_in_magnet_reach_since_s(b, new),
         reckoned_height_m=b.reckoned_height_m + _climb_since_last_tick_m(b, new),
     )
 
@@ -235,45 +250,51 @@ def _update_dead_reckoning(b: Belief) -> Belief:
 def _integrate_reckoning(b: Belief) -> DeadReckoning:
     """Integrate accelerometer and estimate, and learn biases from positions in free air."""
     obs, source = b.obs, b.profile.positioning.source
-    believed = (
+    is_estimate_believed = (
         b.is_position_valid
         and b.is_telemetry_fresh
-        and b.dead_reckoned_s is None
-        and b.first_jump_s is None
+        and b.dead_reckoning_since_s is None
+        and b.first_estimate_jump_at_s is None
     )
     new = advance_reckoning(
         b.reckoning,
         obs.imu,
         obs.telemetry,
-        believed=believed,
-        diverged=b.diverged and not source.is_target,
-        corrected=b.is_velocity_corrected,
+        is_estimate_believed=is_estimate_believed,
+        is_position_diverged=b.is_position_diverged and not source.is_target,
+        is_position_correcting_velocity=b.is_position_correcting_velocity,
         # A motion that no sighting has corrected yet is not a bias of the accelerometer.
-        pushed=source.is_target and not b.is_velocity_corrected,
+        ignores_lateral_estimate=source.is_target and not b.is_position_correcting_velocity,
     )
     in_free_air = b.sent.maneuver.in_free_air and b.height_m > MAX_STANDING_HEIGHT_M
-    if believed and b.is_velocity_corrected and in_free_air and b.last_telemetry:
+    if (
+        is_estimate_believed
+        and b.is_position_correcting_velocity
+        and in_free_air
+        and b.last_telemetry
+    ):
         new = learn_velocity_bias(new, b.last_telemetry, obs.telemetry)
     else:
-        new = reset_means(new)
+        new = reset_velocity_bias_means(new)
     if b.is_position_trusted and not source.is_target and b.last_telemetry is not None:
-        new = add_position_step(new, b.last_telemetry, obs.telemetry)
+        new = accumulate_position_step(new, b.last_telemetry, obs.telemetry)
     return new
 
 
-def _stop_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Set the velocity to zero for a vehicle that has been steady at its contact, or within the
     magnet's reach at a thrust too small to support it: otherwise the accelerometer's bias would
     carry a hanging vehicle out of the reach within ten seconds."""
     obs = b.obs
     rests = (
-        obs.t_s - obs.imu.steady_s >= REST_DWELL_S and obs.t_s - obs.imu.fell_s > HANGING_DWELL_S
+        obs.t_s - obs.imu.climb_steady_since_s >= REST_DWELL_S
+        and obs.t_s - obs.imu.last_fall_at_s > HANGING_DWELL_S
     )
-    hangs = b.in_reach_since_s is not None and is_thrust_too_low_to_fly(b)
-    touched = b.contact_z_m is not None or hangs
+    hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
+    touched = b.last_contact_body_z_m is not None or hangs
     if not touched or not new.distance_below_m < MAGNET_REACH_M or not rests:
         return new
-    is_laterally_unsteady = obs.t_s - obs.imu.steady_aside_s < REST_DWELL_S
+    is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < REST_DWELL_S
     x_mps, y_mps, _ = new.velocity_mps
     new = replace(
         new, velocity_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
@@ -310,17 +331,21 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     if target is None:
         return new
     seen = obs.new_frame and target.measured
-    if not seen and not (b.is_position_valid and not b.is_target_positioned):
+    if not seen and not (b.is_position_valid and not b.is_positioned_by_target):
         return new
     yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     sigma_m = float(max(target.sigma_m[:2]))
     lateral_offset_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-    if not seen and b.last_stale_s is not None and b.last_stale_s >= target.measured_s:
+    if (
+        not seen
+        and b.position_last_stale_at_s is not None
+        and b.position_last_stale_at_s >= target.measured_s
+    ):
         lateral_offset_m, sigma_m = new.lateral_offset_m, new.lateral_sigma_m
     new = add_sighting(new, target.measured_s, lateral_offset_m, float(ez), sigma_m)
     if seen and target.measured_s > new.last_position_step_s:
-        new = replace(new, position_step_sum_m=(0.0, 0.0))
+        new = replace(new, position_step_sum_xy_m=(0.0, 0.0))
     return new
 
 
@@ -328,11 +353,11 @@ def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Correct the height with the target alone: a support just below the target is the target. Late
     pictures make the vehicle seem lower."""
     near = (
-        b.is_target_positioned
+        b.is_positioned_by_target
         and not b.sent.maneuver.descends
         and new.distance_below_m < MAX_TARGET_SUPPORT_DISTANCE_M
     )
-    if not near or b.held_s(SUPPORTED_BY_IMU) < b.profile.planner.perch.contact_dwell_s:
+    if not near or b.held_s(SUPPORT_SHOWN_BY_IMU) < b.profile.planner.perch.contact_dwell_s:
         return new
     return replace(
         new,
@@ -342,34 +367,36 @@ def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
     )
 
 
-def _find_in_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
+def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
     """Return the time since which the magnet may hold the vehicle."""
-    in_reach_since_s = b.in_reach_since_s
+    in_magnet_reach_since_s = b.in_magnet_reach_since_s
     # a released or stopped vehicle does not move into or out of reach
     if not b.sent.is_under_power:
-        return in_reach_since_s
+        return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the reckoning says.
     near = new.distance_below_m < MAGNET_REACH_M and b.sent.floor_detected_s is None
-    if b.contact_z_m is None and not near:
+    if b.last_contact_body_z_m is None and not near:
         return None
     # A vehicle caught below the magnet may be drawn to it again, so an earlier fall proves nothing.
     again = (
-        in_reach_since_s is not None
-        and b.imu.fell_s > in_reach_since_s
+        in_magnet_reach_since_s is not None
+        and b.imu.last_fall_at_s > in_magnet_reach_since_s
         and new.distance_below_m < MAGNET_REACH_M
     )
-    return b.obs.t_s if in_reach_since_s is None or again else in_reach_since_s
+    return b.obs.t_s if in_magnet_reach_since_s is None or again else in_magnet_reach_since_s
 
 
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     """Return the climb since the previous tick of a vehicle without a position, m; 0 with a
     position."""
     obs, before, last = b.obs, b.reckoning.imu, b.last_telemetry
-    if b.dead_reckoned_s is None or before is None:
+    if b.dead_reckoning_since_s is None or before is None:
         return 0.0
-    dt_s = max(0.0, min(MAX_HEIGHT_STEP_S, obs.imu.t_s - before.t_s))
+    dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
     tel = obs.telemetry
-    heard_again = obs.imu.silent_s > before.t_s and b.is_telemetry_fresh and not obs.jumped
+    heard_again = (
+        obs.imu.last_silence_end_s > before.t_s and b.is_telemetry_fresh and not obs.jumped
+    )
     if heard_again and last is not None and tel.start == last.start:
         return tel.position_m[2] - last.position_m[2]
     return new.velocity_mps[2] * dt_s
@@ -385,39 +412,42 @@ def _update_estimators(b: Belief) -> Belief:
     fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]
     since: dict[Condition[Any], float] = update_start_times(b.since, fresh, b, obs.t_s)
     if held:
-        since = keep_independent(since)  # a hold interrupts the evidence
+        since = keep_persistent_start_times(since)  # a hold interrupts the evidence
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
-    sample_s = max(0.0, min(MAX_SAMPLE_WEIGHT_S, obs.telemetry.t_s - last_s))  # 0: no new sample
+    # 0: no new sample
+    sample_dt_s = max(0.0, min(MAX_SAMPLE_DURATION_S, obs.telemetry.t_s - last_s))
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.climbs_to_target or b.target.error_z_m > near_m
     b = replace(
-        b, hover=b.hover.propagate_unmeasured(dt_s), rotor_thrust=hover.rotor_thrust(b, sample_s)
+        b,
+        hover_thrust_estimate=b.hover_thrust_estimate.propagate_unmeasured(dt_s),
+        rotor_thrust=hover.rotor_thrust(b, sample_dt_s),
     )
-    found = b.hover
-    if away and maneuver.learns_hover_thrust and is_hover_thrust(b):
-        found = hover.learn_in_quiet_flight(b, sample_s)
+    found = b.hover_thrust_estimate
+    if away and maneuver.learns_hover_thrust and is_flying_at_hover_thrust(b):
+        found = hover.learn_in_quiet_flight(b, sample_dt_s)
     elif b.sent.is_level_descent:
-        found = hover.learn_in_descent(b, sample_s)
+        found = hover.learn_in_descent(b, sample_dt_s)
     mah = b.profile.vehicle.battery_mah
     return replace(
         b,
         t_s=obs.t_s,
         last_telemetry=obs.telemetry,
         since=since,
-        hover=found,
+        hover_thrust_estimate=found,
         battery_fit=update_from_telemetry(
             b.battery_fit, obs.telemetry, obs.battery_age_s, dt_s, mah
         ),
         mounting=b.mounting if held else _update_mounting(b),
-        mean_lean=_filter_lean(b, sample_s),
+        mean_lean_sine_world_xy=_filter_lean(b, sample_dt_s),
     )
 
 
-def _filter_lean(b: Belief, sample_s: float) -> tuple[float, float]:
+def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
     """Return the mean lean after a sample that covers `sample_s`."""
-    gain = 1.0 - math.exp(-sample_s / LEAN_TIME_CONSTANT_S)
-    (x, y), (mean_x, mean_y) = b.lean, b.mean_lean
+    gain = 1.0 - math.exp(-sample_dt_s / LEAN_TIME_CONSTANT_S)
+    (x, y), (mean_x, mean_y) = b.lean_sine_world_xy, b.mean_lean_sine_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)
 
 

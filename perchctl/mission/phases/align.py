@@ -52,7 +52,9 @@ def hover_height_m(c: Context) -> float | None:
     """Return the height above the ground at which the vehicle would hover below the target, m; None
     if the mission does not hover."""
     hover, b = c.planner.hover, c.belief
-    return None if hover is None else b.target.contact_body_z_m - hover.below_m - b.ground_z_m
+    return (
+        None if hover is None else b.target.body_z_touching_target_m - hover.below_m - b.ground_z_m
+    )
 
 
 def is_hover_height_unsafe(c: Context) -> bool:

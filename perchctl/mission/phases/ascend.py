@@ -77,7 +77,7 @@ def _is_at_hover_place(c: Context) -> bool:
     hovers. The tolerances are those of ALIGN, since the small marker may be too far away to be
     seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
-    goal_z_m = target.contact_body_z_m - standoff_m(c)
+    goal_z_m = target.body_z_touching_target_m - standoff_m(c)
     return (
         target.is_fresh
         and setpoint is not None
@@ -98,7 +98,7 @@ def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, every moment without it is too long, since the position drifts."""
     b = c.belief
-    patience_s = 0.0 if b.is_target_positioned else MAX_TARGET_LOST_S
+    patience_s = 0.0 if b.is_positioned_by_target else MAX_TARGET_LOST_S
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 
@@ -125,7 +125,7 @@ def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
-    goal_z = target.contact_body_z_m - standoff_m(c)
+    goal_z = target.body_z_touching_target_m - standoff_m(c)
     may_climb = target.is_fresh and target.error_xy_m < CLIMB_CONE_FRACTION * cone_radius_m(c)
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps

@@ -7,8 +7,8 @@ from perchctl.mission.belief.contact import (
     MAGNET_HOLDS,
     MOTORS_OFF_DWELL_S,
     MOTORS_STOPPED,
+    gear_offset_at_last_touch_or_now,
     has_slipped,
-    newest_contact_offset,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
@@ -29,8 +29,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
     belief = replace(
         state.belief,
-        contact_z_m=before.telemetry.position_m[2],
-        contact=newest_contact_offset(before.belief),
+        last_contact_body_z_m=before.telemetry.position_m[2],
+        contact=gear_offset_at_last_touch_or_now(before.belief),
     )
     return replace(state, belief=belief, released_s=None)
 

@@ -17,7 +17,10 @@ UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tra
 """The target is not tracked."""
 ESTIMATED = Condition[Context](
     "estimated",
-    lambda c: c.belief.target.is_fresh and c.belief.target_spread_m <= c.planner.estimate.spread_m,
+    lambda c: (
+        c.belief.target.is_fresh
+        and c.belief.target_position_scatter_m <= c.planner.estimate.spread_m
+    ),
 )
 """The target is fresh, and its position is steady within `estimate.spread_m`."""
 

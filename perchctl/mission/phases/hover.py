@@ -68,7 +68,7 @@ def act(c: Context) -> Action:
     """Stay under the target at the setpoint's height; sink if the target is nearer than it should
     be."""
     old = c.state.setpoint or hold_here(c)
-    goal_z_m = c.belief.target.contact_body_z_m - hover_of(c).below_m
+    goal_z_m = c.belief.target.body_z_touching_target_m - hover_of(c).below_m
     return fly_under_target(c, min(old.z_m, goal_z_m + MAX_HOVER_RISE_M))
 
 

@@ -25,8 +25,10 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     # then accelerate the landing until the vehicle tips over.
     capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong
     if Claim.POSITIONS_WRONG in claims or (Claim.MOUNTING_WRONG in claims and capture):
-        reckoning = b.reckoning if b.diverged else correct_bias_for_wrong_positions(b.reckoning)
-        b = replace(b, diverged=True, reckoning=reckoning)
+        reckoning = (
+            b.reckoning if b.is_position_diverged else correct_bias_for_wrong_positions(b.reckoning)
+        )
+        b = replace(b, is_position_diverged=True, reckoning=reckoning)
     if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
         b = replace(b, contact=None)  # no evidence of a support at that position
     # With a wrong mounting, the setpoint leads in a wrong direction.
@@ -87,7 +89,7 @@ LANDING = PhaseDefinition(
                 "motors off"
                 + (
                     ""
-                    if c.belief.dead_reckoned_s is None
+                    if c.belief.dead_reckoning_since_s is None
                     else "; the height was dead-reckoned during the descent"
                 )
             ),

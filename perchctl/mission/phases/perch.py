@@ -13,7 +13,7 @@ obstacle. No hold applies in this phase because a hold would leave the vehicle p
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import CONTACT, contact_offset
+from perchctl.mission.belief.contact import CONTACT, current_gear_offset
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.quality import LATERAL_BLOW, position_loss_text
 from perchctl.mission.context import Context
@@ -49,7 +49,7 @@ def act(c: Context) -> Action:
     old = c.state.setpoint or hold_here(c)
     if target.world_m is None:
         return fly_to(c, old, lift=False)
-    goal = setpoint_under_target(c, target.contact_body_z_m + perch.press_m)
+    goal = setpoint_under_target(c, target.body_z_touching_target_m + perch.press_m)
     setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
     return fly_to(c, setpoint, lift=False)
 
@@ -64,7 +64,7 @@ def contact_reason(c: Context) -> str:
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
         by = f"acceleration and thrust ({position_loss_text(c.belief)})"
-    return f"contact proven by {by}; {contact_offset(c.belief).text}"
+    return f"contact proven by {by}; {current_gear_offset(c.belief).text}"
 
 
 PERCH = PhaseDefinition(
@@ -77,15 +77,17 @@ PERCH = PhaseDefinition(
             {Phase.PERCH},
             lambda c: (
                 is_in_contact(c)
-                and not contact_offset(c.belief).is_within(c.planner.perch.contact_xy_m)
+                and not current_gear_offset(c.belief).is_within(c.planner.perch.contact_xy_m)
             ),
-            lambda c: f"contact {contact_offset(c.belief).text}",
+            lambda c: f"contact {current_gear_offset(c.belief).text}",
         ),
         Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_reason),
         back_off_row(
             "pressed-blindly",
             {Phase.PERCH},
-            lambda c: c.belief.is_target_positioned and c.belief.position_age_s > MAX_BLIND_PRESS_S,
+            lambda c: (
+                c.belief.is_positioned_by_target and c.belief.position_age_s > MAX_BLIND_PRESS_S
+            ),
             lambda c: (
                 f"no contact {c.belief.position_age_s:.1f} s after the last sighting of the target"
             ),

@@ -7,8 +7,8 @@ import math
 from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import (
     CONTACT,
-    SUPPORTED_BY_IMU,
-    contact_offset,
+    SUPPORT_SHOWN_BY_IMU,
+    current_gear_offset,
     is_at_contact_height,
 )
 from perchctl.mission.belief.evidence import Condition
@@ -61,7 +61,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
         state.belief,
         contact=_find_touch_offset(before, claims),
         # The vehicle counts as within the magnet's reach until its position is below.
-        contact_z_m=z_m if touched else b.contact_z_m,
+        last_contact_body_z_m=z_m if touched else b.last_contact_body_z_m,
     )
     return replace(
         state,
@@ -79,12 +79,12 @@ def _find_touch_offset(before: Context, claims: Claim) -> ContactOffset | None:
     if Claim.STILL_ATTACHED in claims:  # the contact was proven, and the vehicle has not come off
         return b.contact
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
-        return b.contact if b.contact_z_m is not None else None
+        return b.contact if b.last_contact_body_z_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
-    # `SUPPORTED_BY_IMU` includes that dwell time
-    carried = proven or b.held_s(SUPPORTED_BY_IMU) >= 0.0
+    # `SUPPORT_SHOWN_BY_IMU` includes that dwell time
+    carried = proven or b.held_s(SUPPORT_SHOWN_BY_IMU) >= 0.0
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
-        return contact_offset(b)
+        return current_gear_offset(b)
     return None
 
 
@@ -119,7 +119,7 @@ def has_recovered(c: Context) -> bool:
     """True if the vehicle has been steady for `recover.dwell_s`, away from its contact."""
     dwell_s = c.planner.recover.dwell_s
     steady = c.held_s(STEADY) >= dwell_s and c.in_phase_s >= dwell_s
-    return steady and c.belief.contact_z_m is None
+    return steady and c.belief.last_contact_body_z_m is None
 
 
 def unsteady_reason(c: Context) -> str:
@@ -130,7 +130,7 @@ def unsteady_reason(c: Context) -> str:
         x_m, y_m, _ = c.telemetry.position_m
         lateral_offset_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
         seen.append(f"{lateral_offset_m:.2f} m from its setpoint")
-    if b.contact_z_m is not None:
+    if b.last_contact_body_z_m is not None:
         seen.append("still at its contact")
     text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
     return f"{text}: {', '.join(seen)}" if seen else text

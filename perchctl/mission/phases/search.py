@@ -43,9 +43,9 @@ def act(c: Context) -> Action:
     x, y, z = state.entry.position_m
     if b.target.world_m is not None:
         there = body_xy_under_target(c, state.entry.yaw_rad)
-        unconfirmed = b.mounting.is_unconfirmed
+        unconfirmed = b.mounting.is_awaiting_evidence
         x, y = _limit_distance(b.mounting, (x, y), there) if unconfirmed else there
-        height = min(z, b.target.contact_body_z_m - c.planner.ascend.near_m)
+        height = min(z, b.target.body_z_touching_target_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
@@ -63,7 +63,10 @@ def _limit_distance(
     """Return the goal, world x and y (m), limited to `MAX_UNCONFIRMED_DISTANCE_M` from the last
     sighting, else from `start`."""
     if mount.sightings:
-        start = (mount.sightings[-1].vehicle_m.real, mount.sightings[-1].vehicle_m.imag)
+        start = (
+            mount.sightings[-1].vehicle_world_xy_m.real,
+            mount.sightings[-1].vehicle_world_xy_m.imag,
+        )
     dx, dy = goal[0] - start[0], goal[1] - start[1]
     part = min(1.0, MAX_UNCONFIRMED_DISTANCE_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
