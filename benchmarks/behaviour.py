@@ -92,9 +92,9 @@ def print_decisions(log: Path) -> None:
         decided = {
             "kind": "decision",
             "phase": new.phase.value,
-            "row": new.row,
+            "row": new.row_name,
             "hold": new.hold,
-            "attempts": new.attempts,
+            "attempts": new.failed_attempts,
             "command": [type(command).__name__, to_exact_json(command)],
             "outcome": None if new.outcome is None else new.outcome.value,
             "reason": new.reason,

@@ -189,7 +189,7 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         ):
             filter_.add_velocity(b, dt_s)
         pose = next((turn.poses[n] for n in ("joint", "large", "small") if n in turn.poses), None)
-        if pose is not None and b.mismatch.later_s == 0.0:
+        if pose is not None and b.camera_imu_mismatch.camera_latency_error_s == 0.0:
             filter_.add_pose(pose)
         yield Moment(b, tuple(axis.copy(i) for i, axis in enumerate(filter_.axes)))
 

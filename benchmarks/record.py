@@ -35,8 +35,8 @@ from perchctl.mission import (
     Observation,
     PlannerState,
     Tick,
-    Turn,
-    TurnInputs,
+    TickInputs,
+    TickRecord,
     UnfilteredPose,
 )
 from perchctl.profile import Profile
@@ -141,14 +141,14 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     found = {} if output is None else output.poses
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
     state = PlannerState.on_ground(obs, Profile())
-    turn = Turn(
+    turn = TickRecord(
         number=number, role="flown", began_s=t_s, t_s=t_s,
-        taken=TurnInputs(samples, frame=seen),
+        inputs=TickInputs(samples, frame=seen),
         poses={name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
-        observation=obs, command=command, phase=state.phase, row="seek",
+        observation=obs, command=command, phase=state.phase, row_name="seek",
         reason="the target is looked for",
     )  # fmt: skip
-    return Tick(turn=turn, state=state, output=output)
+    return Tick(record=turn, state=state, output=output)
 
 
 def percentiles(values: list[float]) -> NDArray[np.float64]:

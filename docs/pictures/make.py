@@ -50,7 +50,7 @@ from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import status_panel  # noqa: E402
 from perchctl.flight import KEY_HELP, STOP_HELP, FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import Observation, Phase, PlannerState, Tick, Turn, TurnInputs  # noqa: E402
+from perchctl.mission import Observation, Phase, PlannerState, Tick, TickInputs, TickRecord  # noqa: E402
 from perchctl.mission.state import BatteryOutlook, PhaseEntry  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -148,18 +148,18 @@ class Flight:
         on_ground = replace(telemetry, position_m=(0.0, 0.0, first["z_m"]))
         state = replace(
             PlannerState.on_ground(Observation(t_s, on_ground), self.profile),
-            phase=Phase(r["phase"]), attempts=r["attempts"], battery=battery,
+            phase=Phase(r["phase"]), failed_attempts=r["attempts"], battery=battery,
             entry=PhaseEntry(t_s=t_s - (since_s - span.start_s), reason=r["reason"]),
         )  # fmt: skip
         obs = Observation(
             t_s, replace(telemetry, behind_s=r["tel_age_s"]), target,
-            camera_age_s=r["cam_age_s"], loop_late_s=r["late_s"],
+            last_good_frame_age_s=r["cam_age_s"], loop_late_s=r["late_s"],
         )  # fmt: skip
-        turn = Turn(
-            number=index, role="flown", began_s=t_s, t_s=t_s, taken=TurnInputs(),
+        turn = TickRecord(
+            number=index, role="flown", began_s=t_s, t_s=t_s, inputs=TickInputs(),
             observation=obs, command=Idle(),
         )  # fmt: skip
-        return Tick(turn=turn, state=state)
+        return Tick(record=turn, state=state)
 
 
 # --- the pictures ---------------------------------------------------------------------

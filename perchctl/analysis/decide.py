@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.errors import InvalidValue
-from perchctl.mission import Observation, PlannerState, Turn, load_table, step_mission
+from perchctl.mission import Observation, PlannerState, TickRecord, load_table, step_mission
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, log_names, to_exact_json
 from perchctl.vehicle import Command
@@ -36,12 +36,12 @@ class ReplayedDecision:
     """
 
     tick: int
-    turn: Turn
+    turn: TickRecord
     difference: FieldDifference | None
     error: str | None = None
 
 
-def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
+def turns_and_gap_text(log: FlightLog) -> tuple[list[TickRecord], str]:
     """The turns before the first turn missing from the log, and a sentence that names the missing
     turn, or says that the last ones may be missing (empty for a whole log). Errors:
     InvalidValue."""
@@ -68,9 +68,9 @@ def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
 
 
 def replay_decisions(
-    turns: Iterable[Turn],
+    turns: Iterable[TickRecord],
     profile: Profile,
-    observation_of: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
+    observation_of: Callable[[TickRecord], Observation | None] = lambda turn: turn.observation,
     comparison: Comparison | None = None,
 ) -> Iterator[ReplayedDecision]:
     """Replay the planner turn by turn.
@@ -101,7 +101,7 @@ def replay_decisions(
 
 
 def _difference(
-    turn: Turn, state: PlannerState, command: Command, comparison: Comparison
+    turn: TickRecord, state: PlannerState, command: Command, comparison: Comparison
 ) -> FieldDifference | None:
     if turn.role == "failed":
         return comparison.difference("error", turn.error, None)
@@ -109,14 +109,14 @@ def _difference(
         return None
     replayed = {
         "phase": state.phase,
-        "row": state.row,
-        "held": bool(state.hold),
-        "attempts": state.attempts,
+        "row_name": state.row_name,
+        "is_holding_position": bool(state.hold),
+        "failed_attempts": state.failed_attempts,
         "command": command,
         "outcome": state.outcome,
         "reason": state.reason,
     }
-    logged = log_names(Turn)
+    logged = log_names(TickRecord)
     return comparison.first_difference(
         (logged.keys[n], getattr(turn, n), value)
         for n, value in replayed.items()

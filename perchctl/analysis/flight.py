@@ -291,12 +291,12 @@ def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None
-        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
+        if last is None or last.sender != each.sender or each.t_s - last.t_s > APART_S:
             goes.append([])
         goes[-1].append(each)
     return tuple(
         Takeover(
-            go[0].by,
+            go[0].sender,
             log.to_flight_s(go[0].t_s),
             log.to_flight_s(go[-1].t_s),
             dict(Counter(_BETWEEN.sub(" ", type(each.command).__name__).lower() for each in go)),

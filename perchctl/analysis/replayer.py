@@ -19,7 +19,7 @@ from perchctl.analysis.sense import Picture, PictureMissing, ReplayedInputs, rep
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import FlightInputs
-from perchctl.mission import Observation, Turn
+from perchctl.mission import Observation, TickRecord
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, log_names
 from perchctl.vision import Pipeline, make_pipeline
@@ -277,7 +277,7 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
 
 
 def _replayed(
-    turns: Sequence[Turn],
+    turns: Sequence[TickRecord],
     profile: Profile,
     pipeline: Pipeline,
     pictures: Iterable[Picture],
@@ -296,7 +296,7 @@ def _replayed(
 
 def _differing(
     log: FlightLog,
-    turns: Sequence[Turn],
+    turns: Sequence[TickRecord],
     found: Iterable[ReplayedInputs],
     comparison: Comparison,
 ) -> Iterator[Difference]:
@@ -317,5 +317,7 @@ def _differing(
         tick += each.turn.role in ("waiting", "flown")
 
 
-def _frames_of(turns: Iterable[Turn]) -> int:
-    return sum(turn.taken.frame is not None and turn.taken.look for turn in turns)
+def _frames_of(turns: Iterable[TickRecord]) -> int:
+    return sum(
+        turn.inputs.frame is not None and turn.inputs.is_detection_requested for turn in turns
+    )

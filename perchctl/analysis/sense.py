@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import FlightInputs
-from perchctl.mission import FrameRecord, Observation, Turn, TurnInputs, UnfilteredPose
+from perchctl.mission import FrameRecord, Observation, TickInputs, TickRecord, UnfilteredPose
 from perchctl.opencv_threads import one_thread
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
@@ -40,7 +40,7 @@ class ReplayedInputs:
     """Replayed inputs of a turn: the markers' `poses` by name, and the recorded `observation` with
     replayed perception, None for a turn without an observation."""
 
-    turn: Turn
+    turn: TickRecord
     poses: dict[str, UnfilteredPose]
     observation: Observation | None
 
@@ -56,13 +56,13 @@ class _Given:
         self._pictures = _readable(pictures)
         self._name: str | None = None  # of the flown source, once it has ended
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
-        self._taken = TurnInputs()
+        self._taken = TickInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
 
-    def turn(self, turn: Turn) -> None:
-        taken, obs = turn.taken, turn.observation
-        self._taken, self._samples = taken, [taken.samples, taken.late]
-        if self._name is None and obs is not None and taken.ended:
+    def turn(self, turn: TickRecord) -> None:
+        taken, obs = turn.inputs, turn.observation
+        self._taken, self._samples = taken, [taken.samples, taken.late_samples]
+        if self._name is None and obs is not None and taken.has_source_ended:
             self._name = _ended_name(taken, obs)
 
     # As a link.
@@ -74,22 +74,22 @@ class _Given:
 
     @property
     def live(self) -> bool:
-        return self._taken.live
+        return self._taken.is_source_live
 
     @property
     def finished(self) -> bool:
-        return self._taken.ended
+        return self._taken.has_source_ended
 
     def poll(self, now_s: float) -> Frame | None:
         seen = self._taken.frame
         if seen is None:
             return None
         image = self._picture_of(seen)
-        t_s = seen.t_s + self._later_s if self._taken.live else seen.t_s
-        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.fields, seen.repeated)
+        t_s = seen.t_s + self._later_s if self._taken.is_source_live else seen.t_s
+        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.picture_kind, seen.repeated)
 
     def problem(self, now_s: float) -> str | None:
-        return self._taken.problem
+        return self._taken.camera_problem
 
     def describe(self) -> str:
         return self._name or "the recording"
@@ -98,7 +98,7 @@ class _Given:
         return None
 
     def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        if self._taken.problem is not None:  # nobody looked at it
+        if self._taken.camera_problem is not None:  # nobody looked at it
             return np.zeros((1, 1), np.uint8)
         image = self._repeated_picture(seen) if seen.repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
@@ -128,7 +128,7 @@ class _Given:
 
 
 def replay_inputs(
-    turns: Iterable[Turn],
+    turns: Iterable[TickRecord],
     profile: Profile,
     pipeline: Pipeline,
     pictures: Iterable[Picture],
@@ -145,23 +145,23 @@ def replay_inputs(
     with one_thread():
         for turn in turns:
             given.turn(turn)
-            taken = turn.taken
+            taken = turn.inputs
             inputs.poll_inputs(
                 turn.began_s,
-                search=taken.look,
-                sends_sights=taken.sends_sights,
-                drops_sightings=taken.drops_sightings,
+                search=taken.is_detection_requested,
+                sends_sights=taken.sends_sightings_as_position,
+                drops_sightings=taken.has_discarded_sightings,
             )
             if turn.t_s != turn.began_s:
                 inputs.catch_up(turn.began_s, turn.t_s)
             yield ReplayedInputs(turn, inputs.poses, _observed(turn, inputs))
 
 
-def _ended_name(taken: TurnInputs, obs: Observation) -> str | None:
+def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
     """Return the flown source's name from the camera's problem after its end, which alone has it.
     None if the problem is another one, so that the replay's differs from it."""
     told = obs.camera_problem
-    if told is None or taken.frame is not None or taken.problem is not None:
+    if told is None or taken.frame is not None or taken.camera_problem is not None:
         return None
     name = told.removesuffix(FlightInputs.ended_text(""))
     return name if told == FlightInputs.ended_text(name) else None
@@ -175,7 +175,7 @@ def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
         raise PictureMissing(str(error)) from error
 
 
-def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
+def _observed(turn: TickRecord, inputs: FlightInputs) -> Observation | None:
     if turn.observation is None or inputs.history.newest is None:
         return None
     seen = inputs.observation(turn.t_s)

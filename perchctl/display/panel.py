@@ -35,16 +35,20 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
     stage = "none" if target is None else target.stage.value
     height_m = tick.telemetry.position_m[2] - state.belief.ground_z_m
     ages = (
-        f"link {age_text(tick.telemetry_age_s)}   camera {age_text(tick.camera_age_s)}"
+        f"link {age_text(tick.telemetry_age_s)}   camera {age_text(tick.last_good_frame_age_s)}"
         f"   loop late {age_text(tick.loop_late_s)}"
     )
     return [
         ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
         ("error", error),
-        ("markers", f"{stage}   failed attempts {state.attempts}"),
+        ("markers", f"{stage}   failed attempts {state.failed_attempts}"),
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),
         ("ages", ages),
-        *([] if tick.outside is None else [("outside", _outside_text(tick.outside))]),
+        *(
+            []
+            if tick.external_positions is None
+            else [("outside", _outside_text(tick.external_positions))]
+        ),
         *([("hover", _hover_text(state))] if state.phase is Phase.HOVER else []),
         ("held" if state.pause_reason else "reason", state.pause_reason or state.reason),
     ]
@@ -96,7 +100,7 @@ def event_text(event: Event) -> str:
             text = f"holding: {event.reason}"
         case EventKind.NOTE:
             text = event.reason
-    return f"{text} (simulated: {event.simulated})" if event.simulated else text
+    return f"{text} (simulated: {event.simulated_fault})" if event.simulated_fault else text
 
 
 class FlightPanel(TerminalDisplay):

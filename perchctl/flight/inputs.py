@@ -16,8 +16,8 @@ from perchctl.mission import (
     FrameRecord,
     Observation,
     PlannerState,
-    Turn,
-    TurnInputs,
+    TickInputs,
+    TickRecord,
     UnfilteredPose,
 )
 from perchctl.perception import (
@@ -57,19 +57,19 @@ class FlightInputs:
     SENSED_FIELDS: ClassVar = (
         "telemetry",
         "target",
-        "new_frame",
-        "camera_age_s",
+        "has_new_frame",
+        "last_good_frame_age_s",
         "camera_problem",
         "battery_age_s",
-        "jumped",
-        "turned_rad",
-        "disagreeing_frames",
-        "delay_s",
-        "delay_sigma_s",
-        "target_refused",
+        "has_estimate_jumped",
+        "heading_jump_rad",
+        "successive_marker_conflicts",
+        "extra_camera_latency_s",
+        "camera_latency_sigma_s",
+        "target_refusal_reason",
         "imu",
-        "felt",
-        "mismatch",
+        "visual_inertial_motion",
+        "camera_imu_mismatch",
     )
     """The fields of an `Observation` that come from here; the others are the loop's."""
 
@@ -86,7 +86,7 @@ class FlightInputs:
     target_positioning: TargetPositioning | None = field(init=False, default=None)
     sends_sights: bool = True
     output: PipelineOutput | None = None  # of this tick's frame, if it was searched
-    taken: TurnInputs = field(default_factory=TurnInputs)  # in this tick
+    taken: TickInputs = field(default_factory=TickInputs)  # in this tick
     is_blind: bool = False
     repeated: bool = False  # this tick's frame is the one before
     last_good_frame_s: float = -math.inf
@@ -138,15 +138,15 @@ class FlightInputs:
             self.on_frame(frame)
             times_s = frame.t_s, frame.t_arrival_s
             seen = FrameRecord(frame.index, *times_s, frame.picture_kind, frame.repeated)
-        self.taken = TurnInputs(
+        self.taken = TickInputs(
             tuple(samples),
             frame=seen,
-            problem=problem,
-            ended=self.source.finished,
-            live=self.source.live,
-            look=search,
-            sends_sights=sends_sights,
-            drops_sightings=drops_sightings,
+            camera_problem=problem,
+            has_source_ended=self.source.finished,
+            is_source_live=self.source.live,
+            is_detection_requested=search,
+            sends_sightings_as_position=sends_sights,
+            has_discarded_sightings=drops_sightings,
         )
         if frame is None:
             if problem is None and self.source.finished:
@@ -220,7 +220,7 @@ class FlightInputs:
         """Take in the telemetry that came while camera or vision hung in the tick of `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
-        self.taken = replace(self.taken, late=tuple(late))
+        self.taken = replace(self.taken, late_samples=tuple(late))
         if self.last_good_frame_s == began_s:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone
 
@@ -232,19 +232,19 @@ class FlightInputs:
             t_s=now_s,
             telemetry=newest,
             target=self.target(now_s),
-            new_frame=self.output is not None,
-            camera_age_s=now_s - self.last_good_frame_s,
+            has_new_frame=self.output is not None,
+            last_good_frame_age_s=now_s - self.last_good_frame_s,
             camera_problem=self.camera_problem,
             battery_age_s=self.history.battery_age_s(now_s),
-            jumped=self.history.jumped,
-            turned_rad=self.history.turned_rad,
-            disagreeing_frames=perception.state.disagreeing_frames,
-            delay_s=perception.calibration.applied_delay_s,
-            delay_sigma_s=perception.latency_sigma_s,
-            target_refused=perception.refused,
+            has_estimate_jumped=self.history.jumped,
+            heading_jump_rad=self.history.turned_rad,
+            successive_marker_conflicts=perception.state.disagreeing_frames,
+            extra_camera_latency_s=perception.calibration.applied_delay_s,
+            camera_latency_sigma_s=perception.latency_sigma_s,
+            target_refusal_reason=perception.refused,
             imu=self.history.imu,
-            felt=perception.motion.motion,
-            mismatch=perception.motion.mismatch,
+            visual_inertial_motion=perception.motion.motion,
+            camera_imu_mismatch=perception.motion.mismatch,
         )
 
     @property
@@ -387,7 +387,7 @@ Decision = tuple[PlannerState, Command, FeedStatus | None]
 class TurnReporter:
     """Counts the loop's turns, and calls `report` with each."""
 
-    def __init__(self, report: Callable[[Turn], None]) -> None:
+    def __init__(self, report: Callable[[TickRecord], None]) -> None:
         self._report = report
         self._count = 0
         self._began_s = 0.0
@@ -399,14 +399,14 @@ class TurnReporter:
     def report_waiting_turn(
         self, inputs: FlightInputs, now_s: float, feed: FeedStatus | None
     ) -> None:
-        turn = Turn(
+        turn = TickRecord(
             number=self._counted(),
             role="waiting",
             began_s=now_s,
             t_s=now_s,
-            taken=inputs.taken,
+            inputs=inputs.taken,
             poses=inputs.poses,
-            outside=external_positions(feed),
+            external_positions=external_positions(feed),
         )
         self._report(turn)
 
@@ -435,12 +435,12 @@ class TurnReporter:
             self._report(self.flown_turn(inputs, obs, *decision))
         elif isinstance(error, Exception):  # else the planner was only interrupted
             self._open = None
-            turn = Turn(
+            turn = TickRecord(
                 number=self._counted(),
                 role="failed",
                 began_s=self._began_s,
                 t_s=obs.t_s,
-                taken=inputs.taken,
+                inputs=inputs.taken,
                 poses=inputs.poses,
                 observation=obs,
                 error=type(error).__name__,
@@ -454,23 +454,23 @@ class TurnReporter:
         state: PlannerState,
         command: Command,
         feed: FeedStatus | None,
-    ) -> Turn:
+    ) -> TickRecord:
         """The turn as it is logged, once its command was sent."""
         self._open = None
-        return Turn(
+        return TickRecord(
             number=self._counted(),
             role="flown",
             began_s=self._began_s,
             t_s=obs.t_s,
-            taken=inputs.taken,
+            inputs=inputs.taken,
             poses=inputs.poses,
             observation=obs,
             command=command,
             phase=state.phase,
-            row=state.row,
-            held=bool(state.hold),
-            attempts=state.attempts,
-            outside=external_positions(feed),
+            row_name=state.row_name,
+            is_holding_position=bool(state.hold),
+            failed_attempts=state.failed_attempts,
+            external_positions=external_positions(feed),
             outcome=state.outcome,
             reason=state.reason,
         )

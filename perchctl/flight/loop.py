@@ -152,7 +152,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         with contextlib.suppress(Exception):  # what failed may fail again
             turns.report_failure(inputs, error)
         with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
-            watchers.event(Event.from_rescue(parts.clock.now(), error, rest.state, rest.text))
+            watchers.event(Event.note_from_rescue(parts.clock.now(), error, rest.state, rest.text))
         raise
 
 
@@ -305,10 +305,10 @@ def _mission(
             watchers.event(event)
         newest = inputs.perception.calibration.newest
         tick = Tick(
-            turn=turns.flown_turn(inputs, obs, state, command, feed),
+            record=turns.flown_turn(inputs, obs, state, command, feed),
             state=state,
             output=inputs.output,
-            consistency=None if newest is logged else newest,
+            camera_errors=None if newest is logged else newest,
         )
         logged = newest
         watchers.tick(tick)
@@ -352,9 +352,9 @@ def _observe(
         inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
-        operator=parts.operator(),
+        operator_request=parts.operator(),
         log_problem=log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
-        position_beside_m=0.0 if feed is None else feed.beside_m,
+        rejected_sighting_distance_m=0.0 if feed is None else feed.beside_m,
     )

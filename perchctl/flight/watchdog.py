@@ -190,13 +190,13 @@ class Watchdog:
         return Observation(
             t_s=now_s,
             telemetry=history.newest or last.obs.telemetry,
-            jumped=history.jumped,
-            turned_rad=history.turned_rad,
+            has_estimate_jumped=history.jumped,
+            heading_jump_rad=history.turned_rad,
             loop_late_s=now_s - last.obs.t_s,
             position_age_s=age_s,
             imu=history.imu,
-            felt=last.obs.felt,
-            mismatch=last.obs.mismatch,
+            visual_inertial_motion=last.obs.visual_inertial_motion,
+            camera_imu_mismatch=last.obs.camera_imu_mismatch,
         )
 
     def _land(self, obs: Observation, last: LastTick) -> Command | None:
@@ -287,11 +287,11 @@ def rescue(
                 t_s=now_s,
                 telemetry=newest,
                 link_problem=problem,
-                jumped=history.jumped,
-                turned_rad=history.turned_rad,
+                has_estimate_jumped=history.jumped,
+                heading_jump_rad=history.turned_rad,
                 position_age_s=math.inf if by_target else position_age_s(now_s),
                 imu=history.imu,
-                felt=motion,
+                visual_inertial_motion=motion,
             )
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):

@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Protocol, TypeGuard, TypeVar
 
 from perchctl.extensions import error_at
-from perchctl.mission import Event, SentCommand, Tick, Turn, Watcher
+from perchctl.mission import Event, SentCommand, Tick, TickRecord, Watcher
 from perchctl.vision import Frame
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ class TurnWatcher(Watcher, Protocol):
     """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
     or decided again, and of the commands that the link sends in the loop's place."""
 
-    def turn(self, turn: Turn) -> None: ...
+    def turn(self, turn: TickRecord) -> None: ...
 
     def sent(self, sent: SentCommand) -> None:
         """Take a command sent in the loop's place; in another thread, so never wait."""
@@ -99,7 +99,7 @@ class Watchers:
         for watcher in self._active:
             self._call(watcher, watcher.tick, tick)
 
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         for watcher in self._active:
             if takes_turns(watcher):
                 self._call(watcher, watcher.turn, turn)

@@ -2,7 +2,7 @@ from .belief.belief import ContactOffset as ContactOffset
 from .belief.motion import ImuMotion as ImuMotion
 from .context import Context as Context
 from .descent import step_landing as step_landing
-from .observation import Mismatch as Mismatch
+from .observation import CameraImuMismatch as CameraImuMismatch
 from .observation import Observation as Observation
 from .observation import VisualInertialMotion as VisualInertialMotion
 from .phase import Claim as Claim
@@ -17,8 +17,8 @@ from .records import ExternalPositions as ExternalPositions
 from .records import FrameRecord as FrameRecord
 from .records import SentCommand as SentCommand
 from .records import Tick as Tick
-from .records import Turn as Turn
-from .records import TurnInputs as TurnInputs
+from .records import TickInputs as TickInputs
+from .records import TickRecord as TickRecord
 from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
 from .report import Findings as Findings

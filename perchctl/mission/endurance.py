@@ -56,7 +56,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
             _no_reading_grace_s(c) if counted_s is None else min(counted_s, _no_reading_grace_s(c))
         )
     spare_s = enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.attempt_s
-    left = c.planner.attempts - c.state.attempts
+    left = c.planner.attempts - c.state.failed_attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
         attempts = 1 + math.floor(min(spare_s / predicted.retry_s, max(0, left)))

@@ -263,7 +263,7 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
     """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
-    is_height_wrong = b.mismatch.later_s != 0.0 or b.is_position_diverged
+    is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
     low = height_m <= NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
     if _camera_motion(c) is not None:
@@ -332,7 +332,11 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     x_mps, y_mps, _ = reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if b.dead_reckoning_since_s is None else c.t_s - b.dead_reckoning_since_s
-    visual_age_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
+    visual_age_s = (
+        math.inf
+        if c.obs.visual_inertial_motion is None
+        else c.t_s - c.obs.visual_inertial_motion.t_s
+    )
     unsure_mps = min(
         MAX_LATERAL_SIGMA_MPS,
         INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),

@@ -11,13 +11,13 @@ from perchctl.vision import TargetEstimate
 
 
 @dataclass(frozen=True)
-class Mismatch:
+class CameraImuMismatch:
     """An error of latency or mounting that explains why the target seems to move: pictures that are
     `later_s` later than assumed, or a camera rotated by `turn_rad` about the vehicle's upward axis.
     The other value is 0."""
 
-    later_s: float = 0.0
-    turn_rad: float = 0.0
+    camera_latency_error_s: float = 0.0
+    camera_yaw_error_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -37,28 +37,29 @@ class Observation:
     t_s: float
     telemetry: Telemetry  #: newest sample; its age is `t_s - telemetry.t_s`
     target: TargetEstimate | None = None  #: pipeline's estimate at `t_s`; None before the first one
-    new_frame: bool = False  #: a good frame was processed in this tick
-    camera_age_s: float = 0.0  #: time since the last good frame arrived
+    has_new_frame: bool = False  #: a good frame was processed in this tick
+    last_good_frame_age_s: float = 0.0  #: time since the last good frame arrived
     camera_problem: str | None = None  #: None, or one sentence
     link_problem: str | None = None  #: None, or one sentence
     battery_age_s: float = 0.0
-    jumped: bool = False  #: the state estimate moved further than any flight could
-    turned_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
+    has_estimate_jumped: bool = False  #: the state estimate moved further than any flight could
+    heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
     loop_late_s: float = 0.0  #: delay of the start of this tick
-    disagreeing_frames: int = 0  #: number of successive frames with contradicting markers
-    operator: Operator = Operator.NONE
+    successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
+    operator_request: Operator = Operator.NONE
     log_problem: str | None = None  #: the flight log cannot be written
     #: latency beyond the profile's, subtracted from the frames' times (`measured`)
-    delay_s: float = 0.0
+    extra_camera_latency_s: float = 0.0
     #: standard deviation of the latency (`measured`); 0 if it is configured
-    delay_sigma_s: float = 0.0
-    target_refused: str | None = None  #: why the last target in view belongs to another vehicle
+    camera_latency_sigma_s: float = 0.0
+    #: why the last target in view belongs to another vehicle
+    target_refusal_reason: str | None = None
     position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
     position_problem: str | None = None  #: why no external position is sent; None while they are
     #: distance from the estimate to the newest sighting; 0 if it was accepted
-    position_beside_m: float = 0.0
+    rejected_sighting_distance_m: float = 0.0
     imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`
     #: newest motion on which pictures and accelerometer agreed
-    felt: VisualInertialMotion | None = None
+    visual_inertial_motion: VisualInertialMotion | None = None
     #: disagreement of the pictures with `imu`; None if there is none
-    mismatch: Mismatch | None = None
+    camera_imu_mismatch: CameraImuMismatch | None = None

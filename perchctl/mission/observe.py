@@ -24,7 +24,7 @@ def observe(
     known = state.belief.last_telemetry is not None
     belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
     state = replace(state, belief=belief)
-    return _apply_frame_shift(state) if obs.jumped and known else state
+    return _apply_frame_shift(state) if obs.has_estimate_jumped and known else state
 
 
 def _apply_frame_shift(state: PlannerState) -> PlannerState:

@@ -63,7 +63,7 @@ def _update_before_decision(
     maneuver = PHASES[state.phase].maneuver
     state = observe(state, obs, profile, maneuver)
     confirmed_frames, target = state.confirmed_frames, obs.target
-    if obs.new_frame:
+    if obs.has_new_frame:
         measured = target is not None and target.measured and target.world_m is not None
         confirmed_frames = confirmed_frames + 1 if measured else 0
         if measured and is_hovering(state):
@@ -101,7 +101,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             t_s=c.t_s,
             position_m=c.telemetry.position_m,
             yaw_rad=c.telemetry.yaw_rad,
-            row=row.name,
+            row_name=row.name,
             reason=row.reason_text(c),
             claims=row.claims,
             stop=row.stop,
@@ -109,7 +109,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         severity=state.severity.escalate(row.severity),
         outcome=row.outcome_after(state.outcome),
         since={},
-        attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
+        failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
         waiting_reason="",
         waited_s=0.0,
         search_step_s=c.t_s,

@@ -1,6 +1,6 @@
 """The records of a flight: its events, and each tick of the loop, complete and exact.
 
-From the `Turn` records, the decisions of a flight can be replayed (`perchctl.analysis`).
+From the `TickRecord` records, the decisions of a flight can be replayed (`perchctl.analysis`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
 from perchctl.vision import CameraErrors, PictureKind, PipelineOutput, TargetEstimate
 
-TurnRole = Literal["waiting", "redone", "flown", "failed"]
+TickRole = Literal["waiting", "redone", "flown", "failed"]
 
 
 class EventKind(Enum):
@@ -38,14 +38,16 @@ class Event:
     kind: EventKind
     reason: str  # a sentence without its full stop
     phase: Phase | None = None  # phase that was entered, or the current one
-    row: str = ""  # transition of the table; empty at the start and if there was none
+    row_name: str = ""  # transition of the table; empty at the start and if there was none
     severity: Severity = Severity.CONTINUE
-    simulated: str = ""  # fault of the simulated scenario that caused it
+    simulated_fault: str = ""  # fault of the simulated scenario that caused it
     rest: RestState | None = None  # rest state found by a rescue; None in all other events
     claims: Claim = Claim.NONE  # claims of the transition
 
     @classmethod
-    def from_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
+    def note_from_rescue(
+        cls, t_s: float, error: BaseException, rest: RestState, text: str
+    ) -> Event:
         """Return the note on the vehicle's rest state after an error in flight, as the rescue found
         it."""
         reason = f"{type(error).__name__} in flight: {text}"
@@ -65,7 +67,7 @@ class Event:
                 text = f"no battery reading: landing within {grace_s:.0f} s"
                 events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
         if state.phase is not before.phase:
-            entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
+            entered = EventKind.PHASE, state.reason, state.phase, state.row_name, state.severity
             events.append(cls(obs.t_s, *entered, claims=state.entry.claims))
         elif state.pause_reason and not before.pause_reason:
             held = EventKind.HOLD, state.pause_reason, state.phase
@@ -92,7 +94,7 @@ class SentCommand:
     """
 
     t_s: float
-    by: str
+    sender: str
     command: Command
 
 
@@ -102,9 +104,9 @@ class ExternalPositions:
 
     age_s: float  # age of the newest position
     problem: str | None  # why none is sent now
-    sent: int
+    sent_count: int
     rate_hz: float
-    place: ExternalPosition | None  # newest position
+    newest_position: ExternalPosition | None  # newest position
 
 
 @dataclass(frozen=True)
@@ -114,28 +116,28 @@ class FrameRecord:
     index: int
     t_s: float
     t_arrival_s: float
-    fields: PictureKind | None = None
+    picture_kind: PictureKind | None = None
     repeated: bool = False
     # checksum of the picture; None if it was not searched or not recorded
     checksum: int | None = None
 
 
 @dataclass(frozen=True)
-class TurnInputs:
+class TickInputs:
     """The samples from the link and the frame from the camera in one tick. `late` are samples that
     arrived while camera or vision blocked the loop. `look`: the frame was meant to be searched.
     `sends_sights`: the sightings of the target were the vehicle's position. `drops_sightings`:
     earlier sightings were discarded because positions had diverged."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order of arrival
-    late: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
+    late_samples: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
     frame: FrameRecord | None = None
-    problem: str | None = None  # problem, ended, live: reported by the camera source
-    ended: bool = False
-    live: bool = True
-    look: bool = True
-    sends_sights: bool = True
-    drops_sightings: bool = False
+    camera_problem: str | None = None  # problem, ended, live: reported by the camera source
+    has_source_ended: bool = False
+    is_source_live: bool = True
+    is_detection_requested: bool = True
+    sends_sightings_as_position: bool = True
+    has_discarded_sightings: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +150,7 @@ class UnfilteredPose:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Turn:
+class TickRecord:
     """One tick of the loop, complete and exact.
 
     `role` is ``waiting`` before take-off; ``flown``; ``redone`` for a decision that was made before
@@ -158,18 +160,18 @@ class Turn:
     """
 
     number: int  # counts from 0; a gap is a missing tick
-    role: TurnRole
+    role: TickRole
     began_s: float
     t_s: float  # time of the decision; later than `began_s` if the loop was blocked
-    taken: TurnInputs
+    inputs: TickInputs
     poses: dict[str, UnfilteredPose] = field(default_factory=dict)
     observation: Observation | None = None  # None while waiting
     command: Command | None = None  # None while waiting, and for a failed tick
     phase: Phase | None = None
-    row: str = ""
-    held: bool = False
-    attempts: int = 0
-    outside: ExternalPositions | None = None
+    row_name: str = ""
+    is_holding_position: bool = False
+    failed_attempts: int = 0
+    external_positions: ExternalPositions | None = None
     outcome: Outcome | None = None
     reason: str | None = None  # None in logs before version 4, which also lack the outcome
     error: str | None = None  # name of the planner's exception
@@ -184,20 +186,20 @@ class Tick:
     mounting if they were estimated in this tick.
     """
 
-    turn: Turn
+    record: TickRecord
     state: PlannerState
     output: PipelineOutput | None = None
-    consistency: CameraErrors | None = None
+    camera_errors: CameraErrors | None = None
 
     @property
     def observation(self) -> Observation:
-        assert self.turn.observation is not None, "a turn that was flown has one"
-        return self.turn.observation
+        assert self.record.observation is not None, "a turn that was flown has one"
+        return self.record.observation
 
     @property
     def command(self) -> Command:
-        assert self.turn.command is not None, "a turn that was flown has one"
-        return self.turn.command
+        assert self.record.command is not None, "a turn that was flown has one"
+        return self.record.command
 
     @property
     def t_s(self) -> float:
@@ -217,8 +219,8 @@ class Tick:
         return self.observation.loop_late_s
 
     @property
-    def camera_age_s(self) -> float:
-        return self.observation.camera_age_s
+    def last_good_frame_age_s(self) -> float:
+        return self.observation.last_good_frame_age_s
 
     @property
     def telemetry_age_s(self) -> float:
@@ -226,14 +228,14 @@ class Tick:
         return self.t_s - self.telemetry.t_s + self.telemetry.behind_s
 
     @property
-    def delay_used_s(self) -> float:
+    def extra_camera_latency_s(self) -> float:
         """Latency that is subtracted from the frames' times, beyond the profile's, s."""
-        return self.observation.delay_s
+        return self.observation.extra_camera_latency_s
 
     @property
-    def outside(self) -> ExternalPositions | None:
+    def external_positions(self) -> ExternalPositions | None:
         """The external positions; None with decks."""
-        return self.turn.outside
+        return self.record.external_positions
 
 
 class Watcher(Protocol):

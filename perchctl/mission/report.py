@@ -195,7 +195,7 @@ class FlightReport:
             reason=_reason(state, history),
             # If a hanging vehicle is noticed after the last attempt, that attempt was counted as
             # failed.
-            attempts=state.attempts
+            attempts=state.failed_attempts
             + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP)
             + int(state.outcome is Outcome.HOVERED),
             duration_s=obs.t_s - state.started_s,

@@ -118,7 +118,9 @@ def has_diverged(c: Context) -> bool:
         touched = b.last_contact_body_z_m is not None or c.state.stopped_s is not None
         return not touched and _setpoint_deviation_m(c) > MAX_LANDING_DEVIATION_M
     spare_m = (
-        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.delay_sigma_s if b.is_positioned_by_target else 0.0
+        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        if b.is_positioned_by_target
+        else 0.0
     )
     if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
         return _setpoint_deviation_m(c) > MAX_GROUND_DISPLACEMENT_M + spare_m
@@ -176,7 +178,7 @@ def is_position_lost(c: Context) -> bool:
         return True
     if (
         b.position_age_s > MIN_CONTRADICTED_POSITION_AGE_S
-        and c.obs.position_beside_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
+        and c.obs.rejected_sighting_distance_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
     ):
         return True
     unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VARIANCE_M2PS2
@@ -203,11 +205,12 @@ def is_outside_corridor(c: Context) -> bool:
 def latency_reason(c: Context) -> str:
     """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
-    assumed_s = camera.start_latency_s + c.obs.delay_s
-    found = f"the pictures are {1e3 * (assumed_s + b.mismatch.later_s):.0f} ms old"
+    assumed_s = camera.start_latency_s + c.obs.extra_camera_latency_s
+    error_s = b.camera_imu_mismatch.camera_latency_error_s
+    found = f"the pictures are {1e3 * (assumed_s + error_s):.0f} ms old"
     if not b.is_telemetry_fresh:  # with late telemetry, pictures in time seem late
         return (
-            f"the times of pictures and telemetry disagree by {1e3 * b.mismatch.later_s:.0f} ms; "
+            f"the times of pictures and telemetry disagree by {1e3 * error_s:.0f} ms; "
             f"the newest telemetry is {b.telemetry_age_s:.1f} s old"
         )
     if isinstance(camera.latency_s, str):
@@ -225,13 +228,13 @@ def is_mounting_wrong(c: Context) -> bool:
     """True if the target moves along with the vehicle, or appears below it."""
     b = c.belief
     below = c.held_s(TARGET_BELOW) >= TARGET_BELOW_DWELL_S
-    return b.mounting.is_wrong or b.mismatch.turn_rad != 0.0 or below
+    return b.mounting.is_wrong or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0 or below
 
 
 def mounting_reason(c: Context) -> str:
     """Return how the camera seems to be mounted, and what to do."""
     b = c.belief
-    turn_rad = b.mismatch.turn_rad
+    turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
     if turn_rad or b.mounting.is_wrong:
         turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.rotation_rad) / 10.0)
         turn_deg = 180 if turn_deg == -180 else turn_deg
@@ -306,7 +309,7 @@ def is_time_over(c: Context) -> bool:
 SAFETY_ROWS: tuple[Transition, ...] = (
     motor_cut_row(
         "operator-stop",
-        lambda c: c.obs.operator >= Operator.STOP,
+        lambda c: c.obs.operator_request >= Operator.STOP,
         "the operator cut the motors",
         Outcome.EMERGENCY,
     ),
@@ -333,7 +336,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "operator-land",
         FLYING_PHASES,
-        lambda c: c.obs.operator >= Operator.LAND,
+        lambda c: c.obs.operator_request >= Operator.LAND,
         "the operator asked to land",
         Outcome.OPERATOR,
     ),
@@ -398,7 +401,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "latency",
         FREE_AIR_PHASES,
-        lambda c: c.belief.mismatch.later_s != 0.0,
+        lambda c: c.belief.camera_imu_mismatch.camera_latency_error_s != 0.0,
         latency_reason,
         claims=Claim.PROFILE_SUSPECT,
     ),
@@ -420,7 +423,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "camera-gone",
         CAMERA_GUIDED_PHASES,
-        lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
+        lambda c: c.obs.last_good_frame_age_s > c.safety.camera_land_s,
         lambda c: no_picture_reason(c.belief),
     ),
     land_row(
@@ -432,7 +435,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "markers-disagree",
         CAMERA_GUIDED_PHASES,
-        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
+        lambda c: c.obs.successive_marker_conflicts >= c.profile.merge.disagreement_frames,
         "the two markers contradict each other: check the printed sizes and the calibration",
     ),
     land_row(

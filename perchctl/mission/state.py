@@ -81,7 +81,7 @@ class PhaseEntry:
     t_s: float = 0.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
     yaw_rad: float = 0.0
-    row: str = ""  # name of the transition, for logs and displays
+    row_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
     claims: Claim = Claim.NONE  # claims of the transition
     stop: EmergencyStop | StopMotors | None = None  # command that the transition sends at once
@@ -100,7 +100,7 @@ class PlannerState:
     outcome: Outcome | None = None
     since: dict[Condition[Any], float] = field(default_factory=dict)
     """Start time of each true condition of the phases."""
-    attempts: int = 0  #: number of failed attempts
+    failed_attempts: int = 0  #: number of failed attempts
     confirmed_frames: int = 0  #: number of successive frames in this phase that measured the target
     searched_positions: int = 0
     search_step_s: float = 0.0
@@ -123,9 +123,9 @@ class PlannerState:
     hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
 
     @property
-    def row(self) -> str:
+    def row_name(self) -> str:
         """Name of the transition into the phase, for logs and displays."""
-        return self.entry.row
+        return self.entry.row_name
 
     @property
     def reason(self) -> str:

@@ -16,7 +16,7 @@ from operator import attrgetter
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.mission import ImuMotion, Mismatch, VisualInertialMotion
+from perchctl.mission import CameraImuMismatch, ImuMotion, VisualInertialMotion
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
@@ -116,7 +116,8 @@ class VisualInertialWindow:
 
     sights: tuple[tuple[float, Vector], ...] = ()  # time, vector from body to target, body axes, m
     judged_s: float = -math.inf
-    latest: Mismatch | None = None  # newest judgement; once enough judgements agree, it stays
+    # newest judgement; once enough judgements agree, it stays
+    latest: CameraImuMismatch | None = None
     latest_s: float = -math.inf
     agree_count: int = 0  # number of successive judgements that agree
     is_corrected: bool = False  # `latest` is an error of a measured latency
@@ -126,20 +127,24 @@ class VisualInertialWindow:
     felt: FeltSamples = field(default_factory=FeltSamples, compare=False, repr=False)
 
     @property
-    def mismatch(self) -> Mismatch | None:
+    def mismatch(self) -> CameraImuMismatch | None:
         """The newest mismatch, once enough successive judgements agree; None before that, and for
         one that is being corrected. Its `later_s` is relative to the latency in use."""
         if self.latest is None or self.is_corrected or self.agree_count < AGREED:
             return None
-        later_s = 0.0 if self.latest.turn_rad else self.latest.later_s - self.in_use_s
-        return Mismatch(later_s, self.latest.turn_rad)
+        later_s = (
+            0.0
+            if self.latest.camera_yaw_error_rad
+            else self.latest.camera_latency_error_s - self.in_use_s
+        )
+        return CameraImuMismatch(later_s, self.latest.camera_yaw_error_rad)
 
     @property
     def correction_s(self) -> float | None:
         """The measured latency beyond the profile's if it differs from the latency in use, else
         None."""
         enough = self.is_corrected and self.agree_count >= AGREED_MEASURED
-        return self.latest.later_s if self.latest is not None and enough else None
+        return self.latest.camera_latency_error_s if self.latest is not None and enough else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
@@ -180,10 +185,18 @@ def estimate_motion(
             # An ascent has little lateral motion. A rotation of the camera does not show
             # vertically.
             found = _found(np.hypot(wanders_m, upwards_m), hypotheses_s, measured)
-            found = None if found is not None and found.turn_rad else found
+            found = None if found is not None and found.camera_yaw_error_rad else found
         agreed = 0 if found is None else 1
-        if found is not None and before is not None and found.turn_rad == before.turn_rad:
-            agreed += old.agree_count if abs(found.later_s - before.later_s) <= ALIKE_S else 0
+        if (
+            found is not None
+            and before is not None
+            and found.camera_yaw_error_rad == before.camera_yaw_error_rad
+        ):
+            agreed += (
+                old.agree_count
+                if abs(found.camera_latency_error_s - before.camera_latency_error_s) <= ALIKE_S
+                else 0
+            )
         new = replace(
             new,
             latest=found,
@@ -192,13 +205,13 @@ def estimate_motion(
             is_corrected=(
                 measured is not None
                 and found is not None
-                and found.turn_rad == 0.0
-                and measured.can_be(found.later_s)
+                and found.camera_yaw_error_rad == 0.0
+                and measured.can_be(found.camera_latency_error_s)
             ),
             in_use_s=0.0 if measured is None else measured.in_use_s,
         )
     agreed_on = new.latest if new.agree_count >= AGREED else None
-    i = _best_about(agreed_on or Mismatch(new.in_use_s), wanders_m, hypotheses_s)
+    i = _best_about(agreed_on or CameraImuMismatch(new.in_use_s), wanders_m, hypotheses_s)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
         climb_mps = vz if t_s - new.latest_s <= MISMATCH_WINDOW_S else None
@@ -213,14 +226,16 @@ def delay_hypotheses(in_use_s: float) -> Array:
     return np.concatenate([_DELAYS_S, np.full(len(_QUARTERS_RAD), in_use_s)])
 
 
-def _best_about(mismatch: Mismatch, wanders_m: Array, later_s: Array) -> int:
+def _best_about(mismatch: CameraImuMismatch, wanders_m: Array, later_s: Array) -> int:
     """Return the index with the least motion among the hypotheses close to `mismatch`."""
-    about = np.abs(later_s - mismatch.later_s) < LEAST_LATER_S
-    about &= mismatch.turn_rad == TURNS_RAD
+    about = np.abs(later_s - mismatch.camera_latency_error_s) < LEAST_LATER_S
+    about &= mismatch.camera_yaw_error_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))
 
 
-def _found(wanders_m: Array, later_s: Array, measured: MeasuredLatency | None) -> Mismatch | None:
+def _found(
+    wanders_m: Array, later_s: Array, measured: MeasuredLatency | None
+) -> CameraImuMismatch | None:
     """Return the mismatch that explains the pictures; None if the latency in use does, or one close
     to it.
 
@@ -238,8 +253,11 @@ def _found(wanders_m: Array, later_s: Array, measured: MeasuredLatency | None) -
     as_it_is = float(wanders_m[np.argmin(np.abs(later_s - in_use_s) + np.abs(TURNS_RAD))])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
         return None
-    found = Mismatch(_refined_s(wanders_m, later_s, best), float(TURNS_RAD[best]))
-    is_off = found.turn_rad != 0.0 or abs(found.later_s - in_use_s) >= least_later_s
+    found = CameraImuMismatch(_refined_s(wanders_m, later_s, best), float(TURNS_RAD[best]))
+    is_off = (
+        found.camera_yaw_error_rad != 0.0
+        or abs(found.camera_latency_error_s - in_use_s) >= least_later_s
+    )
     return found if is_off else None
 
 

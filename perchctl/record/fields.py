@@ -130,10 +130,10 @@ def event_record(event: Event) -> dict[str, Any]:
         "t_s": event.t_s,
         "event": event.kind.value,
         "phase": event.phase.value if event.phase else None,
-        "row": event.row or None,
+        "row": event.row_name or None,
         "severity": event.severity.name.lower().replace("_", " "),
         "reason": event.reason,
-        "simulated": event.simulated or None,
+        "simulated": event.simulated_fault or None,
         "rest": None if event.rest is None else event.rest.name.lower(),
     }
 
@@ -151,15 +151,15 @@ def tick_record(
         "stage": None if seen is None else seen.stage.value,
         "reason": tick.state.reason,
         "hold": tick.state.pause_reason or None,
-        "attempts": tick.state.attempts,
+        "attempts": tick.state.failed_attempts,
         "tel_age_s": tick.telemetry_age_s,
-        "cam_age_s": tick.camera_age_s,
+        "cam_age_s": tick.last_good_frame_age_s,
         "late_s": tick.loop_late_s,
-        "delay_s": None if tick.consistency is None else tick.consistency.delay_s,
-        "delay_used_s": tick.delay_used_s or None,
+        "delay_s": None if tick.camera_errors is None else tick.camera_errors.delay_s,
+        "delay_used_s": tick.extra_camera_latency_s or None,
         "true_miss_m": true_miss_m,
         **_xyz("true_", true_position_m),
-        **_external_values(tick.outside),
+        **_external_values(tick.external_positions),
         **({} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}),
         **_telemetry_values(tick.telemetry),
         **_output_values(tick.output),
@@ -175,7 +175,7 @@ def _external_values(external: ExternalPositions | None) -> dict[str, Any]:
     return {
         "pos_age_s": external.age_s if math.isfinite(external.age_s) else None,
         "pos_note": external.problem,
-        **_xyz("pos_", external.place and external.place.position_m),
+        **_xyz("pos_", external.newest_position and external.newest_position.position_m),
     }
 
 

@@ -23,7 +23,7 @@ import perchctl
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
 from perchctl.errors import PerchError
-from perchctl.mission import Turn
+from perchctl.mission import TickRecord
 from perchctl.profile import Profile, read_mask
 from perchctl.record.exact import exact_fields, to_exact_json
 from perchctl.record.fields import FIELDS, FORMAT, SCHEMA_VERSION
@@ -68,7 +68,7 @@ def turn_fields() -> dict[str, list[str]]:
     left out of a turn, as one that does not exist yet.
     """
     names: dict[str, list[str]] = {}
-    for field in exact_fields(Turn):
+    for field in exact_fields(TickRecord):
         of = names.setdefault(field.owner, [])
         if field.name not in of:
             of.append(field.name)

@@ -10,9 +10,24 @@ import dataclasses
 from dataclasses import dataclass
 from functools import cache
 
-CLASS_KEYS: dict[str, str] = {}
+CLASS_KEYS: dict[str, str] = {
+    "CameraImuMismatch": "Mismatch",
+    "TickInputs": "TurnInputs",
+    "TickRecord": "Turn",
+}
 """The name of a dataclass in the log's ``turn_fields``, by its name in the program."""
 FIELD_KEYS: dict[str, dict[str, str]] = {
+    "CameraImuMismatch": {
+        "camera_latency_error_s": "later_s",
+        "camera_yaw_error_rad": "turn_rad",
+    },
+    "ExternalPositions": {
+        "newest_position": "place",
+        "sent_count": "sent",
+    },
+    "FrameRecord": {
+        "picture_kind": "fields",
+    },
     "FusionAge": {
         "variance_changed_at_s": "changed_s",
         "no_fusion_since_s": "none_since_s",
@@ -48,6 +63,39 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "roll_pitch_rate_radps": "turning_radps",
         "fusion_age": "corrections",
         "motors_off_since_s": "off_s",
+    },
+    "Observation": {
+        "last_good_frame_age_s": "camera_age_s",
+        "extra_camera_latency_s": "delay_s",
+        "camera_latency_sigma_s": "delay_sigma_s",
+        "successive_marker_conflicts": "disagreeing_frames",
+        "visual_inertial_motion": "felt",
+        "has_estimate_jumped": "jumped",
+        "camera_imu_mismatch": "mismatch",
+        "has_new_frame": "new_frame",
+        "operator_request": "operator",
+        "rejected_sighting_distance_m": "position_beside_m",
+        "target_refusal_reason": "target_refused",
+        "heading_jump_rad": "turned_rad",
+    },
+    "SentCommand": {
+        "sender": "by",
+    },
+    "TickInputs": {
+        "late_samples": "late",
+        "camera_problem": "problem",
+        "has_source_ended": "ended",
+        "is_source_live": "live",
+        "is_detection_requested": "look",
+        "sends_sightings_as_position": "sends_sights",
+        "has_discarded_sightings": "drops_sightings",
+    },
+    "TickRecord": {
+        "inputs": "taken",
+        "row_name": "row",
+        "is_holding_position": "held",
+        "failed_attempts": "attempts",
+        "external_positions": "outside",
     },
 }
 """The key of a field in the log, by the names of its dataclass and of itself in the program."""

@@ -24,7 +24,7 @@ from perchctl import __version__
 from perchctl.errors import InvalidValue, Note, NotFound
 from perchctl.files import file_kind
 from perchctl.geometry import Array
-from perchctl.mission import SentCommand, Turn
+from perchctl.mission import SentCommand, TickRecord
 from perchctl.profile import Profile, key_and_reason
 from perchctl.record.exact import (
     ExactField,
@@ -38,7 +38,7 @@ from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
-Exact = TypeVar("Exact", Turn, SentCommand)
+Exact = TypeVar("Exact", TickRecord, SentCommand)
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 """Of a log's records behind its header."""
 SAME_S = 1e-3
@@ -93,7 +93,7 @@ class FlightLog:
     # --- records
 
     @cached_property
-    def turns(self) -> list[Turn]:
+    def turns(self) -> list[TickRecord]:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
         return [parse_turn(record) for record in self.turn_records]
 
@@ -108,7 +108,7 @@ class FlightLog:
         if not isinstance(known, dict):
             known = self._written_names()
         found = []
-        for each in exact_fields(Turn):
+        for each in exact_fields(TickRecord):
             names = known.get(each.owner)
             is_listed = not isinstance(names, (list, set)) or each.name in names
             if not (is_listed or each.path.startswith("command.")):
@@ -123,8 +123,8 @@ class FlightLog:
         names: dict[str, set[str]] = {}
         if self.turns:  # readable
             for record in self.turn_records:
-                collect_written_names(Turn, _whole_turn(record), names)
-        for each in exact_fields(Turn):
+                collect_written_names(TickRecord, _whole_turn(record), names)
+        for each in exact_fields(TickRecord):
             is_since_4 = each.owner == "Turn" and each.name in ("outcome", "reason", "error")
             if each.is_always_written or (is_since_4 and self.header["version"] < 4):
                 continue
@@ -432,9 +432,9 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 # --- turns, and what was sent in the loop's place ---
 
 
-def parse_turn(record: dict[str, Any]) -> Turn:
+def parse_turn(record: dict[str, Any]) -> TickRecord:
     """The turn of a record, to the same bits. Errors: InvalidValue."""
-    return parse_exact(Turn, _whole_turn(record))
+    return parse_exact(TickRecord, _whole_turn(record))
 
 
 def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
@@ -448,7 +448,7 @@ def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
-    """The `Turn` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
+    """The `TickRecord` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
     try:
         return from_exact_json(kind, _without_kind(record))
     except ValueError as error:

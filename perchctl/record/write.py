@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perchctl.errors import InvalidValue
-from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
+from perchctl.mission import Event, FlightReport, SentCommand, Tick, TickRecord
 from perchctl.profile import Profile
 from perchctl.record.disk import BackgroundWriter, DiskFile, create_file
 from perchctl.record.exact import encode_line, json_line, to_exact_json
@@ -187,7 +187,7 @@ class LogWatcher:
         except Exception as error:  # whatever it is: only this record is lost
             self._unmade += 1
             self._remember_unencodable(error)
-        self.turn(tick.turn)
+        self.turn(tick.record)
         if self.recorder is not None and record is not None:
             self.recorder.write_tick(record)
 
@@ -195,7 +195,7 @@ class LogWatcher:
         """Append one tick record (`perchctl.record.fields.tick_record`). Never raises."""
         self._put(partial(encode_line, {"kind": "tick", **record}), record["t_s"])
 
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         """Append a whole turn, exactly (`turn_line`). Never raises."""
         self._put(partial(turn_line, turn), turn.t_s)
 
@@ -329,10 +329,10 @@ def sent_line(sent: SentCommand) -> bytes:
     return json_line({"kind": "sent", **to_exact_json(sent)})
 
 
-def turn_line(turn: Turn) -> bytes:
-    """A turn as one exact line of the log, by the fields of `perchctl.mission.Turn`."""
+def turn_line(turn: TickRecord) -> bytes:
+    """A turn as one exact line of the log, by the fields of `perchctl.mission.TickRecord`."""
     record = {"kind": "turn", **to_exact_json(turn)}
-    obs, samples = turn.observation, turn.taken.late or turn.taken.samples
+    obs, samples = turn.observation, turn.inputs.late_samples or turn.inputs.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
         del record["observation"]["telemetry"]  # it stands in the same line already
     return json_line(record)

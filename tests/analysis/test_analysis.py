@@ -88,9 +88,15 @@ def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
 def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: Path) -> None:
     events = [
         Event(
-            4.1, EventKind.PHASE, "hovering in the perching area", Phase.SEARCH, row="approached"
+            4.1,
+            EventKind.PHASE,
+            "hovering in the perching area",
+            Phase.SEARCH,
+            row_name="approached",
         ),
-        Event(5.2, EventKind.PHASE, "the operator cut the motors", Phase.ABORTED, row="operator"),
+        Event(
+            5.2, EventKind.PHASE, "the operator cut the motors", Phase.ABORTED, row_name="operator"
+        ),
     ]
     log = read_log(synthetic.write(tmp_path / "f.jsonl", most=200, events=events))
     assert "hovering in the perching area (approached)" in show_text(FlightAnalysis(log))

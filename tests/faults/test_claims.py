@@ -89,7 +89,9 @@ def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
 @pytest.mark.parametrize("found", RestState)
 def test_what_a_rescue_says_counts_too(found: RestState) -> None:
     """By what it found: that it hangs is another claim than that it stands."""
-    claims = rescue_claims(Event.from_rescue(9.0, ValueError(), found, "whatever it is called"))
+    claims = rescue_claims(
+        Event.note_from_rescue(9.0, ValueError(), found, "whatever it is called")
+    )
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
         "something holds the vehicle": "held off the target",

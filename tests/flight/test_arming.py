@@ -29,7 +29,7 @@ from perchctl.errors import (
 from perchctl.flight import FlyOptions, OperatorSwitch, fly_lockstep, fly_session
 from perchctl.flight.preflight import ARMING_PAUSE_S, ARMS_WITHIN_S
 from perchctl.link.crtp import encode
-from perchctl.mission import Operator, Outcome, SentCommand, Turn
+from perchctl.mission import Operator, Outcome, SentCommand, TickRecord
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -284,7 +284,7 @@ def test_a_brushless_vehicle_perches_and_ends_disarmed(tmp_path: Path) -> None:
     flight = fly_lockstep(profile, SEED, log, scenario=scenario)
     assert flight.report.outcome is Outcome.PERCHED
     assert flight.hanging
-    sent = [(each.by, each.command) for each in read_log(log).sent]
+    sent = [(each.sender, each.command) for each in read_log(log).sent]
     assert sent[0] == ("preflight", Arm(True))
     assert sent[-1] == ("farewell", Arm(False))
 
@@ -309,7 +309,7 @@ class Session:
 
     def event(self, event: Any) -> None: ...
 
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         if self.sent_commands:
             self.on_arming(self)
 

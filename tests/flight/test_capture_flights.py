@@ -113,9 +113,9 @@ def test_it_perches_by_the_sight_of_the_target_alone() -> None:
     ages_s: dict[Phase, float] = {}
 
     def see(tick: Tick) -> None:
-        assert tick.outside is not None
+        assert tick.external_positions is not None
         phase = tick.state.phase
-        ages_s[phase] = max(ages_s.get(phase, 0.0), tick.outside.age_s)
+        ages_s[phase] = max(ages_s.get(phase, 0.0), tick.external_positions.age_s)
 
     it = fly_lockstep(TARGET_ONLY, 3, watchers=(Watcher(see),))
     assert it.report.phase is Phase.PERCHED

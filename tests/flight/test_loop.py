@@ -91,7 +91,7 @@ def test_a_bad_picture_is_no_measurement(bad: Callable[..., Any], words: str) ->
     # The first repeated one is like any other picture.
     measured = [t.t_s for t in rig.watcher.ticks if t.output is not None]
     assert max(measured) < BAD_S + 1.5 * PERIOD_S * (words == "is frozen") + 1e-9
-    assert max(t.camera_age_s for t in rig.watcher.ticks) > PROFILE.safety.camera_land_s
+    assert max(t.last_good_frame_age_s for t in rig.watcher.ticks) > PROFILE.safety.camera_land_s
 
 
 def test_a_camera_that_reports_a_failure_lands_with_its_words() -> None:

@@ -15,7 +15,7 @@ from perchctl.mission import (
     PlannerState,
     SentCommand,
     Tick,
-    Turn,
+    TickRecord,
     step_mission,
 )
 from perchctl.profile import Profile
@@ -29,20 +29,20 @@ BREAKS_S = 0.5
 
 @dataclass
 class Told(LooksOn):
-    turns: list[Turn] = field(default_factory=list)
+    turns: list[TickRecord] = field(default_factory=list)
 
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         self.turns.append(turn)
 
     def sent(self, sent: SentCommand) -> None:
         return None
 
     @property
-    def of_ticks(self) -> list[Turn]:
-        return [tick.turn for tick in self.ticks if tick.turn is not None]
+    def of_ticks(self) -> list[TickRecord]:
+        return [tick.record for tick in self.ticks if tick.record is not None]
 
     @property
-    def all(self) -> list[Turn]:
+    def all(self) -> list[TickRecord]:
         return sorted((*self.turns, *self.of_ticks), key=lambda turn: turn.number)
 
 
@@ -150,6 +150,6 @@ def test_all_that_is_taken_in_is_in_the_turns() -> None:
 
     rig.link.telemetry = telemetry  # type: ignore[method-assign]
     turns = flown(rig).all
-    taken = [s for turn in turns for s in (*turn.taken.samples, *turn.taken.late)]
+    taken = [s for turn in turns for s in (*turn.inputs.samples, *turn.inputs.late_samples)]
     assert taken == given
-    assert all(turn.taken.frame is not None for turn in turns)
+    assert all(turn.inputs.frame is not None for turn in turns)

@@ -22,7 +22,7 @@ from perchctl.mission import (
     Outcome,
     SentCommand,
     Tick,
-    Turn,
+    TickRecord,
 )
 from perchctl.perception import perception
 from perchctl.record import LogWatcher, read_log
@@ -65,7 +65,7 @@ class Breaks:
 
 
 class BreaksAsALog(Breaks):
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         self._called("turn")
 
     def sent(self, sent: SentCommand) -> None:
@@ -156,7 +156,7 @@ def test_the_file_of_a_log_that_raised_and_the_exit_code_say_so(
     log = LogWatcher.open_lockstep(tmp_path / "flight.jsonl", rig.profile, seed=1)
     real = LogWatcher.turn
 
-    def turn(self: LogWatcher, turn: Turn) -> None:
+    def turn(self: LogWatcher, turn: TickRecord) -> None:
         if turn.t_s > BREAKS_S:
             raise Broken("by the test")
         real(self, turn)

@@ -46,9 +46,9 @@ def decided_here(name: str) -> tuple[bytes, ...]:
             replace(
                 turn,
                 phase=new.phase,
-                row=new.row,
-                held=bool(new.hold),
-                attempts=new.attempts,
+                row_name=new.row_name,
+                is_holding_position=bool(new.hold),
+                failed_attempts=new.failed_attempts,
                 command=command,
                 outcome=new.outcome,
                 reason=new.reason,

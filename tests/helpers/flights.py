@@ -20,7 +20,7 @@ from perchctl.sim import Scenario, draw_capture, draw_scenario
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from perchctl.mission import Tick, Turn
+    from perchctl.mission import Tick, TickRecord
     from perchctl.vision import Frame
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -83,7 +83,7 @@ class _Heights(LogWatcher):
         assert self.truth is not None
         (_, _, self.z_m), _ = self.truth()
 
-    def turn(self, turn: Turn) -> None:
+    def turn(self, turn: TickRecord) -> None:
         return None
 
     def event(self, event: Event) -> None:

@@ -34,14 +34,14 @@ def tick(
             synthetic.target(t_s, 1.0), e_m=np.array(e_m), e_yaw_rad=e_yaw_rad, tracked=tracked
         )
     state = state_with(
-        phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
+        phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, failed_attempts=1,
         takeoff_position_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
-    obs = Observation(t_s, sample, seen, camera_age_s=camera_age_s, loop_late_s=0.001)
+    obs = Observation(t_s, sample, seen, last_good_frame_age_s=camera_age_s, loop_late_s=0.001)
     turn = synthetic.flown_turn(obs, command)
-    return Tick(turn=turn, state=state, output=output)
+    return Tick(record=turn, state=state, output=output)
 
 
 def hover_tick(phase: str = "HOVER", outcome: Outcome | None = None) -> Tick:

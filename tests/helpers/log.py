@@ -18,8 +18,8 @@ from perchctl.mission import (
     Phase,
     PlannerState,
     Tick,
-    Turn,
-    TurnInputs,
+    TickInputs,
+    TickRecord,
 )
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher
@@ -133,15 +133,17 @@ def tick(
     delay_used_s: float = 0.0,
     outside: ExternalPositions | None = None,
 ) -> Tick:
-    obs = Observation(t_s, sample, target, camera_age_s=0.03, delay_s=delay_used_s)
-    turn = flown_turn(obs, command, outside=outside)
-    return Tick(turn=turn, state=state, output=output, consistency=consistency)
+    obs = Observation(
+        t_s, sample, target, last_good_frame_age_s=0.03, extra_camera_latency_s=delay_used_s
+    )
+    turn = flown_turn(obs, command, external_positions=outside)
+    return Tick(record=turn, state=state, output=output, camera_errors=consistency)
 
 
-def flown_turn(obs: Observation, command: Command, **more: Any) -> Turn:
+def flown_turn(obs: Observation, command: Command, **more: Any) -> TickRecord:
     """A turn that was flown, as the loop hands it to its watchers."""
     t_s = obs.t_s
-    turn = Turn(number=0, role="flown", began_s=t_s, t_s=t_s, taken=TurnInputs())
+    turn = TickRecord(number=0, role="flown", began_s=t_s, t_s=t_s, inputs=TickInputs())
     return replace(turn, observation=obs, command=command, **more)
 
 

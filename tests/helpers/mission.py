@@ -113,7 +113,7 @@ def observation(t_s: float, z_m: float = 1.0, **changes: object) -> Observation:
         t_s=t_s,
         telemetry=tel,
         target=target_at(t_s, body_m=tel.position_m),
-        new_frame=True,  # type: ignore[arg-type]
+        has_new_frame=True,  # type: ignore[arg-type]
     )
     return replace(obs, **changes)  # type: ignore[arg-type]
 
@@ -175,7 +175,7 @@ _ENTRY = {
     "entered_s": "t_s",
     "entry_m": "position_m",
     "entry_yaw_rad": "yaw_rad",
-    "row": "row",
+    "row": "row_name",
     "reason": "reason",
     "claims": "claims",
 }

@@ -59,7 +59,7 @@ def _header() -> dict[str, Any]:
 
 def entered(t_s: float, phase: Phase, reason: str, row: str = "", simulated: str = "") -> Event:
     """A phase's event, `t_s` after the flight's first tick."""
-    return Event(START_S + t_s, EventKind.PHASE, reason, phase, row, simulated=simulated)
+    return Event(START_S + t_s, EventKind.PHASE, reason, phase, row, simulated_fault=simulated)
 
 
 def flown_s(record: Mapping[str, Any]) -> float:

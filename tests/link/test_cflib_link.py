@@ -315,7 +315,7 @@ def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess
         assert info(sim) & FLYING
         sent, told = commands_sent(link, sim), told_by(link)
         link.close()
-        assert [(each.by, each.command) for each in told] == [("farewell", RawThrust(0))]
+        assert [(each.sender, each.command) for each in told] == [("farewell", RawThrust(0))]
         until(lambda: sent)  # cflib's farewell: on a busy computer `close` does not wait for it
         assert not any(port == RAW_PORT and bits & FLYING for port, bits in sent)
         let_pass(sim, 2.5)

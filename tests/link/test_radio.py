@@ -317,7 +317,7 @@ def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flo
     flown.heard_after_s(LAND, began_s)
     flown.error_callback()("unplugged")
     flown.until(lambda: told)
-    assert [(sent.by, sent.command) for sent in told] == [("reconnect", LAND)]
+    assert [(sent.sender, sent.command) for sent in told] == [("reconnect", LAND)]
 
 
 def test_a_dongle_that_was_pulled_out_and_put_in_again_goes_on(flown: Flown) -> None:

@@ -156,7 +156,7 @@ def test_the_last_order_is_sent_again_unless_it_was_followed_or_is_old(library: 
     sender.repeat_order(library.now_s - 0.1)
     until(lambda: told)
     library.takes(LAND)
-    assert told[0].by == "reconnect"
+    assert told[0].sender == "reconnect"
     sender.put(PLACES[0])
     library.takes(PLACES[0])
     sender.repeat_order(0.0)
@@ -327,7 +327,7 @@ def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library
     assert set(library.taken) == {PLACES[0], STOP}
     assert sender.trouble() is None
     assert {sent.command for sent in told} == {STOP}
-    assert {sent.by for sent in told} == {"watchdog"}
+    assert {sent.sender for sent in told} == {"watchdog"}
 
 
 def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library) -> None:

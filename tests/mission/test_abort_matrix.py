@@ -64,12 +64,13 @@ ALL = FLYING_PHASES | {Phase.LANDING}
 
 # event: (what happens, seconds it lasts, where it counts, how it ends, outcome)
 EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcome]] = {
-    "operator-stop": (_obs(operator=Operator.STOP), 0.1, ALL, STOP, Outcome.EMERGENCY),
+    "operator-stop": (_obs(operator_request=Operator.STOP), 0.1, ALL, STOP, Outcome.EMERGENCY),
     "locked": (_bits(LOCKED), 0.1, ALL, STOP, Outcome.SAFETY),
     "tumbled": (_bits(TUMBLED), 0.1, ALL, STOP, Outcome.SAFETY),
     "crashed": (_bits(CRASHED), 0.1, ALL, STOP, Outcome.SAFETY),
     "tilted": (_tel(roll_rad=1.5), 0.5, ALL, STOP, Outcome.SAFETY),
-    "operator-land": (_obs(operator=Operator.LAND), 0.1, FLYING_PHASES, LAND, Outcome.OPERATOR),
+    "operator-land": (_obs(operator_request=Operator.LAND), 0.1, FLYING_PHASES, LAND,
+        Outcome.OPERATOR),
     "link-lost": (_obs(link_problem="gone"), 0.1, FLYING_PHASES, LAND, Outcome.SAFETY),
     "telemetry-stale": (
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=9.9)),
@@ -80,9 +81,11 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
     ),
     "heading-lost": (
-        _obs(jumped=True, turned_rad=1.5), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
+        _obs(has_estimate_jumped=True, heading_jump_rad=1.5), 0.1, PRE_CONTACT_PHASES, LAND,
+        Outcome.SAFETY,
     ),
-    "estimator-jump": (_obs(jumped=True), 0.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "estimator-jump": (_obs(has_estimate_jumped=True), 0.8, PRE_CONTACT_PHASES, LAND,
+        Outcome.SAFETY),
     "estimate-unsure": (
         _tel(velocity_variance_m2ps2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
         Outcome.SAFETY,
@@ -99,12 +102,12 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _tel(position_m=(math.nan, 0.0, 1.0)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
     "camera-gone": (
-        _obs(camera_age_s=4.0, new_frame=False, camera_problem="camera unplugged"),
+        _obs(last_good_frame_age_s=4.0, has_new_frame=False, camera_problem="camera unplugged"),
         0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
     "loop-late": (_obs(loop_late_s=1.2), 0.1, FLYING_PHASES, LAND, Outcome.SAFETY),
     "markers-disagree": (
-        _obs(disagreeing_frames=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
+        _obs(successive_marker_conflicts=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
     "time-over": (
         lambda o: o, 0.1, PRE_CONTACT_PHASES, LAND, Outcome.ATTEMPTS_USED_UP,
@@ -156,7 +159,7 @@ def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
         obs = event(observation(t_s, state.entry.position_m[2]))
         state, command = planner.step_mission(state, obs, profile)
         commands.append(command)
-        if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row != "":
+        if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row_name != "":
             break
     return state, commands
 
@@ -187,7 +190,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
 def test_without_a_corridor_no_place_is_outside_of_it(name: str) -> None:
     event, *_ = EVENTS[name]
     state, _ = planner.step_mission(state_in(Phase.ALIGN), event(observation(10.02)), PROFILE)
-    assert state.row != "corridor"
+    assert state.row_name != "corridor"
 
 
 @pytest.mark.parametrize("name", [n for n, e in EVENTS.items() if e[3] == LAND])
@@ -210,7 +213,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
 @pytest.mark.parametrize(
     "event",
     [
-        _obs(camera_age_s=1.0, new_frame=False, target=None),
+        _obs(last_good_frame_age_s=1.0, has_new_frame=False, target=None),
         _obs(loop_late_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
         _tel(velocity_variance_m2ps2=0.08),

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import (
+    CameraImuMismatch,
     ImuMotion,
-    Mismatch,
     Observation,
     Operator,
     Phase,
@@ -190,18 +190,30 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     [
         ({}, PositionSetpoint, PositionSetpoint),
         ({"position_age_s": 0.6}, RawThrust, RawThrust),
-        ({"mismatch": Mismatch(later_s=0.2)}, PositionSetpoint, RawThrust),
-        ({"jumped": True}, Land, RawThrust),
+        (
+            {"camera_imu_mismatch": CameraImuMismatch(camera_latency_error_s=0.2)},
+            PositionSetpoint,
+            RawThrust,
+        ),
+        ({"has_estimate_jumped": True}, Land, RawThrust),
         ({"loop_late_s": 0.5}, Land, RawThrust),
         ({"link_problem": "gone"}, Land, RawThrust),
         ({"behind_s": 0.5}, Land, RawThrust),
         ({"age_s": 0.6}, Land, RawThrust),
-        ({"jumped": True, "turned_rad": 1.5}, RawThrust, RawThrust),
-        ({"jumped": True, "turned_rad": 1.5, "behind_s": 0.5}, RawThrust, RawThrust),
+        ({"has_estimate_jumped": True, "heading_jump_rad": 1.5}, RawThrust, RawThrust),
+        (
+            {"has_estimate_jumped": True, "heading_jump_rad": 1.5, "behind_s": 0.5},
+            RawThrust,
+            RawThrust,
+        ),
         # A level descent does not change its mode for a moment; without a vertical speed raw thrust
         # would be blind, and the vehicle's own landing is left.
-        ({"jumped": True, "turned_rad": 1.5, "age_s": 0.2}, RawThrust, RawThrust),
-        ({"jumped": True, "turned_rad": 1.5, "age_s": 0.6}, Land, RawThrust),
+        (
+            {"has_estimate_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.2},
+            RawThrust,
+            RawThrust,
+        ),
+        ({"has_estimate_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.6}, Land, RawThrust),
     ],
 )
 def test_each_part_of_what_is_known_has_its_own_age(
@@ -249,7 +261,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
-    assert (state.phase, state.row, state.belief.is_position_diverged) == (
+    assert (state.phase, state.row_name, state.belief.is_position_diverged) == (
         Phase.LANDING,
         "mounting",
         astray,
@@ -344,7 +356,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
-    c = context_at(c.state, replace(c.obs, imu=imu, felt=felt), c.profile)
+    c = context_at(c.state, replace(c.obs, imu=imu, visual_inertial_motion=felt), c.profile)
     command = descent.act(c)[1]
     assert isinstance(command, RawThrust)
     assert command.roll_rad == pytest.approx(0.0, abs=1e-9)
@@ -357,7 +369,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     c = context("imu", reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
-    obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
+    obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
     state = observing(c.state, obs, c.profile)
     assert state.belief.reckoning.velocity_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
@@ -386,7 +398,11 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
     c = context("imu", reckoned_height_m=2.0, reckoning=reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
-    obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
+    obs = replace(
+        c.obs,
+        visual_inertial_motion=motion,
+        camera_imu_mismatch=CameraImuMismatch(later_s) if later_s else None,
+    )
     obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
     state = observing(c.state, obs, c.profile)
     assert state.belief.reckoning.velocity_mps[2] == pytest.approx(
@@ -491,7 +507,7 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
     def look(t_s: float) -> Observation:
         shakes_rad = 1e-4 * math.sin(40.0 * t_s)  # no reading stands still
         tel = {"thrust": part * HOVER_THRUST, "acc_z_g": 0.99, "behind_s": 5.0}
-        unseen = {"target": None, "new_frame": False}
+        unseen = {"target": None, "has_new_frame": False}
         return at(HANG_Z_M, obs=unseen, roll_rad=shakes_rad, **tel)(t_s)
 
     begun = remembering(
@@ -565,11 +581,11 @@ BIT = st.fixed_dictionaries(
             [
                 {},
                 {},
-                {"jumped": True},
-                {"jumped": True, "turned_rad": 1.5},
+                {"has_estimate_jumped": True},
+                {"has_estimate_jumped": True, "heading_jump_rad": 1.5},
                 {"loop_late_s": 1.2},
                 {"link_problem": "gone"},
-                {"operator": Operator.LAND},
+                {"operator_request": Operator.LAND},
             ]
         ),
     }
@@ -619,7 +635,7 @@ def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
             yield felt(
                 observation(
                     t_s, telemetry=tel, target=None if bit["target"] == "none" else target,
-                    new_frame=seen, position_age_s=bit["position_age_s"],
+                    has_new_frame=seen, position_age_s=bit["position_age_s"],
                     **(bit["once"] if i == 0 else {}),
                 )
             )  # fmt: skip

@@ -85,7 +85,7 @@ def test_a_landing_begins_without_a_step_of_the_setpoint(
         obs = stands(t_s)
         operator = Operator.LAND if t_s > BEGIN_S + 1.5 * TICK_S else Operator.NONE
         moves = replace(obs.telemetry, velocity_mps=velocity_mps)
-        return replace(obs, telemetry=moves, operator=operator)
+        return replace(obs, telemetry=moves, operator_request=operator)
 
     before, after = fly(ascending(), lands, 2 * TICK_S).ticks
     assert (before.state.phase, after.state.phase) == (Phase.ASCEND, Phase.LANDING)
@@ -191,10 +191,12 @@ def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:
     def look(t_s: float) -> Observation:
         sample = telemetry(t_s, Z_M)
         seen = target_at(BEGIN_S, body_m=sample.position_m, measured=False, tracked=False)
-        return observation(t_s, telemetry=sample, target=replace(seen, t_s=t_s), new_frame=False)
+        return observation(
+            t_s, telemetry=sample, target=replace(seen, t_s=t_s), has_new_frame=False
+        )
 
     flight = fly(ascending(), look, 2.0, one_phase=True)
-    assert flight.state.row == "ascend-lost"
+    assert flight.state.row_name == "ascend-lost"
     assert flight.ticks[-1].t_s == pytest.approx(BEGIN_S + 1.5, abs=0.03)
     climbs_m = [
         tick.command.z_m for tick in flight.ticks if isinstance(tick.command, PositionSetpoint)

@@ -98,7 +98,7 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
     watch = MountingMonitor(contradictions=9, rotation_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
-    assert flight.state.row == "mounting"
+    assert flight.state.row_name == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
     assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
 
@@ -155,7 +155,11 @@ class Follows(Motors):
 def test_a_turned_mounting_lands_and_says_so(deg: int) -> None:
     it = Follows(deg)
     state = fly(state_in(Phase.ALIGN), it, 4.0, one_phase=True).state
-    assert (state.phase, state.row, state.outcome) == (Phase.LANDING, "mounting", Outcome.SAFETY)
+    assert (state.phase, state.row_name, state.outcome) == (
+        Phase.LANDING,
+        "mounting",
+        Outcome.SAFETY,
+    )
     assert f"rotated by about {deg} deg" in state.reason
     assert max(it.far_m) < 0.17
 
@@ -178,5 +182,5 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
         return at(obs={"target": replace(below, measured_s=t_s, small_measured_s=t_s)})(t_s)
 
     state = fly(state_in(Phase.ALIGN), look, 0.58).state
-    assert state.row == "mounting"
+    assert state.row_name == "mounting"
     assert "camera.mount does not point the camera up" in state.reason

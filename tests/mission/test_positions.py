@@ -80,7 +80,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
     """Level, by thrust alone, within a second: long before the estimate itself contradictions."""
-    felt, state, sent = Felt(), remembering(state_in(phase), attempts=1), []
+    felt, state, sent = Felt(), remembering(state_in(phase), failed_attempts=1), []
     for i in range(125):
         t_s = BEGIN_S + 0.01 * (i - 24)
         variance = 2e-4 + 1e-4 * max(0, math.ceil(10 * (t_s - BEGIN_S - lost_s) - 1e-6))
@@ -88,13 +88,13 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
             t_s, 1.0, climb_variance_m2ps2=variance, velocity_variance_m2ps2=variance,
             acc_x_g=1e-4 * (i % 2),
         )  # fmt: skip
-        obs = felt(observation(t_s, telemetry=tel, new_frame=False))
+        obs = felt(observation(t_s, telemetry=tel, has_new_frame=False))
         if i % 2 == 0 and t_s > BEGIN_S:
             state, command = step_mission(state, obs, PROFILE)
             sent.append(command)
         if state.phase is Phase.LANDING:
             break
-    assert (state.phase, state.row, state.outcome) == LOST
+    assert (state.phase, state.row_name, state.outcome) == LOST
     assert "variance keeps growing" in state.reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
@@ -318,7 +318,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         target = target_at(
             t_s, body_m=body_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
         )
-        obs = {"target": target, "new_frame": target.measured}
+        obs = {"target": target, "has_new_frame": target.measured}
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
@@ -366,7 +366,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last_telemetry=None)
     it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
-    assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
+    assert (state.phase, state.row_name) == (Phase.LANDING, "position-astray")
     assert "perchctl check --lift" in state.reason
     assert -0.9 < it.met_mps < 0.0
     assert it.highest_m < 0.3
@@ -413,7 +413,7 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
 ) -> None:
     begin = remembering(state_in(phase, z_m=body_m[2]), **changes)
     state = fly(begin, at(position_m=body_m), profile=profile).state
-    assert (state.row == "position-astray") is lands
+    assert (state.row_name == "position-astray") is lands
 
 
 @pytest.mark.parametrize(("profile", "lands"), [(MOCAP, True), (BY_TARGET, False)])
@@ -421,9 +421,9 @@ def test_the_camera_s_latency_excuses_only_positions_by_the_camera(
     profile: Profile, lands: bool
 ) -> None:
     begin = state_in(Phase.APPROACH, z_m=0.02)
-    look = at(position_m=(0.2, 0.0, 0.02), obs={"delay_sigma_s": 0.05})
+    look = at(position_m=(0.2, 0.0, 0.02), obs={"camera_latency_sigma_s": 0.05})
     state = fly(begin, look, profile=profile).state
-    assert (state.row == "position-astray") is lands
+    assert (state.row_name == "position-astray") is lands
 
 
 @pytest.mark.parametrize("profile", [MOCAP, PROFILE])
@@ -441,8 +441,8 @@ def test_positions_that_are_late_swing_it_up_and_down(
     """A catch falls as fast, and a take-off may be set down by hand. Seed 20701208 climbed into its
     target at 1 m/s, and was taken for held by something else."""
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
-    assert (state.row == "position-astray") is (lands and profile is MOCAP)
-    assert ("vertical oscillation" in state.reason) is (state.row == "position-astray")
+    assert (state.row_name == "position-astray") is (lands and profile is MOCAP)
+    assert ("vertical oscillation" in state.reason) is (state.row_name == "position-astray")
 
 
 def gains_beside(
@@ -488,5 +488,5 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
     """They have added 0.3 m/s to the left: so the attitude leans by 0.05 rad that the vehicle does
     not, and what is reckoned by it would brake a speed that is none."""
     state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
-    assert state.row == "position-astray"
+    assert state.row_name == "position-astray"
     assert abs(state.belief.reckoning.velocity_mps[1]) < 0.15

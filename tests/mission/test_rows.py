@@ -13,9 +13,9 @@ import pytest
 
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.mission import (
+    CameraImuMismatch,
     ContactOffset,
     ImuMotion,
-    Mismatch,
     Observation,
     Operator,
     Outcome,
@@ -92,7 +92,7 @@ class Case:
             state, command = planner.step_mission(state, self.look(t_s), self.profile, table)
             if state.phase is self.to:
                 fits = self.command is None or isinstance(command, self.command)
-                fits = fits and self.row in (None, state.row)
+                fits = fits and self.row in (None, state.row_name)
                 return fits and state.outcome is self.outcome
         return False
 
@@ -147,7 +147,7 @@ OFF = {"thrust": 0.0, "supervisor": READY}
 # row of the table: its case
 CASES: dict[str, Case] = {
     "operator-stop": Case(
-        P.ALIGN, P.ABORTED, seen(operator=Operator.STOP), 0.1, O.EMERGENCY, EmergencyStop
+        P.ALIGN, P.ABORTED, seen(operator_request=Operator.STOP), 0.1, O.EMERGENCY, EmergencyStop
     ),
     "hung-but-locked": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
@@ -161,11 +161,13 @@ CASES: dict[str, Case] = {
     "crashed": Case(P.ALIGN, P.ABORTED, at(supervisor=AIRBORNE | CRASHED), 0.1, O.SAFETY,
                     StopMotors),
     "tilted": Case(P.ALIGN, P.ABORTED, at(roll_rad=1.5), 0.5, O.SAFETY, EmergencyStop),
-    "operator-land": Case(P.ALIGN, P.LANDING, seen(operator=Operator.LAND), 0.1, O.OPERATOR),
+    "operator-land": Case(P.ALIGN, P.LANDING, seen(operator_request=Operator.LAND), 0.1,
+        O.OPERATOR),
     "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), BEGIN_S), 1.5, O.SAFETY),
     "heading-lost": Case(
-        P.ALIGN, P.LANDING, seen(jumped=True, turned_rad=1.5), 0.1, O.SAFETY, RawThrust
+        P.ALIGN, P.LANDING, seen(has_estimate_jumped=True, heading_jump_rad=1.5), 0.1, O.SAFETY,
+        RawThrust
     ),
     "position-astray": Case(
         P.APPROACH, P.LANDING, aside(0.2, 0.01), 0.1, O.SAFETY, RawThrust, z_m=0.3, profile=MOCAP
@@ -173,7 +175,7 @@ CASES: dict[str, Case] = {
     "position-lost": Case(
         P.ALIGN, P.LANDING, seen(position_age_s=0.8, position_problem="occluded"), 0.1, O.SAFETY
     ),
-    "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
+    "estimator-jump": Case(P.ALIGN, P.LANDING, seen(has_estimate_jumped=True), 0.8, O.SAFETY),
     "estimate-unsure": Case(
         P.ALIGN, P.LANDING, at(velocity_variance_m2ps2=0.08), 1.2, O.SAFETY
     ),
@@ -181,7 +183,7 @@ CASES: dict[str, Case] = {
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
     "latency": Case(
         P.ALIGN, P.LANDING,
-        seen(mismatch=Mismatch(later_s=0.15)), 0.1, O.SAFETY,
+        seen(camera_imu_mismatch=CameraImuMismatch(camera_latency_error_s=0.15)), 0.1, O.SAFETY,
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
@@ -191,10 +193,11 @@ CASES: dict[str, Case] = {
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
     "corridor": Case(P.ALIGN, P.LANDING, aside(0.6), 0.1, O.SAFETY, profile=IN_CORRIDOR),
     "camera-gone": Case(
-        P.ALIGN, P.LANDING, seen(camera_age_s=4.0, new_frame=False), 0.1, O.SAFETY
+        P.ALIGN, P.LANDING, seen(last_good_frame_age_s=4.0, has_new_frame=False), 0.1, O.SAFETY
     ),
     "loop-late": Case(P.ALIGN, P.LANDING, seen(loop_late_s=1.2), 0.1, O.SAFETY),
-    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(disagreeing_frames=40), 0.1, O.SAFETY),
+    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(successive_marker_conflicts=40), 0.1,
+        O.SAFETY),
     "log-lost": Case(
         P.ALIGN, P.LANDING, seen(log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
     ),
@@ -292,7 +295,7 @@ CASES: dict[str, Case] = {
     ),
     "attempts-used": Case(
         P.RECOVER, P.LANDING, seen(), 0.7, O.ATTEMPTS_USED_UP,
-        state={"attempts": PROFILE.planner.attempts},
+        state={"failed_attempts": PROFILE.planner.attempts},
     ),
     "recovered": Case(P.RECOVER, P.ESTIMATE, seen(), 1.2),
     "recover-timeout": Case(
@@ -357,7 +360,11 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
     state, _ = planner.step_mission(state, locked, PROFILE)
-    assert (state.phase, state.row, state.outcome) == (P.PERCHED, "hung-but-locked", O.OPERATOR)
+    assert (state.phase, state.row_name, state.outcome) == (
+        P.PERCHED,
+        "hung-but-locked",
+        O.OPERATOR,
+    )
 
 
 def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
@@ -404,7 +411,7 @@ def test_a_row_of_your_own_comes_after_every_safety_row() -> None:
     assert names == ["too-weak", "mine", "back", "approached"]
     assert tuple(row for row in table if row.name not in ("mine", "back")) == TABLE
     assert table[at].outcome is Outcome.SAFETY
-    stopped = replace(observation(BEGIN_S), operator=Operator.LAND)
+    stopped = replace(observation(BEGIN_S), operator_request=Operator.LAND)
     for obs, name in ((observation(BEGIN_S), "mine"), (stopped, "operator-land")):
         row = first_transition(context_at(state_in(P.ALIGN), obs, PROFILE), table)
         assert row is not None
@@ -463,7 +470,7 @@ def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     assert (after.phase, after.pause_reason, after.waited_s) == (P.ASCEND, "", 0.0)
     lost = observation(11.0, target=None)
     assert planner.step_mission(state, lost, PROFILE, table)[0].phase is P.SEARCH
-    stopped = observation(11.0, operator=Operator.LAND)
+    stopped = observation(11.0, operator_request=Operator.LAND)
     assert planner.step_mission(state, stopped, PROFILE, table)[0].phase is P.LANDING
 
 

@@ -51,7 +51,7 @@ def unseen(z_m: float, since_s: float = 0.0, for_s: float | None = None, **tel: 
         obs = {
             "position_age_s": t_s - BEGIN_S + since_s if for_s is None else for_s,
             "position_problem": "the target is not seen",
-            "new_frame": False,
+            "has_new_frame": False,
         }
         return at(z_m, obs=obs, **tel)(t_s)
 
@@ -93,7 +93,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
     blind_m = heights[round(HOLD_S / TICK_S) + 1 :]
     assert all(after <= before for before, after in pairwise(blind_m))
     assert blind_m[-1] < blind_m[0]
-    assert flight.state.row == "position-lost"
+    assert flight.state.row_name == "position-lost"
     assert "descending level" in flight.state.reason
 
 
@@ -105,7 +105,7 @@ def test_what_sightings_contradict_is_not_flown_by(
     beside_m: float, age_s: float, lands: bool
 ) -> None:
     """It comes down level as soon as they have done so for longer than one of them may be wrong."""
-    seen = at(1.0, obs={"position_beside_m": beside_m, "position_age_s": age_s})
+    seen = at(1.0, obs={"rejected_sighting_distance_m": beside_m, "position_age_s": age_s})
     state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
     assert (state.phase is Phase.LANDING) is lands
     assert ("from its estimate" in state.reason) is lands
@@ -171,7 +171,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
     assert (flight.state.phase is Phase.LANDING) is (gained_mps > GUST_SPEED_THRESHOLD_MPS)
     if flight.state.phase is Phase.LANDING:
-        assert flight.state.row == "position-lost"
+        assert flight.state.row_name == "position-lost"
         assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_FUSED_POSITION_EXTRA_AGE_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
@@ -187,14 +187,14 @@ def test_pictures_that_come_late_are_no_blow(later_s: float, lost: int) -> None:
 
     def look(t_s: float) -> Observation:
         age_s = 0.07 + later_s + (t_s - BEGIN_S) % period_s
-        return at(obs={"position_age_s": age_s, "delay_s": later_s}, **slow)(t_s)
+        return at(obs={"position_age_s": age_s, "extra_camera_latency_s": later_s}, **slow)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 3.0, PROFILE, feels=True, one_phase=True)
     assert flight.state.phase is not Phase.LANDING
 
 
 def test_a_landing_that_loses_it_goes_on_blindly() -> None:
-    ordered = at(obs={"operator": Operator.LAND})
+    ordered = at(obs={"operator_request": Operator.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
     assert state.phase is Phase.LANDING
     assert state.belief.dead_reckoning_since_s is None
@@ -258,12 +258,12 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
 def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside() -> None:
     """By other means it has the time that it always had."""
     flight = lost(state_in(Phase.PERCH, z_m=2.1), 1.4, 2.1)
-    rows = [tick.state.row for tick in flight.ticks if tick.state.phase is Phase.RECOVER]
+    rows = [tick.state.row_name for tick in flight.ticks if tick.state.phase is Phase.RECOVER]
     assert rows[0] == "pressed-blindly"
-    assert flight.state.attempts == 1
+    assert flight.state.failed_attempts == 1
     assert "after the last sight" in flight.state.reason
     decks = fly(state_in(Phase.PERCH, z_m=2.1), unseen(2.1, for_s=1.3))
-    assert decks.state.row != "pressed-blindly"
+    assert decks.state.row_name != "pressed-blindly"
 
 
 def pressed_past_the_sight(
@@ -280,7 +280,7 @@ def pressed_past_the_sight(
             measured_s=BEGIN_S + TICK_S, sigma_m=np.full(3, sigma_m),
         )  # fmt: skip
         return at(
-            z_m, obs={"target": target, "new_frame": not i, "position_age_s": TICK_S * i},
+            z_m, obs={"target": target, "has_new_frame": not i, "position_age_s": TICK_S * i},
             velocity_mps=(0.0, 0.0, -0.1 if i else 0.0), thrust=1.1 * HOVER_THRUST,
             acc_z_g=1.0 + climb_mps / GRAVITY_MPS2,
         )(t_s)  # fmt: skip
@@ -292,7 +292,7 @@ def pressed_past_the_sight(
 def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() -> None:
     """Though the estimate sinks, and half a second later places nothing any more."""
     state = pressed_past_the_sight()
-    assert (state.phase, state.row) == (Phase.COMPLETE, "contact")
+    assert (state.phase, state.row_name) == (Phase.COMPLETE, "contact")
     assert state.entry.t_s - BEGIN_S > HOLD_S
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
 
@@ -304,7 +304,11 @@ def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
     lateral_offset_m: float, sigma_m: float
 ) -> None:
     state = pressed_past_the_sight(lateral_offset_m, sigma_m)
-    assert (state.phase, state.row, state.attempts) == (Phase.RECOVER, "beside-the-magnet", 1)
+    assert (state.phase, state.row_name, state.failed_attempts) == (
+        Phase.RECOVER,
+        "beside-the-magnet",
+        1,
+    )
 
 
 # --- Without a heading: level, on the vertical speed alone ----------------------------------------

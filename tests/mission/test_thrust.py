@@ -128,7 +128,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
 ) -> None:
     start = remembering(state_in(Phase.ALIGN), hover_thrust=hover)
     state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, lateral_offset_m=0.2)
-    assert state.row == row
+    assert state.row_name == row
     assert row != "too-weak" or "battery too low" in state.reason
 
 
@@ -159,7 +159,7 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
     """A vehicle that touches something with all its thrust, seen by a late turn."""
-    late = {"target": None, "new_frame": False, "loop_late_s": late_s}
+    late = {"target": None, "has_new_frame": False, "loop_late_s": late_s}
     return at(CONTACT_Z_M, obs=late, thrust=float(FULL_THRUST))(t_s)
 
 
@@ -232,7 +232,7 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
 def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     """The lowest setpoint of a landing still leads below where it is handed over."""
     profile = changed({"planner.landing.handover_m": handover_m})
-    it = Follows(0.1, operator=Operator.LAND)
+    it = Follows(0.1, operator_request=Operator.LAND)
     flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
     ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
     assert flight.ticks[ordered].state.order_count == 1

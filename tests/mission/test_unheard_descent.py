@@ -155,7 +155,7 @@ def come_down(
             t_s, body_m=(x_m, 0.0, z_m), measured_s=t_s - PICTURES_LATE_S, measured=now
         )
         obs = observation(t_s, telemetry=heard, target=target, position_age_s=1.1 + TICK_S * i)
-        obs = replace(obs, new_frame=now, felt=felt)
+        obs = replace(obs, has_new_frame=now, visual_inertial_motion=felt)
         state, command = step_mission(state, look(obs), BY_TARGET)
         commands.append(command)
         vehicle.step(command)

@@ -150,7 +150,9 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
 @given(
     bits=st.lists(BITS, min_size=1, max_size=6),
     begin=st.sampled_from(STATES),
-    doubt=st.sampled_from([{}, {"jumped": True}, {"link_problem": "gone"}, {"loop_late_s": 0.5}]),
+    doubt=st.sampled_from(
+        [{}, {"has_estimate_jumped": True}, {"link_problem": "gone"}, {"loop_late_s": 0.5}]
+    ),
     flying=st.booleans(),
 )
 def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
@@ -298,7 +300,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
     flight = fly(begin, hand, 20.0, PROFILES[positioning], feels=True)
     state = flight.state
     assert (state.phase, state.outcome) == (Phase.ABORTED, Outcome.SAFETY)
-    assert state.row == "held-elsewhere"
+    assert state.row_name == "held-elsewhere"
     # It neither fights on in the hand, nor stops without its weight having hung in it.
     assert flight.stops_s[0] < 10.0 + 8.0
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
@@ -504,7 +506,7 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     """It was at rest before the silence and is at rest after it: on the floor. Else what is
     remembered moves with the estimate."""
     state = landing(1.0, last_telemetry=telemetry(10.0, 1.0))
-    new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
+    new, _ = step_mission(state, at(0.02, obs={"has_estimate_jumped": True})(10.0 + gap_s), PROFILE)
     assert state.belief.takeoff_position_m is not None
     assert new.belief.takeoff_position_m is not None
     assert new.belief.takeoff_position_m[2] - state.belief.takeoff_position_m[2] == pytest.approx(
@@ -521,7 +523,7 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     state = landing(
         0.4, order_count=3, last_order_s=9.0, last_telemetry=telemetry(9.98, 0.4, supervisor=lands)
     )
-    up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
+    up = at(0.9, obs={"has_estimate_jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
     state, command = step_mission(state, up(10.0), PROFILE)
     assert is_setpoint(command, above_m=1.2)
     slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
@@ -604,6 +606,6 @@ def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -
     felt = Felt()
     felt(at()(BEGIN_S))
     flight = fly(landing(1.0, Phase.ALIGN), at(**frozen), 1.4, feels=felt, one_phase=True)
-    assert flight.state.row == "telemetry-stale"
+    assert flight.state.row_name == "telemetry-stale"
     last_stale_s = PROFILE.safety.telemetry_land_s
     assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(last_stale_s, abs=0.1)

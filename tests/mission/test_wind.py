@@ -101,7 +101,7 @@ def test_what_holds_it_in_the_wind_goes_down_with_it(
 
     def lands(t_s: float) -> Observation:
         operator = Operator.LAND if t_s > lands_s else Operator.NONE
-        return replace(look(t_s), operator=operator)
+        return replace(look(t_s), operator_request=operator)
 
     flight = fly(state_in(Phase.ALIGN), lands, 0.6, MOCAP)
     assert flight.state.phase is Phase.LANDING
@@ -162,7 +162,7 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
             return obs
         assert obs.target is not None
         late = replace(obs.target, measured_s=lost_s, measured=False)
-        return replace(obs, target=late, new_frame=False)
+        return replace(obs, target=late, has_new_frame=False)
 
     flight = fly(state_in(Phase.PERCH, z_m=1.9), look, 1.2, BY_TARGET, feels=True, one_phase=True)
     assert flight.state.phase is Phase.PERCH

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
-from perchctl.mission import Mismatch
+from perchctl.mission import CameraImuMismatch
 from perchctl.perception.visual_inertial import (
     BEYOND_S,
     LEAST_LATER_S,
@@ -112,8 +112,8 @@ def test_a_delay_is_found_and_the_speed_with_it(
     mismatch, motion = watch.mismatch, watch.motion
     assert mismatch is not None
     assert motion is not None
-    assert mismatch.turn_rad == 0.0
-    assert mismatch.later_s == pytest.approx(later_s, abs=1.5 * STEP_S)
+    assert mismatch.camera_yaw_error_rad == 0.0
+    assert mismatch.camera_latency_error_s == pytest.approx(later_s, abs=1.5 * STEP_S)
     *true_mps, true_climb_mps = swing.velocity_mps(motion.t_s)
     # Between two delays of the grid the speed is off by 0.06 m/s at the most.
     assert motion.velocity_mps == pytest.approx(true_mps, abs=0.07)
@@ -153,10 +153,10 @@ def test_a_latency_that_cannot_be_measured_is_the_planner_s_matter(
     watch = watched(Swing(0.05), later_s=later_s, measured=measured)
     assert watch.correction_s is None
     assert watch.mismatch is not None
-    assert watch.mismatch.later_s == pytest.approx(later_s - in_use_s, abs=0.02)
+    assert watch.mismatch.camera_latency_error_s == pytest.approx(later_s - in_use_s, abs=0.02)
     turned = watched(Swing(0.05), later_s=in_use_s, turned_rad=math.pi, measured=measured)
     assert turned.correction_s is None
-    assert turned.mismatch == Mismatch(0.0, math.pi)
+    assert turned.mismatch == CameraImuMismatch(0.0, math.pi)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, -1])
@@ -167,8 +167,8 @@ def test_a_turned_camera_is_found(quarters: int) -> None:
     mismatch, motion = watch.mismatch, watch.motion
     assert mismatch is not None
     assert motion is not None
-    assert mismatch.later_s == 0.0
-    assert mismatch.turn_rad == pytest.approx(turned_rad)
+    assert mismatch.camera_latency_error_s == 0.0
+    assert mismatch.camera_yaw_error_rad == pytest.approx(turned_rad)
     assert motion.velocity_mps == pytest.approx(swing.velocity_mps(motion.t_s)[:2], abs=0.03)
 
 

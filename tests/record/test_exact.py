@@ -22,8 +22,8 @@ from perchctl.mission import (
     Outcome,
     Phase,
     SentCommand,
-    Turn,
-    TurnInputs,
+    TickInputs,
+    TickRecord,
     UnfilteredPose,
 )
 from perchctl.record import from_exact_json, read_log, to_exact_json
@@ -83,7 +83,8 @@ def test_an_observation_comes_back(
     )  # fmt: skip
     obs = Observation(
         number, telemetry, target, True, math.inf,
-        camera_problem="no picture \u2028 for 1 s", operator=operator, position_age_s=number,
+        camera_problem="no picture \u2028 for 1 s", operator_request=operator,
+        position_age_s=number,
     )  # fmt: skip
     assert comes_back(Observation, obs)
     assert comes_back(Observation, Observation(0.0, telemetry))
@@ -120,23 +121,25 @@ def test_enums_as_keys_and_arrays_and_numbers_of_any_type_come_back(value: Any) 
     assert comes_back(type(value), value)
 
 
-def whole_turn() -> Turn:
+def whole_turn() -> TickRecord:
     sample = synthetic.telemetry(1.0, 0.3)
     frame = FrameRecord(3, 0.9, 0.95, "woven", True, 12)
-    return Turn(
+    return TickRecord(
         number=7,
         role="redone",
         began_s=1.0,
         t_s=1.3,
-        taken=TurnInputs((replace(sample, t_s=0.9), sample), look=False, frame=frame),
+        inputs=TickInputs(
+            (replace(sample, t_s=0.9), sample), is_detection_requested=False, frame=frame
+        ),
         poses={"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
         observation=Observation(1.3, sample, synthetic.target(1.0, 1.0)),
         command=Land(0.0, 2.0),
         phase=Phase.LANDING,
-        row="fence",
-        held=True,
-        attempts=2,
-        outside=ExternalPositions(0.1, None, 3, 99.0, None),
+        row_name="fence",
+        is_holding_position=True,
+        failed_attempts=2,
+        external_positions=ExternalPositions(0.1, None, 3, 99.0, None),
         outcome=Outcome.SAFETY,
         reason="beyond the fence",
         error="KeyError",
@@ -151,7 +154,7 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
     assert bits(parse_turn(decode_line(line))) == bits(turn)
     # A sample that was left out as nonsense is the newest of its turn all the same.
     assert turn.observation is not None
-    older = replace(turn.observation, telemetry=turn.taken.samples[0])
+    older = replace(turn.observation, telemetry=turn.inputs.samples[0])
     turn = replace(turn, observation=older)
     assert bits(parse_turn(decode_line(turn_line(turn)))) == bits(turn)
 
@@ -164,8 +167,10 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
 def test_a_command_of_each_kind_comes_back(command: Any) -> None:
     """In a turn, and sent in the loop's place. Three kinds have no field at all."""
     assert comes_back(
-        Turn,
-        Turn(number=0, role="flown", began_s=0.0, t_s=0.0, taken=TurnInputs(), command=command),
+        TickRecord,
+        TickRecord(
+            number=0, role="flown", began_s=0.0, t_s=0.0, inputs=TickInputs(), command=command
+        ),
     )
     line = sent_line(sent := SentCommand(0.1 + 0.2, "watchdog", command))
     assert bits(parse_exact(SentCommand, decode_line(line))) == bits(sent)
@@ -194,7 +199,7 @@ def test_a_turn_of_an_earlier_version_comes_back() -> None:
     """A field that is missing has its default; one that is no more is passed over."""
     record = decode_line(turn_line(whole_turn())) | {"timing": {"planner_s": 0.001}}
     del record["attempts"]
-    assert parse_turn(record).attempts == 0
+    assert parse_turn(record).failed_attempts == 0
     del record["began_s"]
     with pytest.raises(InvalidValue, match="began_s"):
         parse_turn(record)
@@ -207,7 +212,7 @@ def test_a_log_keeps_its_keys_whatever_the_program_calls_a_field() -> None:
     for owner, keys in read_log(CORPUS / "hovered.jsonl.gz").header["turn_fields"].items():
         assert set(keys) <= set(now[owner])
     written: dict[str, set[str]] = {}
-    for each in exact_fields(Turn) + exact_fields(SentCommand):
+    for each in exact_fields(TickRecord) + exact_fields(SentCommand):
         written.setdefault(each.owner, set()).add(each.name)
     for kind, keys in FIELD_KEYS.items():
         assert set(keys.values()) <= written[CLASS_KEYS.get(kind, kind)]

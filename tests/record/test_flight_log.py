@@ -167,7 +167,7 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
 @pytest.mark.parametrize("rest", RestState)
 def test_a_rescue_is_a_note_with_its_rest(rest: RestState) -> None:
     """A reader needs no prose to tell where the vehicle is."""
-    record = event_record(Event.from_rescue(9.0, ValueError(), rest, rest.value))
+    record = event_record(Event.note_from_rescue(9.0, ValueError(), rest, rest.value))
     assert (record["event"], record["rest"]) == ("note", rest.name.lower())
     assert record["reason"] == f"ValueError in flight: {rest.value}"
     assert event_record(Event(9.0, EventKind.NOTE, "a note in flight: "))["rest"] is None

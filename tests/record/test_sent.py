@@ -80,4 +80,4 @@ def test_a_rescue_s_orders_are_told() -> None:
     rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, on_sent=told.append)
     assert told
     assert [(each.t_s, each.command) for each in told] == link.sent
-    assert {each.by for each in told} == {"rescue"}
+    assert {each.sender for each in told} == {"rescue"}

@@ -50,10 +50,10 @@ def test_the_corpus_is_worth_its_place() -> None:
     assert {"perched", "landed", "aborted"} <= ends
     flown = {turn.phase for name in NAMES for turn in corpus(name).turns if turn.phase}
     assert flown == set(Phase)
-    assert any(turn.outside for name in NAMES for turn in corpus(name).turns)
+    assert any(turn.external_positions for name in NAMES for turn in corpus(name).turns)
     assert any(turn.role == "redone" for turn in corpus("hung-within").turns)
-    assert any(turn.taken.late for turn in corpus("hung-within").turns)
-    assert any(turn.row == "telemetry-stale" for turn in corpus("link-silent").turns)
+    assert any(turn.inputs.late_samples for turn in corpus("hung-within").turns)
+    assert any(turn.row_name == "telemetry-stale" for turn in corpus("link-silent").turns)
 
 
 def test_flights_of_two_formats_are_in_it() -> None:
@@ -64,4 +64,4 @@ def test_flights_of_two_formats_are_in_it() -> None:
     for name, version in of.items():
         told = [turn.reason is not None for turn in corpus(name).turns if turn.command]
         assert all(told) if version > 3 else not any(told)
-    assert {each.by for each in corpus("hung").sent} == {"watchdog"}
+    assert {each.sender for each in corpus("hung").sent} == {"watchdog"}

@@ -83,7 +83,10 @@ def test_a_landing_without_positions_is_seen_again(
     fly_fault_in_folder(profile, (fault,), tmp_path, True, seed)
     path = seed_log_path(seed, tmp_path)
     log = read_log(path)
-    assert any(not turn.taken.sends_sights or turn.taken.drops_sightings for turn in log.turns)
+    assert any(
+        not turn.inputs.sends_sightings_as_position or turn.inputs.has_discarded_sightings
+        for turn in log.turns
+    )
     check_seen(replay(log, recorded_pictures(path)))
 
 

@@ -19,7 +19,7 @@ from perchctl.analysis import replay
 from perchctl.analysis.decide import Comparison
 from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.mission import Turn, setpoints, step_mission
+from perchctl.mission import TickRecord, setpoints, step_mission
 from perchctl.profile import Profile, apply_settings
 from perchctl.record import FlightLog, LogWatcher, json_line, read_log
 from perchctl.record.header import make_header
@@ -52,7 +52,7 @@ def altered(line: bytes, **changes: Any) -> bytes:
     return json_line(json.loads(line) | changes)
 
 
-def with_turns(log: FlightLog, turns: list[Turn]) -> FlightLog:
+def with_turns(log: FlightLog, turns: list[TickRecord]) -> FlightLog:
     changed = replace(log)
     changed.__dict__["turns"] = turns
     return changed
@@ -128,11 +128,20 @@ def test_the_first_field_is_named(one: Any, other: Any, name: str) -> None:
     assert Comparison().difference("c", float("nan"), float("nan")) is None
 
 
-@pytest.mark.parametrize(("field", "value"), [("row", "fence"), ("held", True), ("attempts", 9)])
-def test_each_part_of_a_decision_is_compared(logs: Logs, field: str, value: object) -> None:
+@pytest.mark.parametrize(
+    ("name", "field", "value"),
+    [
+        ("row_name", "row", "fence"),
+        ("is_holding_position", "held", True),
+        ("failed_attempts", "attempts", 9),
+    ],
+)
+def test_each_part_of_a_decision_is_compared(
+    logs: Logs, name: str, field: str, value: object
+) -> None:
     turns = list(logs("stopped").turns)
     at = next(turn.number for turn in turns if turn.role == "flown") + 20
-    turns[at] = replace(turns[at], **{field: value})
+    turns[at] = replace(turns[at], **{name: value})
     first = replay(with_turns(logs("stopped"), turns)).differences[0]
     assert (first.tick, first.field, first.recorded) == (20, field, value)
 
@@ -156,7 +165,7 @@ def test_of_a_killed_flight_what_is_there_is_replayed(tmp_path: Path, name: str)
 def test_a_turn_that_was_not_sent_is_no_tick(logs: Logs) -> None:
     turns = list(logs("stopped").turns)
     at = len(turns) - 20
-    turn = replace(turns[at], role="redone", attempts=9)
+    turn = replace(turns[at], role="redone", failed_attempts=9)
     rest = [replace(t, number=t.number + 1) for t in turns[at:]]
     found = replay(with_turns(logs("stopped"), [*turns[:at], turn, *rest]))
     assert [each.field for each in found.differences] == ["attempts"]

@@ -61,7 +61,7 @@ def test_they_show_all_that_matters() -> None:
     turns = corpus("seen").turns
     poses = {name for turn in turns for name in turn.poses}
     assert {"large", "joint", "small"} <= poses
-    assert any(turn.role == "waiting" and turn.taken.frame for turn in turns)
+    assert any(turn.role == "waiting" and turn.inputs.frame for turn in turns)
     stages = {t.stage for turn in turns if (t := _target(turn.observation)) is not None}
     assert len(stages) >= 3
 

@@ -95,7 +95,7 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     hang_in_the_camera(link, rig.camera, at_s=0.7)
     hang_in_the_planner(link, monkeypatch, at_s=1.6)
     log, pictures = flown(tmp_path, rig)
-    assert any(turn.taken.late for turn in log.turns)
+    assert any(turn.inputs.late_samples for turn in log.turns)
     redone = [turn for turn in log.turns if turn.role == "redone"]
     assert redone
     found = seen_again(log, pictures)
@@ -266,7 +266,9 @@ def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -
     at = next(k for k, turn in enumerate(turns) if turn.role == "flown") + 10
     obs = turns[at].observation
     assert obs is not None
-    turns[at] = replace(turns[at], observation=replace(obs, camera_age_s=obs.camera_age_s + 1e-15))
+    turns[at] = replace(
+        turns[at], observation=replace(obs, last_good_frame_age_s=obs.last_good_frame_age_s + 1e-15)
+    )
     other = replace(log)
     other.__dict__["turns"] = turns
     found = seen_again(other, pictures)

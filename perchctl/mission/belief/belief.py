@@ -21,7 +21,7 @@ from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.belief.target import TargetBelief, VisualMotion
 from perchctl.mission.belief.thrust import HoverThrust
-from perchctl.mission.observation import Mismatch, Observation
+from perchctl.mission.observation import CameraImuMismatch, Observation
 from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
@@ -225,7 +225,7 @@ class Belief:
         `POSITION_SETTLING_AFTER_GAP_S`, have not diverged and, if they come from pictures, agree
         with the accelerometer."""
         doubted = self.is_position_diverged or (
-            self.is_positioned_by_target and self.obs.mismatch is not None
+            self.is_positioned_by_target and self.obs.camera_imu_mismatch is not None
         )
         returns = (
             self.position_last_stale_at_s is not None
@@ -242,7 +242,7 @@ class Belief:
     @cached_property
     def camera_latency_s(self) -> float:
         """Age of a frame on arrival, s: the camera latency in use."""
-        return self.profile.camera.start_latency_s + self.obs.delay_s
+        return self.profile.camera.start_latency_s + self.obs.extra_camera_latency_s
 
     @cached_property
     def is_position_correcting_velocity(self) -> bool:
@@ -263,7 +263,7 @@ class Belief:
             return False
         least_mps = (
             GUST_SPEED_THRESHOLD_MPS
-            + GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.delay_sigma_s
+            + GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
         return math.hypot(*self.reckoning.lateral_gain_of_imu_only_mps) > least_mps
 
@@ -406,10 +406,10 @@ class Belief:
         )
 
     @cached_property
-    def mismatch(self) -> Mismatch:
+    def camera_imu_mismatch(self) -> CameraImuMismatch:
         """Error of latency or mounting that makes the target appear to move; zero if there is
         none."""
-        return self.obs.mismatch or Mismatch()
+        return self.obs.camera_imu_mismatch or CameraImuMismatch()
 
     @cached_property
     def sighting_age_s(self) -> float:
@@ -421,7 +421,9 @@ class Belief:
         """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
         the target is the positioning system, otherwise with its state estimate."""
         if self.is_positioned_by_target:
-            return self.obs.felt is not None and self.obs.mismatch is None
+            return (
+                self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None
+            )
         return not (self.mounting.is_awaiting_evidence or self.mounting.is_wrong)
 
     @property

@@ -90,7 +90,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
         return f"the state estimate is uncertain ({variance_text(b)})"
     if b.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {b.obs.loop_late_s:.1f} s late"
-    if maneuver.needs_pictures and b.obs.camera_age_s > safety.camera_hold_s:
+    if maneuver.needs_pictures and b.obs.last_good_frame_age_s > safety.camera_hold_s:
         return no_picture_reason(b)
     return ""
 
@@ -102,8 +102,11 @@ def position_loss_text(b: Belief) -> str:
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
         why = why or NO_CORRECTION_TEXT
-    if b.obs.position_beside_m > 0.0:
-        why = f"the target shows the vehicle {b.obs.position_beside_m:.2f} m from its estimate"
+    if b.obs.rejected_sighting_distance_m > 0.0:
+        why = (
+            f"the target shows the vehicle {b.obs.rejected_sighting_distance_m:.2f} m from its "
+            f"estimate"
+        )
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
     return f"{text}: {why}" if why else text
 
@@ -123,4 +126,4 @@ def variance_text(b: Belief) -> str:
 
 def no_picture_reason(b: Belief) -> str:
     """Return why there is no picture, or for how long there was none."""
-    return b.obs.camera_problem or f"no picture for {b.obs.camera_age_s:.1f} s"
+    return b.obs.camera_problem or f"no picture for {b.obs.last_good_frame_age_s:.1f} s"

@@ -91,9 +91,9 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
         b = _reset_after_gap(b)
     if b.is_position_stale:
         b = replace(b, position_last_stale_at_s=obs.t_s)
-    if obs.jumped:
+    if obs.has_estimate_jumped:
         b = _shift_belief_frame(b)
-    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
+    if obs.heading_jump_rad > math.radians(profile.safety.heading_lost_deg):
         b = replace(b, heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
     b = _compare_ordered_thrust(b)
     b = _update_dead_reckoning(b)
@@ -139,7 +139,7 @@ def _update_target(b: Belief) -> Belief:
     """Return the belief with the target's position and spread, and the velocity from pictures,
     after a frame that measured the target."""
     target = b.obs.target
-    if not b.obs.new_frame or target is None or not target.measured:
+    if not b.obs.has_new_frame or target is None or not target.measured:
         return b
     b = replace(b, visual_motion=b.visual_motion.with_detection(target))
     if target.world_m is None:
@@ -311,11 +311,11 @@ def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Adopt the velocity on which pictures and accelerometer agree, once per new result."""
-    motion, before = b.obs.felt, b.reckoning.imu
+    motion, before = b.obs.visual_inertial_motion, b.reckoning.imu
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
     # Late pictures make the estimated height diverge, too.
-    climb_mps = motion.climb_mps if b.mismatch.later_s != 0.0 else None
+    climb_mps = motion.climb_mps if b.camera_imu_mismatch.camera_latency_error_s != 0.0 else None
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
         new,
@@ -330,7 +330,7 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     obs, target = b.obs, b.obs.target
     if target is None:
         return new
-    seen = obs.new_frame and target.measured
+    seen = obs.has_new_frame and target.measured
     if not seen and not (b.is_position_valid and not b.is_positioned_by_target):
         return new
     yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
@@ -395,7 +395,9 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
     tel = obs.telemetry
     heard_again = (
-        obs.imu.last_silence_end_s > before.t_s and b.is_telemetry_fresh and not obs.jumped
+        obs.imu.last_silence_end_s > before.t_s
+        and b.is_telemetry_fresh
+        and not obs.has_estimate_jumped
     )
     if heard_again and last is not None and tel.start == last.start:
         return tel.position_m[2] - last.position_m[2]
@@ -454,7 +456,9 @@ def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
 def _update_mounting(b: Belief) -> MountingMonitor:
     obs, target = b.obs, b.obs.target
     measured = target is not None and target.measured and target.world_m is not None
-    if not (obs.new_frame and measured and b.is_telemetry_fresh and b.sent.maneuver.in_free_air):
+    if not (
+        obs.has_new_frame and measured and b.is_telemetry_fresh and b.sent.maneuver.in_free_air
+    ):
         return b.mounting
     assert b.last_target_world_m is not None
     return update_monitor(

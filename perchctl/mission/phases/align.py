@@ -45,7 +45,7 @@ def is_charge_too_low_to_begin(c: Context) -> bool:
     """True if an attempt or a retry is about to begin and the battery has too little charge for
     it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
-    return begins and c.state.attempts < c.planner.attempts and is_charge_too_low(c)
+    return begins and c.state.failed_attempts < c.planner.attempts and is_charge_too_low(c)
 
 
 def hover_height_m(c: Context) -> float | None:

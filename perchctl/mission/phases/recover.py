@@ -147,7 +147,8 @@ RECOVER = PhaseDefinition(
             "attempts-used",
             {Phase.RECOVER},
             lambda c: (
-                c.state.attempts >= c.planner.attempts and c.in_phase_s > LAST_RECOVERY_DURATION_S
+                c.state.failed_attempts >= c.planner.attempts
+                and c.in_phase_s > LAST_RECOVERY_DURATION_S
             ),
             lambda c: (
                 "all perching attempts are used up"

@@ -75,7 +75,7 @@ def _limit_distance(
 def not_found_reason(c: Context) -> str:
     """Return that the target was not found, and why if known."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
-    why = why or c.obs.target_refused
+    why = why or c.obs.target_refusal_reason
     return f"{text}: {why}" if why else text
 
 
