@@ -93,7 +93,7 @@ def print_decisions(log: Path) -> None:
             "kind": "decision",
             "phase": new.phase.value,
             "row": new.row_name,
-            "hold": new.hold,
+            "hold": new.hold_reason,
             "attempts": new.failed_attempts,
             "command": [type(command).__name__, to_exact_json(command)],
             "outcome": None if new.outcome is None else new.outcome.value,

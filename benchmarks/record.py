@@ -140,7 +140,7 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     seen = None if frame is None else FrameRecord(frame.index, frame.t_s, frame.t_arrival_s)
     found = {} if output is None else output.poses
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
-    state = PlannerState.on_ground(obs, Profile())
+    state = PlannerState.initial_on_ground(obs, Profile())
     turn = TickRecord(
         number=number, role="flown", began_s=t_s, t_s=t_s,
         inputs=TickInputs(samples, frame=seen),

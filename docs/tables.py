@@ -29,10 +29,10 @@ from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.phase import (  # noqa: E402
     AIRBORNE_PHASES,
     CAMERA_GUIDED_PHASES,
-    FLYING_PHASES,
     FREE_AIR_PHASES,
     MAGNET_ATTACH_PHASES,
     PRE_CONTACT_PHASES,
+    PRE_LANDING_PHASES,
 )
 from perchctl.mission.transition import Transition  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
@@ -207,7 +207,7 @@ def corner_methods() -> str:
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (AIRBORNE_PHASES, "in the air"),
-    (FLYING_PHASES, "before landing"),
+    (PRE_LANDING_PHASES, "before landing"),
     (PRE_CONTACT_PHASES, "before contact"),
     (CAMERA_GUIDED_PHASES, "by camera"),
     (FREE_AIR_PHASES, "in the open"),

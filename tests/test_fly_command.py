@@ -293,7 +293,7 @@ def test_a_calibration_of_another_size(tmp_path: Path) -> None:
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> None:
     """A flight that has ended, as `fly` gets it, and a plot that is drawn in no time."""
-    landed = FlightReport(Phase.LANDED, Outcome.OPERATOR, "Ctrl-C", 0, 3.0, False)
+    landed = FlightReport(Phase.LANDED, Outcome.ENDED_BY_OPERATOR, "Ctrl-C", 0, 3.0, False)
     monkeypatch.setattr("perchctl.flight.fly_session", lambda *_, **__: (landed, None))
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
 

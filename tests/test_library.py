@@ -46,7 +46,7 @@ from perchctl.errors import (
     PerchError,
     UsageError,
 )
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 from perchctl.perception import perception
 from tests.helpers.flights import ordered
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -285,7 +285,7 @@ def test_a_row_of_your_own_waits_for_a_switch(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(own_row, "WAIT_S", 30.0)
     monkeypatch.setattr(own_row, "SWITCH", Switch())
-    stop = ordered({Phase.ASCEND: Operator.STOP})
+    stop = ordered({Phase.ASCEND: OperatorRequest.STOP})
     fly_lockstep(load_profile(SHORT), rows=own_row.ROWS, log="waits.jsonl", **stop)
     events = [(each["phase"], each["reason"]) for each in read_log("waits.jsonl").events]
     assert events.count(("ALIGN", "the switch is off")) == 1

@@ -147,7 +147,7 @@ class Flight:
         )
         on_ground = replace(telemetry, position_m=(0.0, 0.0, first["z_m"]))
         state = replace(
-            PlannerState.on_ground(Observation(t_s, on_ground), self.profile),
+            PlannerState.initial_on_ground(Observation(t_s, on_ground), self.profile),
             phase=Phase(r["phase"]), failed_attempts=r["attempts"], battery=battery,
             entry=PhaseEntry(t_s=t_s - (since_s - span.start_s), reason=r["reason"]),
         )  # fmt: skip

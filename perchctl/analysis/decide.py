@@ -110,7 +110,7 @@ def _difference(
     replayed = {
         "phase": state.phase,
         "row_name": state.row_name,
-        "is_holding_position": bool(state.hold),
+        "is_holding_position": bool(state.hold_reason),
         "failed_attempts": state.failed_attempts,
         "command": command,
         "outcome": state.outcome,

@@ -194,7 +194,7 @@ class FlightAnalysis:
             miss_m=end.miss_m,
             settled_xy_rms_m=xy_m,
             settled_yaw_rms_rad=yaw_rad,
-            latency_s=None if findings is None else findings.latency_s,
+            latency_s=None if findings is None else findings.measured_latency_s,
             latency_sigma_s=None if findings is None else findings.latency_sigma_s,
             battery_start_v=float(volts[0]) if volts.size else None,
             battery_min_v=end.battery_min_v,

@@ -12,7 +12,7 @@ from perchctl.mission import Phase
 from perchctl.record import PhaseSpan
 
 HELD_LEAST_S = 0.1
-FLYING = frozenset(phase.value for phase in Phase if phase.is_flying)
+FLYING = frozenset(phase.value for phase in Phase if phase.is_before_landing)
 TOOK_OVER = {
     "watchdog": "The watchdog took over",
     "rescue": "The rescue took over, after an error",

@@ -219,7 +219,7 @@ def fly_and_report(
         try:
             page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, confirm)
-            detached = report.detached
+            detached = report.detached_watchers
         except BaseException as error:
             detached = tuple(getattr(error, "__notes__", ()))
             # The page first: a disk that hangs holds up the log's end, and Land would seem ready.

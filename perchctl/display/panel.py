@@ -57,7 +57,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
 def _hover_text(state: PlannerState) -> str:
     errors, hover = state.hover_errors, state.belief.profile.planner.hover
     of = "" if hover is None else f" of {hover.duration_s:g}"
-    *axes, yaw_rad = errors.rms
+    *axes, yaw_rad = errors.rms_xyz_yaw
     if not errors.frames:
         return f"{errors.duration_s:.0f}{of} s"
     x, y, z = (f"{1e3 * each:.1f}" for each in axes)
@@ -72,13 +72,14 @@ def _battery_text(tick: Tick) -> str:
     if not battery_v >= NO_BATTERY_READING_V:
         return "unknown"
     text = f"{battery_v:.2f} V"
-    if not tick.state.phase.is_before_contact or battery.left_s is None:
+    if not tick.state.phase.is_before_contact or battery.hover_time_left_s is None:
         return text
-    if battery.attempts is None:
-        return f"{text}, {_whole(battery.left_s)} left"
-    if battery.attempts == 0:
+    if battery.affordable_attempts is None:
+        return f"{text}, {_whole(battery.hover_time_left_s)} left"
+    attempts = battery.affordable_attempts
+    if attempts == 0:
         return f"{text}, not enough for an attempt"
-    return f"{text}, enough for {battery.attempts} attempt{'s' if battery.attempts > 1 else ''}"
+    return f"{text}, enough for {attempts} attempt{'s' if attempts > 1 else ''}"
 
 
 def _whole(seconds: float) -> str:

@@ -379,7 +379,7 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
     Outcome.ATTEMPTS_USED_UP: {"hangs or stands"},
     Outcome.SAFETY: set(),
     Outcome.EMERGENCY: {"motors off"},
-    Outcome.OPERATOR: {"hangs or stands"},
+    Outcome.ENDED_BY_OPERATOR: {"hangs or stands"},
 }
 """The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
@@ -405,7 +405,7 @@ def last_transition(report: FlightReport) -> str:
 def report_claims(report: FlightReport) -> Claims:
     """All claims that a report makes about the vehicle."""
     claims = ROW_CLAIMS.get(last_transition(report), set()) | PHASE_CLAIMS.get(report.phase, set())
-    locked = {"locked"} if report.locked else set()
+    locked = {"locked"} if report.is_vehicle_locked else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 

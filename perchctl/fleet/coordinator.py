@@ -32,7 +32,7 @@ from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, Vehicl
 from perchctl.fleet.outcome import LOOK_FIRST, worst_code
 from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import OperatorSwitch
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 
 ROUND_S = 0.02
 """Between two rounds. Longer, and a stop waits longer; shorter, and the rounds cost more computing
@@ -148,7 +148,7 @@ class Coordinator:
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
         word = self._switch.read()  # once: what lands all must not come after the permission
-        if self._confirmed and are_all_ready(self._views) and word is Operator.NONE:
+        if self._confirmed and are_all_ready(self._views) and word is OperatorRequest.NONE:
             self.started = True
         self._watch_distances()
         self._watch_messages()
@@ -175,7 +175,9 @@ class Coordinator:
         """Order all to land, or to cut their motors by the operator's word, and hear whom still can
         be heard. What failed in one vehicle's place does not keep the others from their orders."""
         now_s, word = self._clock(), self._switch.read()
-        order = Order(word=Operator.STOP if word is Operator.STOP else Operator.LAND)
+        order = Order(
+            word=OperatorRequest.STOP if word is OperatorRequest.STOP else OperatorRequest.LAND
+        )
         for name in self._children:
             with contextlib.suppress(Exception):
                 self._send(name, order, now_s)

@@ -28,7 +28,7 @@ from perchctl.fleet.fleet import FleetVehicle
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, gap_text
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 
 FRESH_STATUS_S = 1.0
 """A vehicle whose process has sent nothing for so long is not ready. Longer, and one that hangs
@@ -106,7 +106,7 @@ def decide(
     views: Sequence[VehicleView],
     *,
     started: bool,
-    word: Operator = Operator.NONE,
+    word: OperatorRequest = OperatorRequest.NONE,
     landed: Collection[str] = (),
 ) -> Decision:
     """The orders of this moment.
@@ -128,18 +128,18 @@ def decide(
     orders, reasons = {}, {}
     for view in views:
         name, own = view.name, word
-        if own is Operator.NONE and name in landed:
-            own = Operator.LAND
-        if own is Operator.NONE and failed is not None:
+        if own is OperatorRequest.NONE and name in landed:
+            own = OperatorRequest.LAND
+        if own is OperatorRequest.NONE and failed is not None:
             if not started:
-                own, reasons[name] = Operator.LAND, f"{failed} is not ready"
+                own, reasons[name] = OperatorRequest.LAND, f"{failed} is not ready"
             elif plan.fleet.on_failure == "land-all":
-                own, reasons[name] = Operator.LAND, f"{failed} has failed"
-        if own is Operator.NONE and view.stage.is_before_takeoff:
+                own, reasons[name] = OperatorRequest.LAND, f"{failed} has failed"
+        if own is OperatorRequest.NONE and view.stage.is_before_takeoff:
             obstacle = find_obstacle(plan, name, ended)
             if obstacle is not None:
-                own, reasons[name] = Operator.LAND, obstacle
-        permitted = started and own is Operator.NONE and name in group
+                own, reasons[name] = OperatorRequest.LAND, obstacle
+        permitted = started and own is OperatorRequest.NONE and name in group
         orders[name] = Order(may_take_off=permitted, word=own)
     return Decision(orders=orders, reasons=reasons)
 

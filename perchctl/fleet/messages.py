@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from perchctl.corridor import Point
-from perchctl.mission import Operator, Phase
+from perchctl.mission import OperatorRequest, Phase
 
 BEAT_S = 0.1
 """Between two messages in each direction. Longer, and few of them are left within the second after
@@ -66,7 +66,7 @@ class Order:
     """
 
     may_take_off: bool = False
-    word: Operator = Operator.NONE
+    word: OperatorRequest = OperatorRequest.NONE
 
 
 @dataclass(frozen=True, kw_only=True)

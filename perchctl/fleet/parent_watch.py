@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from perchctl.fleet.messages import Order
 from perchctl.flight import OperatorSwitch
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 
 PARENT_SILENCE_S = 1.0
 """Without a message for so long, the parent hangs and the vehicle lands. Longer, and nobody can
@@ -43,12 +43,12 @@ class ParentSwitch(OperatorSwitch):
         """Take an order in. Its word only adds to what was ordered before; a lost parent that is
         heard again can still cut the motors, but permits nothing."""
         self._heard = True
-        if order.word is not Operator.NONE:
+        if order.word is not OperatorRequest.NONE:
             self.land()
-        if order.word is Operator.STOP:
+        if order.word is OperatorRequest.STOP:
             self.cut()
         # After the word: permission must not be read before it.
-        permitted = order.may_take_off and order.word is Operator.NONE
+        permitted = order.may_take_off and order.word is OperatorRequest.NONE
         self.may_take_off = permitted and self.lost is None
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:
@@ -57,7 +57,7 @@ class ParentSwitch(OperatorSwitch):
         self.may_take_off = False
         self.land()
 
-    def read(self) -> Operator:
+    def read(self) -> OperatorRequest:
         with self._counting:
             now_s, before_s = self.clock(), self._read_s
             if self._heard or before_s is None:

@@ -25,7 +25,7 @@ from perchctl.extensions import error_at
 from perchctl.fleet.messages import BEAT_S, Order, Pace, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
 from perchctl.flight import FlyOptions, fly_session, operator_signals
-from perchctl.mission import Event, Operator, Tick, Watcher
+from perchctl.mission import Event, OperatorRequest, Tick, Watcher
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
 
@@ -82,7 +82,7 @@ def fly_vehicle(
         outcome = VehicleOutcome.from_phase(report.phase)
         summary = log.close(report, miss_m if outcome is VehicleOutcome.PERCHED else None)
         assert summary is not None, "it was closed with a report"
-        for sentence in report.detached:
+        for sentence in report.detached_watchers:
             _say(sentence)
         return reporter.result_of(outcome, summary, str(log.path))
     except BaseException as error:
@@ -178,7 +178,7 @@ class ParentLine:
         except Exception as error:  # whatever unpickling it raises
             self._switch.lose_parent(f"a message of the parent is unreadable ({error_at(error)})")
             return None
-        if isinstance(message, Order) and isinstance(message.word, Operator):
+        if isinstance(message, Order) and isinstance(message.word, OperatorRequest):
             return message
         self._switch.lose_parent(f"the parent sent a {type(message).__name__} instead of an order")
         return None

@@ -468,7 +468,7 @@ class TurnReporter:
             command=command,
             phase=state.phase,
             row_name=state.row_name,
-            is_holding_position=bool(state.hold),
+            is_holding_position=bool(state.hold_reason),
             failed_attempts=state.failed_attempts,
             external_positions=external_positions(feed),
             outcome=state.outcome,

@@ -16,7 +16,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
 from perchctl.mission import (
     FlightReport,
-    Operator,
+    OperatorRequest,
     Phase,
     Tick,
     Transition,
@@ -164,7 +164,7 @@ def fly_lockstep(
     *,
     scenario: Scenario | None = None,
     capture: CaptureSettings | None = None,
-    operator: Callable[[], Operator] = lambda: Operator.NONE,
+    operator: Callable[[], OperatorRequest] = lambda: OperatorRequest.NONE,
     watchers: tuple[Watcher, ...] = (),
     rows: Sequence[Transition] = (),
     camera: Callable[[FrameSource], FrameSource] = lambda source: source,
@@ -238,7 +238,7 @@ def fly_lockstep(
     )
     if opened is not None:
         flight.close_log(opened)
-    for sentence in report.detached:
+    for sentence in report.detached_watchers:
         warnings.warn(sentence, Note, stacklevel=2)
     return flight
 

@@ -36,7 +36,7 @@ from perchctl.mission import (
     EventKind,
     FlightReport,
     Observation,
-    Operator,
+    OperatorRequest,
     Phase,
     PlannerState,
     SentCommand,
@@ -88,7 +88,7 @@ class FlightParts:
     profile: Profile
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
-    operator: Callable[[], Operator] = lambda: Operator.NONE
+    operator: Callable[[], OperatorRequest] = lambda: OperatorRequest.NONE
     positions: PositionStatus | None = None
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = load_table(None)
@@ -116,7 +116,7 @@ def fly(parts: FlightParts) -> FlightReport:
         for sentence in watchers.detached:
             error.add_note(sentence)
         raise
-    return replace(report, detached=tuple(watchers.detached))
+    return replace(report, detached_watchers=tuple(watchers.detached))
 
 
 def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
@@ -229,9 +229,9 @@ def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetr
         abort_on(view_problem(place, newest.position_m, newest.yaw_rad, parts.profile, camera))
 
 
-def _end_on_word(word: Operator, arming: Arming) -> None:
+def _end_on_word(word: OperatorRequest, arming: Arming) -> None:
     """Raises Interrupted on the operator's word; the link then disarms as it is closed."""
-    if word is not Operator.NONE:
+    if word is not OperatorRequest.NONE:
         ending = "disarming" if arming.has_begun else "nothing was started"
         raise Interrupted(f"interrupted before take-off: {ending}")
 
@@ -273,7 +273,7 @@ def _mission(
         before = state
         new, command = step_mission(before, obs, parts.profile, parts.table)
         turns.note_decision(obs, new, command, feed)
-        overruled = new.phase.is_flying and watchdog.overruled_s > late_s
+        overruled = new.phase.is_before_landing and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > TURN_HANG_S):
             redone = True  # nothing that was decided before a hang is sent after it
             turns.report_discarded_turn(inputs, obs, new, command)

@@ -41,7 +41,7 @@ from types import FrameType
 from typing import Any
 
 from perchctl.errors import Interrupted
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 
 STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
 KEY_HELP = "The space bar cuts the motors at once."
@@ -93,13 +93,13 @@ class OperatorSwitch:
     _presses_s: list[float] = field(default_factory=list)  # until they are a stop
     _stopped_s: float = math.inf
 
-    def read(self) -> Operator:
+    def read(self) -> OperatorRequest:
         with self._lock:
             self._decide(self.clock())
             if self._stopped_s < math.inf:
-                return Operator.STOP
+                return OperatorRequest.STOP
             pressed = bool(self._presses_s) or self.landing_requested
-            return Operator.LAND if pressed else Operator.NONE
+            return OperatorRequest.LAND if pressed else OperatorRequest.NONE
 
     def land(self) -> None:
         self.landing_requested = True

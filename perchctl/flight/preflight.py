@@ -21,7 +21,7 @@ from perchctl.flight.criteria import (
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import TargetView, view_from
@@ -267,14 +267,14 @@ class Arming:
         return Arm(True)
 
 
-def disarm_on_word(operator: Callable[[], Operator]) -> Callable[..., Arm | None]:
+def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm | None]:
     """Return the link's guard for the wait before take-off: it disarms on the operator's word, also
     while the loop hangs."""
 
     def poll(
         now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Arm | None:
-        if operator() is Operator.NONE or may_be_flying(newest, now_s):
+        if operator() is OperatorRequest.NONE or may_be_flying(newest, now_s):
             return None
         is_armed = newest is not None and is_armed_by_request(newest.supervisor)
         return Arm(False) if is_armed else None

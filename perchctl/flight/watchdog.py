@@ -22,14 +22,14 @@ from perchctl.flight.preflight import disarm_on_word
 from perchctl.link import Link
 from perchctl.mission import (
     Observation,
-    Operator,
+    OperatorRequest,
     Phase,
     PlannerState,
     RestReport,
     RestState,
     SentCommand,
     VisualInertialMotion,
-    find_rest,
+    report_rest,
     step_landing,
 )
 from perchctl.perception import History, add_samples
@@ -77,7 +77,7 @@ class Watchdog:
     def __init__(
         self,
         profile: Profile,
-        operator: Callable[[], Operator],
+        operator: Callable[[], OperatorRequest],
         position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     ) -> None:
         self._profile = profile
@@ -138,7 +138,7 @@ class Watchdog:
         if self._motors_off:
             return None
         silent_s = now_s - last.obs.t_s
-        if operator is Operator.STOP and (self._closing or silent_s > STOP_AFTER_S):
+        if operator is OperatorRequest.STOP and (self._closing or silent_s > STOP_AFTER_S):
             self._cut_ordered = True
             return self._cut(now_s, newest)
         if self._closing:
@@ -147,7 +147,9 @@ class Watchdog:
             self._history = self._held = self._way_down = None
             return None
         late_s = now_s - last.next_due_s
-        overruled = operator is Operator.LAND or late_s > self._profile.safety.loop_late_land_s
+        overruled = (
+            operator is OperatorRequest.LAND or late_s > self._profile.safety.loop_late_land_s
+        )
         if overruled:
             self.overruled_s = max(self.overruled_s, late_s)
         obs = self._observed(now_s, last, newest, waiting)
@@ -156,11 +158,11 @@ class Watchdog:
         return self._hold(now_s, last, newest)
 
     def _before_first_tick(
-        self, operator: Operator, now_s: float, newest: Telemetry | None
+        self, operator: OperatorRequest, now_s: float, newest: Telemetry | None
     ) -> Command | None:
         """The operator's word, which a first turn that hangs or fails does not read. Its command
         may have gone out even so: a stop cuts, and only on the ground a landing disarms."""
-        if operator is Operator.STOP:
+        if operator is OperatorRequest.STOP:
             self._cut_ordered = True
             return self._cut(now_s, newest)
         return self._on_ground(now_s, newest)
@@ -224,7 +226,7 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
     """True also while the weight is on the magnet: its release goes on, monitored."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
-        and (state.released_s is not None or state.stopped_s is not None)
+        and (state.release_began_s is not None or state.motor_stop_ordered_s is not None)
     )
 
 
@@ -246,7 +248,7 @@ def rescue(
     link: Link,
     clock: Clock,
     profile: Profile,
-    operator: Callable[[], Operator],
+    operator: Callable[[], OperatorRequest],
     state: PlannerState | None,
     history: History,
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
@@ -273,7 +275,7 @@ def rescue(
     by_target = profile.positioning.source.is_target
     start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
-        if operator() is Operator.STOP:
+        if operator() is OperatorRequest.STOP:
             send(EmergencyStop())  # the link's guard repeats it
             return RestReport(RestState.UNSEEN)
         with suppress(Exception):
@@ -296,7 +298,7 @@ def rescue(
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
-            rest = find_rest(state, obs, profile, LOOK_S)
+            rest = report_rest(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)

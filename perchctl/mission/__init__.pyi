@@ -6,7 +6,7 @@ from .observation import CameraImuMismatch as CameraImuMismatch
 from .observation import Observation as Observation
 from .observation import VisualInertialMotion as VisualInertialMotion
 from .phase import Claim as Claim
-from .phase import Operator as Operator
+from .phase import OperatorRequest as OperatorRequest
 from .phase import Outcome as Outcome
 from .phase import Phase as Phase
 from .phase import Severity as Severity
@@ -21,13 +21,13 @@ from .records import TickInputs as TickInputs
 from .records import TickRecord as TickRecord
 from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
-from .report import Findings as Findings
+from .report import CameraFindings as CameraFindings
 from .report import FlightReport as FlightReport
 from .report import HoverReport as HoverReport
 from .report import RestReport as RestReport
 from .report import Touchdown as Touchdown
-from .report import find_rest as find_rest
 from .report import find_row_claims as find_row_claims
+from .report import report_rest as report_rest
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState
 from .table import add_rows as add_rows

@@ -51,10 +51,10 @@ from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Claim, Phase, Severity
 from perchctl.mission.release import (
-    catch_setpoint_above_m,
     catch_slip,
-    clear_contact_below,
-    leave_press,
+    choose_catch_setpoint_above_m,
+    end_press,
+    forget_contact_when_below,
     release_by_thrust,
     stop_motors,
 )
@@ -74,13 +74,13 @@ DESCENT_MANEUVER = Maneuver(descends=True)
 """Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
-MAX_PEEL_SETPOINT_BELOW_M = 0.35
+MAX_PEEL_SETPOINT_BELOW_VEHICLE_M = 0.35
 """Largest distance of a setpoint below the vehicle, m. Larger: a vehicle that comes off the magnet
 falls."""
 PEEL_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
-PEEL_FALL_MPS = -0.35
+FALLING_OFF_MAGNET_MPS = -0.35
 """Vertical speed below which a vehicle is falling off the magnet while it peels off, m/s."""
 MAX_LANDED_HEIGHT_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
@@ -104,13 +104,13 @@ ONBOARD_LANDING_MARGIN_S = 1.8
 """Time added to the quintic's duration, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-MAX_HEIGHT_DRIFT_M = 1.0
+MAX_HEIGHT_ESTIMATE_DRIFT_M = 1.0
 """Largest assumed drift of the height, m."""
-UNSUPPORTED_G = 0.5
+MAX_UNSUPPORTED_G = 0.5
 """Specific force below which the vehicle falls, g: no floor supports it."""
-MAX_DROP_SPEED_MPS = 1.0
+MAX_DROP_ONTO_FLOOR_SPEED_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
-MIN_MIDAIR_CUT_HEIGHT_M = 0.4
+MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
 """Height above which stopped motors mean a cut in the air and not a landing, m."""
 
 
@@ -119,7 +119,7 @@ def step_landing(
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the descent without the mission's table, for watchdog and rescue. The first
     call begins the landing. `state` is None if the planner has not run yet."""
-    state = state or PlannerState.on_ground(obs, profile)
+    state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
     return record_command(*act(Context(state)))
@@ -146,9 +146,9 @@ def begin_landing(state: PlannerState) -> PlannerState:
         severity=max(state.severity, Severity.LAND),
         since={},
         belief=reset_evidence(b),
-        pressed=state.catch_above_m is None and is_pressing(b),
-        last_order_s=None,
-        order_count=0,
+        began_pressed=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
+        last_stop_or_land_order_at_s=None,
+        stop_or_land_order_count=0,
     )
     return enter_descent(new, state)
 
@@ -163,12 +163,16 @@ def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
         and not b.is_positioned_by_target
         and not b.is_position_diverged
     ):
-        state = replace(state, order_count=MIN_LANDING_ORDERS, last_order_s=b.obs.t_s)
-    elif heard and tel.thrust < 1 and before.stopped_s is None:
+        state = replace(
+            state,
+            stop_or_land_order_count=MIN_LANDING_ORDERS,
+            last_stop_or_land_order_at_s=b.obs.t_s,
+        )
+    elif heard and tel.thrust < 1 and before.motor_stop_ordered_s is None:
         # The motors were stopped or never ran; no order may start them again.
-        state = replace(state, stopped_s=b.obs.t_s)
+        state = replace(state, motor_stop_ordered_s=b.obs.t_s)
     last_contact_body_z_m = old.last_contact_body_z_m
-    pressed_unseen = state.pressed and b.is_positioned_by_target
+    pressed_unseen = state.began_pressed and b.is_positioned_by_target
     if last_contact_body_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
         # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
         # ceiling. It counts as free only after a sighting from below.
@@ -192,20 +196,20 @@ def act(c: Context) -> Action:
     """Return the landing's new state and command: catch a fall, stop on the floor, or descend."""
     state = c.state
     if _is_falling_free(c):
-        return _restart_with_catch(c)
-    if state.stopped_s is None and state.catch_above_m is not None:
+        return _restart_landing_with_catch(c)
+    if state.motor_stop_ordered_s is None and state.catch_setpoint_above_vehicle_m is not None:
         if (caught := _catch_fall(c)) is not None:
             return caught
-        c = Context(replace(state, catch_above_m=None))
+        c = Context(replace(state, catch_setpoint_above_vehicle_m=None))
     is_off = c.held_s(MOTORS_OFF_DESPITE_ORDER) >= MOTORS_OFF_DWELL_S
-    if c.state.stopped_s is not None or is_off or _is_standing(c):
+    if c.state.motor_stop_ordered_s is not None or is_off or _is_standing(c):
         return stop_motors(c)
-    if c.state.released_s is not None:
-        return _complete_weight_transfer(c)
+    if c.state.release_began_s is not None:
+        return _complete_transfer_to_magnet(c)
     # changing to another policy during the firmware's own landing would cost height
-    if c.state.order_count:
+    if c.state.stop_or_land_order_count:
         return _order_onboard_landing(c)
-    return _transfer_weight(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
+    return _transfer_weight_to_magnet(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
 
 
 def descend(c: Context) -> Action:
@@ -228,14 +232,14 @@ def descend(c: Context) -> Action:
         b.is_flight_data_unreliable,
     )
     if b.is_positioned_by_target or not (in_reach or doubtful):
-        state, away = leave_press(c)
+        state, away = end_press(c)
         if away is not None:
             return state, away
         c = Context(state)
     low = b.height_m <= landing.handover_m
     if in_reach:
         gives_up = c.in_phase_s > PEEL_TIMEOUT_S and (b.is_imu_fresh or not doubtful)
-        return _transfer_weight(c) if gives_up else _descend_by_setpoints(c)
+        return _transfer_weight_to_magnet(c) if gives_up else _descend_by_setpoints(c)
     if b.is_positioned_by_target:
         return _descend_by_thrust(c) if c.state.descent.thrust or low else _descend_by_setpoints(c)
     overdue = c.in_phase_s > landing.setpoint_time_s
@@ -248,7 +252,7 @@ def is_landing_over(c: Context) -> bool:
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
-        if low and Claim.UNCONFIRMED in c.state.entry.claims:
+        if low and Claim.LANDING_UNCONFIRMED in c.state.entry.claims:
             return True
     return 0.0 < c.state.descent.thrust <= MIN_THRUST_FRACTION * c.belief.hover_thrust + 1.0
 
@@ -262,10 +266,10 @@ def _is_falling_free(c: Context) -> bool:
         return False
     if not state.is_under_power:
         return b.is_in_magnet_reach and has_slipped(b)
-    if state.order_count:
+    if state.stop_or_land_order_count:
         return False
-    caught = state.catch_above_m is None
-    return b.last_contact_body_z_m is not None and caught and b.is_sinking(-PEEL_FALL_MPS)
+    caught = state.catch_setpoint_above_vehicle_m is None
+    return b.last_contact_body_z_m is not None and caught and b.is_sinking(-FALLING_OFF_MAGNET_MPS)
 
 
 def _is_standing(c: Context) -> bool:
@@ -280,7 +284,7 @@ def _is_standing(c: Context) -> bool:
     )
 
 
-def _restart_with_catch(c: Context) -> Action:
+def _restart_landing_with_catch(c: Context) -> Action:
     """Restart the landing at the present height, with a catch."""
     tel, b = c.telemetry, c.belief
     belief = replace(
@@ -292,13 +296,13 @@ def _restart_with_catch(c: Context) -> Action:
     state = replace(
         c.state,
         belief=belief,
-        released_s=None,
-        stopped_s=None,
-        pressed=False,
-        catch_above_m=catch_setpoint_above_m(b.hover_thrust, tel.thrust),
+        release_began_s=None,
+        motor_stop_ordered_s=None,
+        began_pressed=False,
+        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_m(b.hover_thrust, tel.thrust),
         setpoint=None,
-        last_order_s=None,
-        order_count=0,
+        last_stop_or_land_order_at_s=None,
+        stop_or_land_order_count=0,
         descent=replace(c.state.descent, thrust=0.0),
         entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
     )
@@ -319,17 +323,19 @@ def _descend_by_setpoints(c: Context) -> Action:
     landing, state, b = c.planner.landing, c.state, c.belief
     here = hold_here(c)
     start = here
-    if state.catch_above_m is None and state.setpoint is not None:
+    if state.catch_setpoint_above_vehicle_m is None and state.setpoint is not None:
         start = state.setpoint
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry.position_m
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = step_towards(c, start, goal, down_mps=landing.speed_mps, turns=False)
+    setpoint = step_towards(c, start, goal, down_mps=landing.speed_mps, changes_heading=False)
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:
-        setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_SETPOINT_BELOW_M))
-    state = clear_contact_below(state, MAGNET_RELEASED_BELOW_M)
-    state = replace(state, setpoint=setpoint, catch_above_m=None)
-    dx, dy = state.integral_m
+        setpoint = replace(
+            setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_SETPOINT_BELOW_VEHICLE_M)
+        )
+    state = forget_contact_when_below(state, MAGNET_RELEASED_BELOW_M)
+    state = replace(state, setpoint=setpoint, catch_setpoint_above_vehicle_m=None)
+    dx, dy = state.lateral_integral_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
     return state, limit_setpoint(c, sent)
 
@@ -340,7 +346,7 @@ def _descend_by_thrust(c: Context) -> Action:
 
 
 def make_onboard_landing(
-    planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float
+    planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, z_m: float
 ) -> Land:
     """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
     rest.
@@ -348,7 +354,9 @@ def make_onboard_landing(
     The goal is below the ground, by a drift that grows with the flight time `flown_s`, and never
     above the vehicle: the motors stop at the end of the trajectory.
     """
-    drifted_m = min(MAX_HEIGHT_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
+    drifted_m = min(
+        MAX_HEIGHT_ESTIMATE_DRIFT_M, planner.landing.drift_mps * max(0.0, time_in_flight_s)
+    )
     goal_z_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(
         goal_z_m,
@@ -360,42 +368,59 @@ def make_onboard_landing(
 def _order_onboard_landing(c: Context) -> Action:
     """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
     tel, b = c.telemetry, c.belief
-    state, away = leave_press(c)
-    if away is not None and not b.is_flight_data_unreliable and not state.order_count:
+    state, away = end_press(c)
+    if away is not None and not b.is_flight_data_unreliable and not state.stop_or_land_order_count:
         return state, away
-    ends = state.order_count >= MIN_LANDING_ORDERS and not (
-        b.is_position_valid and b.height_m >= MIN_MIDAIR_CUT_HEIGHT_M
+    ends = state.stop_or_land_order_count >= MIN_LANDING_ORDERS and not (
+        b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
     )
-    carried = tel.acc_z_g > UNSUPPORTED_G or (ends and tel.velocity_mps[2] > -MAX_DROP_SPEED_MPS)
+    carried = tel.acc_z_g > MAX_UNSUPPORTED_G or (
+        ends and tel.velocity_mps[2] > -MAX_DROP_ONTO_FLOOR_SPEED_MPS
+    )
     if (
         b.is_imu_fresh
         and tel.thrust < 1
         and carried
-        and (state.order_count or not tel.has_bit(FLYING))
+        and (state.stop_or_land_order_count or not tel.has_bit(FLYING))
     ):
         return state, Idle()  # on the floor, another order would start the motors again
-    waited = math.inf if state.last_order_s is None else c.t_s - state.last_order_s
-    seen = state.order_count >= MIN_LANDING_ORDERS and b.is_imu_fresh and tel.has_bit(HL_ACTIVE)
-    if not seen and waited > LANDING_ORDER_PERIOD_S and state.order_count < MAX_LANDING_ORDERS:
-        flown_s = c.t_s - state.started_s
-        order = make_onboard_landing(c.planner, b.ground_z_m, flown_s, tel.position_m[2])
+    waited = (
+        math.inf
+        if state.last_stop_or_land_order_at_s is None
+        else c.t_s - state.last_stop_or_land_order_at_s
+    )
+    seen = (
+        state.stop_or_land_order_count >= MIN_LANDING_ORDERS
+        and b.is_imu_fresh
+        and tel.has_bit(HL_ACTIVE)
+    )
+    if (
+        not seen
+        and waited > LANDING_ORDER_PERIOD_S
+        and state.stop_or_land_order_count < MAX_LANDING_ORDERS
+    ):
+        time_in_flight_s = c.t_s - state.started_s
+        order = make_onboard_landing(c.planner, b.ground_z_m, time_in_flight_s, tel.position_m[2])
         return replace(
-            state, last_order_s=c.t_s, order_count=state.order_count + 1, setpoint=None
+            state,
+            last_stop_or_land_order_at_s=c.t_s,
+            stop_or_land_order_count=state.stop_or_land_order_count + 1,
+            setpoint=None,
         ), order
     return state, Idle()
 
 
-def _transfer_weight(c: Context) -> Action:
+def _transfer_weight_to_magnet(c: Context) -> Action:
     """Transfer the weight to the magnet, and accept older telemetry than a perch does."""
-    return release_by_thrust(c, late_s=c.safety.telemetry_hold_s)
+    return release_by_thrust(c, accepted_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
-def _complete_weight_transfer(c: Context) -> Action:
+def _complete_transfer_to_magnet(c: Context) -> Action:
     """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, order a
     thrust that carries most of the weight: a hanging vehicle stays, and a fallen one does not
     climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
-        return _transfer_weight(c)
+        return _transfer_weight_to_magnet(c)
     part = MIN_THRUST_FRACTION * c.belief.hover_thrust
     thrust = int(max(KEEPALIVE_THRUST, min(MIN_POSITION_MODE_THRUST, part)))
-    return replace(c.state, released_s=c.t_s), RawThrust(thrust)
+    return replace(c.state, release_began_s=c.t_s), RawThrust(thrust)

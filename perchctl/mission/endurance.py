@@ -134,13 +134,13 @@ def predict_durations(c: Context) -> MissionDurations:
 def is_charge_too_low(c: Context) -> bool:
     """True if the charge is too low for an attempt at a known target."""
     gated = c.safety.energy_gate and c.belief.target.world_m is not None
-    return gated and not c.state.battery.attempts
+    return gated and not c.state.battery.affordable_attempts
 
 
 def battery_shortfall_text(c: Context) -> str:
     """Return the remaining time, and the times that an attempt, the landing and the reserve
     take."""
-    seconds, predicted = c.state.battery.left_s, predict_durations(c)
+    seconds, predicted = c.state.battery.hover_time_left_s, predict_durations(c)
     has = "the remaining battery time is unknown"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"

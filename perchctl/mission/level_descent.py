@@ -22,7 +22,7 @@ from perchctl.mission.belief.contact import MAX_RAW_THRUST
 from perchctl.mission.belief.reckoning import BIAS_TIME_CONSTANT_S
 from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, VisualMotion
 from perchctl.mission.context import Context
-from perchctl.mission.release import clear_contact_below
+from perchctl.mission.release import forget_contact_when_below
 from perchctl.mission.setpoints import Action
 from perchctl.mission.state import PlannerState
 from perchctl.values import replace
@@ -36,15 +36,15 @@ NEAR_FLOOR_SINK_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
 NEAR_FLOOR_HEIGHT_M = 0.6
 """Height below which the vehicle sinks at `NEAR_FLOOR_SINK_SETPOINT_MPS`, m."""
-MAX_GAIN_S_PER_M = 0.5
+MAX_SINK_RATE_GAIN_S_PER_M = 0.5
 """Largest gain, in shares of the hover thrust per m/s. Larger: the vehicle oscillates."""
-MIN_GAIN_S_PER_M = 0.2
+MIN_SINK_RATE_GAIN_S_PER_M = 0.2
 """Smallest gain, with old telemetry, in shares of the hover thrust per m/s."""
-GAIN_TIMES_AGE_S2_PER_M = 0.06
+SINK_RATE_GAIN_TIMES_AGE_S2_PER_M = 0.06
 """Product of gain and age of the vertical speed, between the smallest and the largest gain."""
-UNMEASURED_THRUST_FACTOR = 0.98
+THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
-CAMERA_SINK_SETPOINT_MPS = 0.4
+SINK_SETPOINT_BY_CAMERA_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
 MIN_CAMERA_SINK_MPS = 0.2
@@ -59,10 +59,10 @@ THRUST_RAMP_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-CAMERA_THRUST_RAMP_PER_S = 0.1
+THRUST_RAMP_BY_CAMERA_PER_S = 0.1
 """Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
 the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
-MIN_SINK_MPS = 0.05
+MIN_DETECTED_SINK_MPS = 0.05
 """Sink rate below which the vehicle does not sink, m/s."""
 MIN_THRUST_FRACTION = 0.4
 """Smallest ordered thrust, as a share of the hover thrust."""
@@ -78,7 +78,7 @@ MAX_BRAKE_TILT_RAD = 0.22
 MAX_WIND_TILT_RAD = 0.2
 """Largest lean against the wind, rad: a wind of 6 m/s. Larger: a blow or a wrong bias moves the
 vehicle far off."""
-MAX_FULL_BRAKE_AGE_S = 0.2
+MAX_SPEED_AGE_FOR_FULL_BRAKE_S = 0.2
 """Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
 INITIAL_LATERAL_SIGMA_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
@@ -86,13 +86,13 @@ LATERAL_SIGMA_GROWTH_MPS2 = 0.1
 """Growth of that uncertainty, m/s per second: an attitude error of 0.01 rad adds 0.1."""
 MAX_LATERAL_SIGMA_MPS = 0.3
 """Largest uncertainty of the lateral speed, m/s."""
-MAX_ATTITUDE_ERROR_AGE_S = 6.0
+MAX_VISUAL_BIAS_AGE_S = 6.0
 """Time after which the attitude error that pictures have shown no longer applies, s."""
 MIN_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
 MAX_SUPPORTED_THRUST_FRACTION = 0.88
 """Largest thrust that counts as low, as a share of the hover thrust."""
-MAX_AIRBORNE_G = 0.85
+MAX_G_STILL_AIRBORNE = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
 TOUCHDOWN_THRUST_FRACTION = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
@@ -100,9 +100,9 @@ TOUCHDOWN_DURATION_S = 0.25
 """Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
 MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
 """Height below which a blow from below is the floor's, m."""
-DESCENT_MARGIN_S = 2.0
+DESCENT_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration after which the vehicle has landed or hangs, s."""
-UNMEASURED_DESCENT_MARGIN_S = 0.8
+OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
 """The same margin without a measured vertical speed, s."""
 MAX_SETPOINT_DESCENT_S = 1.5
 """Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
@@ -112,10 +112,10 @@ MIN_MEAN_SINK_MPS = 0.35
 MAGNET_RELEASED_BELOW_M = 0.1
 """Distance below the contact at which the magnet has let go, m. Larger: a vehicle that has come off
 still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
-CAMERA_MAGNET_RELEASED_BELOW_M = 0.2
+MAGNET_RELEASED_BELOW_BY_CAMERA_M = 0.2
 """The same distance from pictures with an old attitude, m. Larger: the vehicle drifts for longer
 before it brakes. Smaller: a target seen at an angle seems to be above."""
-CAMERA_STANDING_THRUST_FRACTION = 0.75
+STANDING_THRUST_FRACTION_BY_CAMERA = 0.75
 """Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
 in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
 Smaller: the motors run on the floor for longer."""
@@ -123,7 +123,7 @@ MAX_RAMP_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
 
-def _camera_motion(c: Context) -> VisualMotion | None:
+def _fresh_visual_motion(c: Context) -> VisualMotion | None:
     """Return the motion from pictures if the telemetry is old and the pictures are newer; else
     None."""
     b, seen = c.belief, c.belief.visual_motion
@@ -141,13 +141,13 @@ def _is_target_redetected(c: Context) -> bool:
 
 def _climb_measured_at_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
-    seen = _camera_motion(c)
+    seen = _fresh_visual_motion(c)
     return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
 
 
 def _is_climb_unknown(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
-    return _climb_age_s(c) > hover.MAX_TELEMETRY_AGE_S
+    return _climb_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_S
 
 
 def _tick_duration_s(c: Context) -> float:
@@ -155,7 +155,7 @@ def _tick_duration_s(c: Context) -> float:
     return max(0.0, min(MAX_RAMP_STEP_S, c.t_s - c.state.t_s))
 
 
-def _climb_age_s(c: Context) -> float:
+def _climb_measurement_age_s(c: Context) -> float:
     """Return the age of the vertical speed, s: at least one tick."""
     return max(1e-3, _tick_duration_s(c), c.t_s - _climb_measured_at_s(c))
 
@@ -171,19 +171,23 @@ def descend_level(c: Context) -> Action:
     """Sink level by raw thrust controlled by the vertical speed, tilted against the lateral
     speed."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
-    dt_s, age_s, measured_s = _tick_duration_s(c), _climb_age_s(c), _climb_measured_at_s(c)
+    dt_s, age_s, measured_s = (
+        _tick_duration_s(c),
+        _climb_measurement_age_s(c),
+        _climb_measured_at_s(c),
+    )
     measured_mps = _measured_climb_mps(c)
-    climb_mps = measured_mps + descent.pending_climb_mps
-    sinks, ramp_per_s = climb_mps <= -MIN_SINK_MPS, THRUST_RAMP_PER_S
-    if _camera_motion(c) is not None:  # on the floor, recent orders cause no climb
-        sinks, ramp_per_s = measured_mps <= -MIN_CAMERA_SINK_MPS, CAMERA_THRUST_RAMP_PER_S
+    climb_mps = measured_mps + descent.unmeasured_climb_mps
+    is_sinking, ramp_per_s = climb_mps <= -MIN_DETECTED_SINK_MPS, THRUST_RAMP_PER_S
+    if _fresh_visual_motion(c) is not None:  # on the floor, recent orders cause no climb
+        is_sinking, ramp_per_s = measured_mps <= -MIN_CAMERA_SINK_MPS, THRUST_RAMP_BY_CAMERA_PER_S
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoning_since_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_S:
-        thrust *= UNMEASURED_THRUST_FACTOR
-    floor_detected_s = _find_floor_detection_s(c, hover_thrust, height_m, sinks=sinks)
+        thrust *= THRUST_FACTOR_WITHOUT_CLIMB_RATE
+    floor_detected_s = _find_floor_detection_s(c, hover_thrust, height_m, is_sinking=is_sinking)
     touched_s = math.inf if floor_detected_s is None else c.t_s - floor_detected_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -194,32 +198,36 @@ def descend_level(c: Context) -> Action:
         and tel.acc_z_g > MIN_SUPPORTED_G
         and tel.thrust < MAX_SUPPORTED_THRUST_FRACTION * hover_thrust
     )
-    overdue = _is_overdue(c) and not (b.is_imu_fresh and tel.acc_z_g < MAX_AIRBORNE_G)
+    overdue = _is_touchdown_overdue(c) and not (
+        b.is_imu_fresh and tel.acc_z_g < MAX_G_STILL_AIRBORNE
+    )
     before = descent.thrust or hover_thrust
     if touched_s < TOUCHDOWN_DURATION_S:
         thrust = TOUCHDOWN_THRUST_FRACTION * hover_thrust
     elif _is_target_redetected(c):
         thrust = before
-    elif floor_detected_s is not None or carried or not sinks or overdue:
+    elif floor_detected_s is not None or carried or not is_sinking or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(MIN_THRUST_FRACTION * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
     shown_s = 0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
-    pending_climb_mps = descent.pending_climb_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
-    state = _clear_contact_after_fall(c)
+    unmeasured_climb_mps = (
+        descent.unmeasured_climb_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
+    )
+    state = _forget_contact_after_fall(c)
     state = replace(
         state,
         descent=replace(
             descent,
             thrust=thrust,
             floor_detected_s=floor_detected_s,
-            pending_climb_mps=pending_climb_mps,
+            unmeasured_climb_mps=unmeasured_climb_mps,
             climb_measured_s=measured_s,
         ),
         setpoint=None,
-        order_count=0,
-        catch_above_m=None,
+        stop_or_land_order_count=0,
+        catch_setpoint_above_vehicle_m=None,
     )
     roll_rad, pitch_rad = (
         (0.0, 0.0) if floor_detected_s is not None else _compute_braking_attitude(c)
@@ -230,7 +238,7 @@ def descend_level(c: Context) -> Action:
 def _measured_climb_mps(c: Context) -> float:
     """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
     the vehicle in place since the last telemetry."""
-    seen = _camera_motion(c)
+    seen = _fresh_visual_motion(c)
     if seen is not None:
         return seen.vehicle_velocity_mps[2]
     held = c.telemetry.t_s < c.state.entry.t_s - SETPOINT_SETTLING_S
@@ -238,23 +246,23 @@ def _measured_climb_mps(c: Context) -> float:
 
 
 def _find_floor_detection_s(
-    c: Context, hover_thrust: float, height_m: float, *, sinks: bool
+    c: Context, hover_thrust: float, height_m: float, *, is_sinking: bool
 ) -> float | None:
     """Return when the floor was first detected: by a blow from below during a sink, or by pictures
     of a motionless vehicle at a thrust too low to carry it."""
-    descent, b, seen = c.state.descent, c.belief, _camera_motion(c)
+    descent, b, seen = c.state.descent, c.belief, _fresh_visual_motion(c)
     if descent.floor_detected_s is not None:
         return descent.floor_detected_s
     struck = (
         c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_DURATION_S
         and b.reckoning.climb_before_impact_mps < 0.0
     )
-    weak = 0.0 < descent.thrust < CAMERA_STANDING_THRUST_FRACTION * hover_thrust
+    weak = 0.0 < descent.thrust < STANDING_THRUST_FRACTION_BY_CAMERA * hover_thrust
     stands = (
         seen is not None
-        and seen.target_from_gear_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
+        and seen.target_from_gear_m[2] > MAGNET_RELEASED_BELOW_BY_CAMERA_M
         and weak
-        and not sinks
+        and not is_sinking
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
@@ -266,25 +274,25 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
     is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
     low = height_m <= NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
-    if _camera_motion(c) is not None:
-        sink_mps = CAMERA_SINK_SETPOINT_MPS
-    gain = GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
-    gain = max(MIN_GAIN_S_PER_M, min(MAX_GAIN_S_PER_M, gain))
+    if _fresh_visual_motion(c) is not None:
+        sink_mps = SINK_SETPOINT_BY_CAMERA_MPS
+    gain = SINK_RATE_GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
+    gain = max(MIN_SINK_RATE_GAIN_S_PER_M, min(MAX_SINK_RATE_GAIN_S_PER_M, gain))
     tilt = max(MIN_TILT_COSINE, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
-def _clear_contact_after_fall(c: Context) -> PlannerState:
+def _forget_contact_after_fall(c: Context) -> PlannerState:
     """Return the state, without its contact once a position or pictures show the vehicle lower, or
     after a fall."""
-    state, b, seen = c.state, c.belief, _camera_motion(c)
+    state, b, seen = c.state, c.belief, _fresh_visual_motion(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
-        return clear_contact_below(state, MAGNET_RELEASED_BELOW_M)
+        return forget_contact_when_below(state, MAGNET_RELEASED_BELOW_M)
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
         in_magnet_reach_since_s, state.entry.t_s
     )
-    seen_below = seen is not None and seen.target_from_gear_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
+    seen_below = seen is not None and seen.target_from_gear_m[2] > MAGNET_RELEASED_BELOW_BY_CAMERA_M
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
@@ -297,7 +305,7 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
     return state
 
 
-def _is_overdue(c: Context) -> bool:
+def _is_touchdown_overdue(c: Context) -> bool:
     """True if the vehicle has been without a position for so long that it must have landed or
     hang."""
     state, b = c.state, c.belief
@@ -306,7 +314,7 @@ def _is_overdue(c: Context) -> bool:
     descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoning_since_s or 0.0, state.entry.t_s)
     measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_S
-    spare_s = DESCENT_MARGIN_S if measured else UNMEASURED_DESCENT_MARGIN_S
+    spare_s = DESCENT_OVERDUE_MARGIN_S if measured else OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
     if not measured and b.hover_thrust_estimate.is_imprecise:
         spare_s += MAX_SETPOINT_DESCENT_S
     return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_SINK_MPS
@@ -342,9 +350,9 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
         INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
     )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
-    part *= min(1.0, MAX_FULL_BRAKE_AGE_S / max(1e-3, b.attitude_age_s))
-    ahead_mps, left_mps = _rotate_to_heading(part * x_mps, part * y_mps, yaw_rad)
-    seen, gain = _camera_motion(c), BRAKE_GAIN_RAD_PER_MPS
+    part *= min(1.0, MAX_SPEED_AGE_FOR_FULL_BRAKE_S / max(1e-3, b.attitude_age_s))
+    ahead_mps, left_mps = _world_to_heading_xy(part * x_mps, part * y_mps, yaw_rad)
+    seen, gain = _fresh_visual_motion(c), BRAKE_GAIN_RAD_PER_MPS
     if seen is not None and b.is_camera_motion_consistent:
         ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
         if c.t_s - seen.t_s <= MAX_CAMERA_SPEED_AGE_S:
@@ -358,8 +366,8 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
         if b.is_position_diverged
         else min(1.0, reckoning.time_under_position_control_s / BIAS_TIME_CONSTANT_S)
     )
-    counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_ATTITUDE_ERROR_AGE_S)
-    ahead_mps2, left_mps2 = _rotate_to_heading(
+    counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_VISUAL_BIAS_AGE_S)
+    ahead_mps2, left_mps2 = _world_to_heading_xy(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
     )
     roll_rad, pitch_rad = c.obs.imu.roll_pitch_error_rad
@@ -369,14 +377,17 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     )
 
 
-def _rotate_to_heading(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
+def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
     """Return world x and y as ahead and left of a vehicle with this heading."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 
 
-def _wind_tilt_rad(mps2: float) -> float:
-    return max(-MAX_WIND_TILT_RAD, min(MAX_WIND_TILT_RAD, math.atan(mps2 / GRAVITY_MPS2)))
+def _wind_tilt_rad(acceleration_against_wind_mps2: float) -> float:
+    return max(
+        -MAX_WIND_TILT_RAD,
+        min(MAX_WIND_TILT_RAD, math.atan(acceleration_against_wind_mps2 / GRAVITY_MPS2)),
+    )
 
 
 def _brake_tilt_rad(mps: float, rad_per_mps: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from perchctl.mission.belief.motion import ImuMotion
-from perchctl.mission.phase import Operator
+from perchctl.mission.phase import OperatorRequest
 from perchctl.vehicle import Telemetry
 from perchctl.vision import TargetEstimate
 
@@ -46,7 +46,7 @@ class Observation:
     heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
     loop_late_s: float = 0.0  #: delay of the start of this tick
     successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
-    operator_request: Operator = Operator.NONE
+    operator_request: OperatorRequest = OperatorRequest.NONE
     log_problem: str | None = None  #: the flight log cannot be written
     #: latency beyond the profile's, subtracted from the frames' times (`measured`)
     extra_camera_latency_s: float = 0.0

@@ -6,7 +6,7 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.update import has_gap, update_belief
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import CATCH_ABOVE_MOTORS_OFF_M
+from perchctl.mission.release import CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -19,8 +19,8 @@ def observe(
     ends. After a jump of the estimate, the remembered positions move with it."""
     if has_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above; keeping it would make the vehicle press.
-        setpoint = state.setpoint if state.catch_above_m is None else None
-        state = replace(state, since={}, catch_above_m=None, setpoint=setpoint)
+        setpoint = state.setpoint if state.catch_setpoint_above_vehicle_m is None else None
+        state = replace(state, since={}, catch_setpoint_above_vehicle_m=None, setpoint=setpoint)
     known = state.belief.last_telemetry is not None
     belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
     state = replace(state, belief=belief)
@@ -31,13 +31,13 @@ def _apply_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
     trajectory in the old frame, so the vehicle is caught and the landing ordered again."""
     b, blocked_z_m = state.belief, state.blocked_z_m
-    if state.phase is Phase.LANDING and state.order_count and b.telemetry.thrust >= 1:
+    if state.phase is Phase.LANDING and state.stop_or_land_order_count and b.telemetry.thrust >= 1:
         state = replace(
             state,
             entry=replace(state.entry, t_s=b.obs.t_s),
-            order_count=0,
-            last_order_s=None,
-            catch_above_m=CATCH_ABOVE_MOTORS_OFF_M,
+            stop_or_land_order_count=0,
+            last_stop_or_land_order_at_s=None,
+            catch_setpoint_above_vehicle_m=CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M,
         )
     return replace(
         state,

@@ -33,9 +33,9 @@ class Phase(Enum):
     ABORTED = "ABORTED"
 
     @property
-    def is_flying(self) -> bool:
+    def is_before_landing(self) -> bool:
         """True until a landing begins."""
-        return self in FLYING_PHASES
+        return self in PRE_LANDING_PHASES
 
     @property
     def is_before_contact(self) -> bool:
@@ -54,9 +54,9 @@ FINAL_PHASES = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 """Final phases."""
 AIRBORNE_PHASES = frozenset(Phase) - FINAL_PHASES
 """Phases in which the motors may run."""
-FLYING_PHASES = AIRBORNE_PHASES - {Phase.LANDING}
+PRE_LANDING_PHASES = AIRBORNE_PHASES - {Phase.LANDING}
 """Phases before the landing."""
-PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
+PRE_CONTACT_PHASES = PRE_LANDING_PHASES - {Phase.COMPLETE}
 """Phases before a contact is proven."""
 CAMERA_GUIDED_PHASES = frozenset(
     {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER, Phase.HOVER}
@@ -66,7 +66,7 @@ FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
 """Phases in which nothing but air should touch the vehicle: their maneuver is `in_free_air`."""
 MAGNET_ATTACH_PHASES = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
-PUBLISHED_PHASES = (
+PAPER_METHOD_PHASES = (
     Phase.APPROACH,
     Phase.SEARCH,
     Phase.ESTIMATE,
@@ -87,9 +87,9 @@ class Severity(IntEnum):
     LAND = 3
     STOP = 4
 
-    def escalate(self, transition: Severity) -> Severity:
+    def escalate(self, transition_severity: Severity) -> Severity:
         """Return the flight's severity after a transition of severity `transition`."""
-        return max(self, transition) if self >= Severity.LAND else transition
+        return max(self, transition_severity) if self >= Severity.LAND else transition_severity
 
 
 class Outcome(Enum):
@@ -101,7 +101,7 @@ class Outcome(Enum):
     ATTEMPTS_USED_UP = "attempts used up"
     SAFETY = "safety abort"
     EMERGENCY = "emergency stop"
-    OPERATOR = "operator"
+    ENDED_BY_OPERATOR = "operator"
 
     @property
     def exit_code(self) -> int:
@@ -116,7 +116,7 @@ _EXIT_CODES: dict[Outcome, int] = {
     Outcome.ATTEMPTS_USED_UP: AttemptsUsedUp.exit_code,
     Outcome.SAFETY: SafetyAbort.exit_code,
     Outcome.EMERGENCY: EmergencyStopped.exit_code,
-    Outcome.OPERATOR: Interrupted.exit_code,
+    Outcome.ENDED_BY_OPERATOR: Interrupted.exit_code,
 }
 
 
@@ -139,15 +139,15 @@ class Claim(Flag):
     """External positions lead position control away from its setpoint."""
     MOUNTING_WRONG = auto()
     """The camera's mounting differs from the profile, or the axes of the positions are wrong."""
-    PROFILE_SUSPECT = auto()
+    PROFILE_MAY_BE_WRONG = auto()
     """The profile's camera or positioning section may be wrong and should be checked."""
-    HOVER_CONTINUES = auto()
+    RESUMES_HOVER = auto()
     """A hover has sunk below its place, and continues once the vehicle has climbed back."""
-    UNCONFIRMED = auto()
+    LANDING_UNCONFIRMED = auto()
     """The end of the landing could not be confirmed in time."""
 
 
-class Operator(IntEnum):
+class OperatorRequest(IntEnum):
     """The operator's command, which never decreases: `LAND`, then `STOP`, which cuts the motors."""
 
     NONE = 0

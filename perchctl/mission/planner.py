@@ -22,7 +22,7 @@ from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_HEIGHT_CONTROL_M
+from perchctl.mission.phases.approach import MIN_CONTROLLED_HEIGHT_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
@@ -40,18 +40,22 @@ def step_mission(
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the mission; `state` is None in the first tick, on the ground."""
-    state = _update_before_decision(state or PlannerState.on_ground(obs, profile), obs, profile)
+    state = _update_before_decision(
+        state or PlannerState.initial_on_ground(obs, profile), obs, profile
+    )
     c = Context(state)
     row = first_transition(c, table)
     if row is None:
         state = replace(state, waiting_reason="")
-    elif row.is_waiting_row_of(state.phase):
-        waited_s = state.waited_s + obs.t_s - state.t_s
-        state = replace(state, waiting_reason=row.reason_text(c), waited_s=waited_s)
+    elif row.keeps_mission_in(state.phase):
+        waited_in_phase_s = state.waited_in_phase_s + obs.t_s - state.t_s
+        state = replace(
+            state, waiting_reason=row.reason_text(c), waited_in_phase_s=waited_in_phase_s
+        )
     else:
         state = _enter_phase(c, row)
         hold = hold_reason(state.belief, PHASES[state.phase].maneuver)
-        state = replace(state, hold=hold)
+        state = replace(state, hold_reason=hold)
     return record_command(*act(Context(state)))
 
 
@@ -62,16 +66,19 @@ def _update_before_decision(
     conditions of the phase, hold, and battery outlook."""
     maneuver = PHASES[state.phase].maneuver
     state = observe(state, obs, profile, maneuver)
-    confirmed_frames, target = state.confirmed_frames, obs.target
+    consecutive_target_frames, target = state.consecutive_target_frames, obs.target
     if obs.has_new_frame:
         measured = target is not None and target.measured and target.world_m is not None
-        confirmed_frames = confirmed_frames + 1 if measured else 0
+        consecutive_target_frames = consecutive_target_frames + 1 if measured else 0
         if measured and is_hovering(state):
             state = _add_hover_error(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
     since = update_start_times(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
     state = replace(
-        state, confirmed_frames=confirmed_frames, hold=hold, since={} if hold else since
+        state,
+        consecutive_target_frames=consecutive_target_frames,
+        hold_reason=hold,
+        since={} if hold else since,
     )
     return replace(state, battery=compute_battery_outlook(Context(state)))
 
@@ -111,12 +118,12 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         since={},
         failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
         waiting_reason="",
-        waited_s=0.0,
-        search_step_s=c.t_s,
-        confirmed_frames=0,
-        pressed=ends and state.catch_above_m is None and presses,
-        last_order_s=None,
-        order_count=0,
+        waited_in_phase_s=0.0,
+        search_step_began_s=c.t_s,
+        consecutive_target_frames=0,
+        began_pressed=ends and state.catch_setpoint_above_vehicle_m is None and presses,
+        last_stop_or_land_order_at_s=None,
+        stop_or_land_order_count=0,
     )
     return PHASES[row.to].enter(new, c)
 
@@ -126,8 +133,12 @@ def act(c: Context) -> Action:
     state = c.state
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.
-    leaves = state.phase is Phase.RECOVER and (state.pressed or state.catch_above_m is not None)
-    if state.hold and state.setpoint is not None and not leaves:
-        lift = state.phase is not Phase.APPROACH or c.belief.height_m > MIN_HEIGHT_CONTROL_M
-        return fly_to(c, lower_held_setpoint(c, state.setpoint), lift=lift)
+    leaves = state.phase is Phase.RECOVER and (
+        state.began_pressed or state.catch_setpoint_above_vehicle_m is not None
+    )
+    if state.hold_reason and state.setpoint is not None and not leaves:
+        corrects_height = (
+            state.phase is not Phase.APPROACH or c.belief.height_m > MIN_CONTROLLED_HEIGHT_M
+        )
+        return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

@@ -60,7 +60,7 @@ class Event:
         """Return the events of one tick; `before` is the previous state, None in the first tick."""
         events: list[Event] = []
         if before is None:
-            before = PlannerState.on_ground(obs, profile)
+            before = PlannerState.initial_on_ground(obs, profile)
             events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
@@ -75,7 +75,7 @@ class Event:
         elif (
             state.belief.position_last_stale_at_s == obs.t_s
             and before.belief.position_last_stale_at_s != before.t_s
-            and not state.hold
+            and not state.hold_reason
         ):
             text = position_loss_text(state.belief.with_observation(obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))

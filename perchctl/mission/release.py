@@ -22,37 +22,37 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
-PRESS_END_BELOW_M = 0.08
+PRESS_ENDED_BELOW_CONTACT_M = 0.08
 """Distance below the contact at which the vehicle has left it, m."""
-PRESS_END_FALL_MPS = -0.3
+FALLING_OFF_PRESS_MPS = -0.3
 """Vertical speed below which the vehicle is falling off, m/s; the setpoint then stays at the
 vehicle."""
-UNWIND_PRESSED_BELOW_M = 1.0
+INTEGRATOR_UNWIND_BELOW_IN_PRESS_M = 1.0
 """Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
-UNWIND_FREE_BELOW_M = 0.25
+INTEGRATOR_UNWIND_BELOW_IN_AIR_M = 0.25
 """The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
 PRESS_END_TIMEOUT_S = 4.0
-"""Time after which `leave_press` ends, whether or not the vehicle has come off, s."""
+"""Time after which `end_press` ends, whether or not the vehicle has come off, s."""
 
 # --- release ---
 MIN_HOLDING_THRUST_FRACTION = 0.9
 """Share of the holding thrust down to which the raw thrust of a press is lowered."""
-UNCONFIRMED_THRUST_EXTRA_S = 1.5
+EXTRA_HANG_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the ordered one, s."""
 
 # --- stop ---
 STOP_ORDER_COUNT = 5
 """Number of stop orders: a single lost notify message would lock a hanging vehicle."""
-STOP_PERIOD_S = 0.1
+STOP_ORDER_PERIOD_S = 0.1
 """Time between stop orders, s."""
-STOP_RETRY_PERIOD_S = 0.5
+LATE_STOP_ORDER_PERIOD_S = 0.5
 """Time after which one more stop order is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
-CATCH_ABOVE_MOTORS_OFF_M = 1.0
+CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors stand still, m."""
-CATCH_ABOVE_MOTORS_ON_M = 0.2
+CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
 MOTORS_ON_THRUST_FRACTION = 0.5
@@ -63,31 +63,35 @@ MAX_CATCH_DURATION_S = 2.0
 """Longest duration of a catch, s."""
 CATCH_END_CLIMB_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
-MAX_BRAKED_SPEED_MPS = 1.0
+MAX_SPEED_USED_FOR_BRAKING_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no blow that the vehicle survives leaves more."""
 ONBOARD_POSITION_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
 
-def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
+def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     """Return the state, and a setpoint below the vehicle until it has left the contact and the
     onboard integrators have unwound; None after that, or if the vehicle was not pressed."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry.position_m
-    if not state.pressed:
+    if not state.began_pressed:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
-        away_m > PRESS_END_BELOW_M
+        away_m > PRESS_ENDED_BELOW_CONTACT_M
         and not is_above_hover_thrust(c.belief)
-        and tel.velocity_mps[2] > PRESS_END_FALL_MPS
+        and tel.velocity_mps[2] > FALLING_OFF_PRESS_MPS
     )
     if calm or c.in_phase_s > PRESS_END_TIMEOUT_S:
-        return replace(state, pressed=False), None
-    distance_below_m = UNWIND_PRESSED_BELOW_M if away_m < PRESS_END_BELOW_M else UNWIND_FREE_BELOW_M
-    if tel.velocity_mps[2] < PRESS_END_FALL_MPS:
+        return replace(state, began_pressed=False), None
+    distance_below_m = (
+        INTEGRATOR_UNWIND_BELOW_IN_PRESS_M
+        if away_m < PRESS_ENDED_BELOW_CONTACT_M
+        else INTEGRATOR_UNWIND_BELOW_IN_AIR_M
+    )
+    if tel.velocity_mps[2] < FALLING_OFF_PRESS_MPS:
         distance_below_m = 0.0
-    dx, dy = state.integral_m
+    dx, dy = state.lateral_integral_m
     setpoint = PositionSetpoint(
         x + dx, y + dy, tel.position_m[2] - distance_below_m, state.entry.yaw_rad
     )
@@ -110,33 +114,33 @@ def lower_thrust(c: Context) -> Action:
     top = state.entry.position_m[2] + perch.press_m + slid_m
     low = b.last_contact_body_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
-    sent = limit_setpoint(c, correct_setpoint(c, setpoint, lift=False))
+    sent = limit_setpoint(c, correct_setpoint(c, setpoint, corrects_height=False))
     return replace(state, setpoint=setpoint), sent
 
 
-def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
+def release_by_thrust(c: Context, *, accepted_telemetry_age_s: float = 0.0) -> Action:
     """Second stage of the release: reduce raw thrust until the motors stand still, and stop them
     once the whole weight has hung for long enough. Telemetry that is too old as evidence and older
     than `late_s` restarts the stage."""
     complete, state, b = c.planner.complete, c.state, c.belief
-    if not b.is_imu_fresh and b.attitude_age_s > late_s:
+    if not b.is_imu_fresh and b.attitude_age_s > accepted_telemetry_age_s:
         return hold_contact_by_position(c)
-    released_s = state.released_s
-    if released_s is None:
-        released_s, z_m = c.t_s, c.telemetry.position_m[2]
+    release_began_s = state.release_began_s
+    if release_began_s is None:
+        release_began_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(
             b,
             last_contact_body_z_m=z_m
             if b.last_contact_body_z_m is None
             else b.last_contact_body_z_m,
         )
-        state = replace(state, released_s=released_s, belief=b)
+        state = replace(state, release_began_s=release_began_s, belief=b)
     hung_s = c.held_s(FULL_WEIGHT_HANGS)
     unconfirmed = b.last_thrust_mismatch_s >= c.t_s - hung_s
-    extra_s = UNCONFIRMED_THRUST_EXTRA_S if unconfirmed else 0.0
+    extra_s = EXTRA_HANG_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
-    part = min(1.0, (c.t_s - released_s) / complete.ramp_s)
+    part = min(1.0, (c.t_s - release_began_s) / complete.ramp_s)
     start = c.planner.perch.thrust if state.setpoint is None else MIN_POSITION_MODE_THRUST
     start = min(start, MIN_POSITION_MODE_THRUST)
     return state, RawThrust(int(start + part * (KEEPALIVE_THRUST - start)))
@@ -149,46 +153,61 @@ def hold_contact_by_position(c: Context) -> Action:
     x, y, z_m = tel.position_m
     if b.last_contact_body_z_m is not None and b.is_position_valid:
         z_m = b.last_contact_body_z_m
-    setpoint = PositionSetpoint(x, y, z_m + CATCH_ABOVE_MOTORS_ON_M, tel.yaw_rad)
-    return replace(state, setpoint=setpoint, released_s=None), limit_setpoint(c, setpoint)
+    setpoint = PositionSetpoint(x, y, z_m + CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M, tel.yaw_rad)
+    return replace(state, setpoint=setpoint, release_began_s=None), limit_setpoint(c, setpoint)
 
 
-def has_ramped_down(c: Context) -> bool:
+def has_thrust_ramped_down(c: Context) -> bool:
     """True if raw thrust has brought the motors to rest."""
-    released_s = c.state.released_s
-    return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
+    release_began_s = c.state.release_began_s
+    return release_began_s is not None and c.t_s - release_began_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Action:
     """Send stop and notify `STOP_ORDER_COUNT` times because one lost notify would lock a hanging
     vehicle; send more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
-    if state.stopped_s is None:
-        return replace(state, stopped_s=now_s, last_order_s=now_s, order_count=1), StopMotors()
-    waited_s = now_s - (state.last_order_s if state.last_order_s is not None else state.stopped_s)
-    still_to_send = state.order_count < STOP_ORDER_COUNT and waited_s >= STOP_PERIOD_S
-    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= STOP_RETRY_PERIOD_S):
-        return replace(state, last_order_s=now_s, order_count=state.order_count + 1), StopMotors()
+    if state.motor_stop_ordered_s is None:
+        return replace(
+            state,
+            motor_stop_ordered_s=now_s,
+            last_stop_or_land_order_at_s=now_s,
+            stop_or_land_order_count=1,
+        ), StopMotors()
+    waited_s = now_s - (
+        state.last_stop_or_land_order_at_s
+        if state.last_stop_or_land_order_at_s is not None
+        else state.motor_stop_ordered_s
+    )
+    still_to_send = (
+        state.stop_or_land_order_count < STOP_ORDER_COUNT and waited_s >= STOP_ORDER_PERIOD_S
+    )
+    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= LATE_STOP_ORDER_PERIOD_S):
+        return replace(
+            state,
+            last_stop_or_land_order_at_s=now_s,
+            stop_or_land_order_count=state.stop_or_land_order_count + 1,
+        ), StopMotors()
     return state, Idle()
 
 
-def catch_setpoint_above_m(hover_thrust: float, thrust: float) -> float:
+def choose_catch_setpoint_above_m(hover_thrust: float, thrust: float) -> float:
     """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
     turning = thrust > MOTORS_ON_THRUST_FRACTION * hover_thrust
-    return CATCH_ABOVE_MOTORS_ON_M if turning else CATCH_ABOVE_MOTORS_OFF_M
+    return CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M if turning else CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M
 
 
 def catch_slip(c: Context) -> Action | None:
     """Return the setpoint far above that catches a slip; None after the fall, or with old
     telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
-    if state.catch_above_m is None or not b.is_imu_fresh:
+    if state.catch_setpoint_above_vehicle_m is None or not b.is_imu_fresh:
         return None
     begun = c.in_phase_s < MIN_CATCH_DURATION_S
     if begun or (b.climb_mps < CATCH_END_CLIMB_MPS and c.in_phase_s < MAX_CATCH_DURATION_S):
         x, y = _braking_setpoint_m(c) if b.has_uncorrected_gust else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
-            x, y, tel.position_m[2] + state.catch_above_m, state.entry.yaw_rad
+            x, y, tel.position_m[2] + state.catch_setpoint_above_vehicle_m, state.entry.yaw_rad
         )
         return replace(state, setpoint=setpoint), limit_setpoint(c, setpoint)
     return None
@@ -199,13 +218,14 @@ def _braking_setpoint_m(c: Context) -> tuple[float, float]:
     tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
-        max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps)) for mps in missing_mps
+        max(-MAX_SPEED_USED_FOR_BRAKING_MPS, min(MAX_SPEED_USED_FOR_BRAKING_MPS, mps))
+        for mps in missing_mps
     )
     x_m, y_m, _ = tel.position_m
     return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S
 
 
-def clear_contact_below(state: PlannerState, distance_below_m: float) -> PlannerState:
+def forget_contact_when_below(state: PlannerState, distance_below_m: float) -> PlannerState:
     """Return the state, without its contact if the vehicle is more than `distance_below_m` below
     it."""
     b = state.belief
@@ -214,4 +234,4 @@ def clear_contact_below(state: PlannerState, distance_below_m: float) -> Planner
         or b.telemetry.position_m[2] >= b.last_contact_body_z_m - distance_below_m
     ):
         return state
-    return replace(state, belief=replace(b, last_contact_body_z_m=None, contact=None))
+    return replace(state, belief=replace(b, last_contact_body_z_m=None, last_contact_offset=None))

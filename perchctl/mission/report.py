@@ -28,10 +28,10 @@ MAX_TOUCHDOWN_HEIGHT_M = 0.3
 """Largest height of a blow above the final position for it to be a touchdown, m."""
 SIGMAS_FOR_95_PERCENT = 1.96
 """Half width of a 95 % interval, in standard deviations."""
-LATENCY_GATE_S = 0.02
+MIN_REPORTED_LATENCY_ERROR_S = 0.02
 """Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
 oscillate by centimetres."""
-ROTATION_GATE_DEG = 2.0
+MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
 """Rotation error above which the report gives advice, deg: 35 mm at 1 m, more than the cone of an
 ascent allows."""
 
@@ -63,21 +63,21 @@ class Touchdown:
 
 
 @dataclass(frozen=True)
-class Findings:
+class CameraFindings:
     """Latency, and rotation of the camera relative to the profile about body x, y and z, each with
     one standard deviation. `advice` is a tuple of sentences; it is empty if the profile fits, and
     for a simulated vehicle because its camera is not a real one."""
 
-    latency_s: float
+    measured_latency_s: float
     latency_sigma_s: float
-    rotation_deg: tuple[float, float, float]
+    rotation_error_deg: tuple[float, float, float]
     rotation_sigma_deg: tuple[float, float, float]
     advice: tuple[str, ...] = ()
 
     @classmethod
     def from_camera_errors(
         cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False
-    ) -> Findings:
+    ) -> CameraFindings:
         """Return the findings from a flight's estimates, with advice on each error that is beyond
         its limit and significant at 95 %; no advice if the flight was `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
@@ -87,13 +87,17 @@ class Findings:
         if simulated:
             return found
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
-        if set_here and _is_significant(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
+        if set_here and _is_significant(
+            seen.delay_s, MIN_REPORTED_LATENCY_ERROR_S, seen.delay_sigma_s
+        ):
             advice.append(
                 f"the latency is {found.latency_text}, not {camera.start_latency_s * 1e3:.0f} ms "
                 f"as in the profile: set camera.latency_s to {max(0.0, latency_s):.3f}"
             )
-        turns = zip(found.rotation_deg, found.rotation_sigma_deg, strict=True)
-        if any(_is_significant(turn, ROTATION_GATE_DEG, sigma) for turn, sigma in turns):
+        turns = zip(found.rotation_error_deg, found.rotation_sigma_deg, strict=True)
+        if any(
+            _is_significant(turn, MIN_REPORTED_ROTATION_ERROR_DEG, sigma) for turn, sigma in turns
+        ):
             advice.append(
                 f"the camera is rotated by {found.rotation_text} relative to the profile: measure "
                 f"the mounting with `perchctl calibrate mount`"
@@ -104,22 +108,22 @@ class Findings:
     def latency_text(self) -> str:
         """The latency with its 95 % interval, for example ``92 +- 6 ms``."""
         margin_s = SIGMAS_FOR_95_PERCENT * self.latency_sigma_s
-        return f"{self.latency_s * 1e3:.0f} +- {margin_s * 1e3:.0f} ms"
+        return f"{self.measured_latency_s * 1e3:.0f} +- {margin_s * 1e3:.0f} ms"
 
     @property
     def rotation_text(self) -> str:
         """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
         0.4 +- 1.8 deg``."""
-        each = zip(self.rotation_deg, self.rotation_sigma_deg, strict=True)
+        each = zip(self.rotation_error_deg, self.rotation_sigma_deg, strict=True)
         return (
             ", ".join(f"{turn:.1f} +- {SIGMAS_FOR_95_PERCENT * sigma:.1f}" for turn, sigma in each)
             + " deg"
         )
 
 
-def _is_significant(off: float, gate: float, sigma: float) -> bool:
+def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
     """True if the error exceeds the gate and the width of its 95 % interval."""
-    return abs(off) > max(gate, 2.0 * SIGMAS_FOR_95_PERCENT * sigma)
+    return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT * sigma)
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ class HoverReport:
     (`HoverErrors`): x forward, y left, z up, and heading."""
 
     duration_s: float
-    below_m: float
+    below_target_m: float
     rms_m: tuple[float, float, float]
     rms_yaw_rad: float
 
@@ -138,7 +142,7 @@ class HoverReport:
         hover, errors = profile.planner.hover, state.hover_errors
         if hover is None or not errors.frames:
             return None
-        x_m, y_m, z_m, yaw_rad = errors.rms
+        x_m, y_m, z_m, yaw_rad = errors.rms_xyz_yaw
         return cls(errors.duration_s, hover.below_m, (x_m, y_m, z_m), yaw_rad)
 
     @property
@@ -159,18 +163,19 @@ class FlightReport:
     reason: str
     attempts: int
     duration_s: float
-    locked: bool
+    is_vehicle_locked: bool
     history: tuple[Event, ...] = ()  # events of the phases, from the start of the flight
-    findings: Findings | None = None  # latency and mounting, if the flight was long enough
-    contact: ContactOffset | None = None  # offset of a vehicle that hangs
+    findings: CameraFindings | None = None  # latency and mounting, if the flight was long enough
+    last_contact_offset: ContactOffset | None = None  # offset of a vehicle that hangs
     touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
     hover: HoverReport | None = None  # the newest hover of a mission that hovers
-    detached: tuple[str, ...] = ()  # one sentence for each watcher detached after an exception
+    # one sentence for each watcher detached after an exception
+    detached_watchers: tuple[str, ...] = ()
 
     @property
     def is_profile_suspect(self) -> bool:
         """True if a row that claims a wrong profile fired during the flight."""
-        return any(Claim.PROFILE_SUSPECT in event.claims for event in self.history)
+        return any(Claim.PROFILE_MAY_BE_WRONG in event.claims for event in self.history)
 
     @classmethod
     def from_state(
@@ -185,7 +190,7 @@ class FlightReport:
     ) -> FlightReport:
         """Return the report of a completed mission from its last tick."""
         b = state.belief.with_observation(obs, profile)
-        hangs, contact = state.phase is Phase.PERCHED, b.contact
+        hangs, contact = state.phase is Phase.PERCHED, b.last_contact_offset
         if hangs and contact is None:  # the magnet caught the vehicle during the descent
             contact = current_gear_offset(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
@@ -201,12 +206,14 @@ class FlightReport:
             duration_s=obs.t_s - state.started_s,
             # The available telemetry is older than an emergency stop, which always locks the
             # vehicle.
-            locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
+            is_vehicle_locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None
             if consistency is None
-            else Findings.from_camera_errors(consistency, profile.camera, simulated=simulated),
-            contact=contact if placed else None,
+            else CameraFindings.from_camera_errors(
+                consistency, profile.camera, simulated=simulated
+            ),
+            last_contact_offset=contact if placed else None,
             touchdown=find_touchdown(Context(replace(state, belief=b))),
             hover=HoverReport.from_state(state, profile),
         )
@@ -227,12 +234,12 @@ class RestReport:
         return f"{self.state.value}; it {self.touchdown.text}"
 
 
-def find_rest(
-    state: PlannerState, obs: Observation, profile: Profile, off_s: float
+def report_rest(
+    state: PlannerState, obs: Observation, profile: Profile, min_motors_off_s: float
 ) -> RestReport | None:
     """Return the rest state; None until telemetry has shown the motors off for `off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
-    if c.held_s(MOTORS_STOPPED) < off_s:
+    if c.held_s(MOTORS_STOPPED) < min_motors_off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
@@ -264,5 +271,7 @@ def find_touchdown(c: Context) -> Touchdown | None:
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
-    told = why and (state.phase is not Phase.ABORTED or Claim.UNCONFIRMED in state.entry.claims)
+    told = why and (
+        state.phase is not Phase.ABORTED or Claim.LANDING_UNCONFIRMED in state.entry.claims
+    )
     return f"{why}; {state.reason}" if told else state.reason

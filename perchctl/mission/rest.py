@@ -17,9 +17,9 @@ estimate."""
 MIN_HANGING_HEIGHT_M = 0.45
 """Height at the start of a descent above which the height distinguishes hanging from standing,
 m."""
-MAX_REST_ON_FLOOR_M = 0.3
+MAX_FLOOR_REST_HEIGHT_M = 0.3
 """Height below which the vehicle stands, m."""
-MAX_STAYED_DESCENT_M = 0.15
+MAX_DESCENT_STILL_HANGING_M = 0.15
 """Descent below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
 table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
@@ -43,12 +43,12 @@ def find_rest_state(c: Context) -> RestState:
     if b.is_positioned_by_target or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
-        return _find_rest_state_by_falls(c)
+        return _find_rest_state_from_falls(c)
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HANGING_HEIGHT_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
-    stayed = high and not b.target.is_far_above and came_down_m < MAX_STAYED_DESCENT_M
+    stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_STILL_HANGING_M
     at_contact = b.last_contact_body_z_m is not None and not b.target.is_far_above
-    if stayed or (b.height_m > MAX_REST_ON_FLOOR_M and at_contact):
+    if stayed or (b.height_m > MAX_FLOOR_REST_HEIGHT_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
 
@@ -59,13 +59,14 @@ def _is_held_elsewhere(c: Context) -> bool:
         return False
     if (
         b.is_position_valid
-        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_STAYED_DESCENT_M
+        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_DESCENT_STILL_HANGING_M
     ):
         return False
     if Claim.HELD_BY_OTHER in state.entry.claims:
         return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
-        contact_height_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M and b.contact is None
+        contact_height_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M
+        and b.last_contact_offset is None
     )
     by_position = (
         b.is_position_valid
@@ -76,7 +77,7 @@ def _is_held_elsewhere(c: Context) -> bool:
     return below and (b.target.is_fresh or by_position)
 
 
-def _find_rest_state_by_falls(c: Context) -> RestState:
+def _find_rest_state_from_falls(c: Context) -> RestState:
     """Return the rest state from the falls since the vehicle came within the magnet's reach, if
     ever, and from silences that could hide a fall."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_magnet_reach_since_s
@@ -105,14 +106,16 @@ def is_still_hanging(c: Context) -> bool:
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and b.last_contact_body_z_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M:
             return True
-    return _find_rest_state_by_falls(c) is RestState.HANGS
+    return _find_rest_state_from_falls(c) is RestState.HANGS
 
 
 def is_hanging_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped while the vehicle hung, and it still hangs."""
-    stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
-    if stopped_s is None or (
-        landing and stopped_s >= c.state.entry.t_s and c.state.order_count == 0
+    motor_stop_ordered_s, landing = c.state.motor_stop_ordered_s, c.state.phase is Phase.LANDING
+    if motor_stop_ordered_s is None or (
+        landing
+        and motor_stop_ordered_s >= c.state.entry.t_s
+        and c.state.stop_or_land_order_count == 0
     ):
         return False
     return is_still_hanging(c)

@@ -34,12 +34,12 @@ from perchctl.mission.belief.quality import (
 from perchctl.mission.context import Context
 from perchctl.mission.phase import (
     CAMERA_GUIDED_PHASES,
-    FLYING_PHASES,
     FREE_AIR_PHASES,
     MAGNET_ATTACH_PHASES,
     PRE_CONTACT_PHASES,
+    PRE_LANDING_PHASES,
     Claim,
-    Operator,
+    OperatorRequest,
     Outcome,
     Phase,
 )
@@ -60,27 +60,27 @@ LIFTOFF_HEIGHT_M = 0.05
 MAX_GROUND_DISPLACEMENT_M = 0.12
 """Largest lateral motion before the vehicle has lifted off, m. Larger: a wrong mounting tips it
 over."""
-DIVERGED_LOW_HEIGHT_M = 0.3
+LOW_HEIGHT_FOR_DIVERGENCE_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
-MAX_LOW_DEVIATION_M = 0.22
+MAX_DEVIATION_AT_LOW_HEIGHT_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
-`DIVERGED_LOW_HEIGHT_M` and in a vertical climb."""
+`LOW_HEIGHT_FOR_DIVERGENCE_M` and in a vertical climb."""
 MAX_LANDING_DEVIATION_M = 0.4
 """The same distance during a landing, m."""
-MAX_DEVIATION_M = 0.8
+MAX_SETPOINT_DEVIATION_M = 0.8
 """The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
 reaches the walls."""
-DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
+EXTRA_DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the lateral limit with the target as the position source, in m per second of the
 latency's standard deviation: pictures that are 0.1 s later than assumed cause up to 0.2 m. Larger:
 a rotated camera leads the vehicle further away."""
-MAX_VERTICAL_CLIMB_OFFSET_M = 0.1
+MAX_LATERAL_OFFSET_IN_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
 OSCILLATION_SINK_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-OSCILLATION_CLIMB_EXCESS_MPS = 0.35
+OSCILLATION_CLIMB_ABOVE_ORDERED_MPS = 0.35
 """Climb rate beyond that of the setpoint in the ascent which only such an oscillation reaches, m/s;
 flights with prompt positions exceed it by 0.1. Larger: the vehicle strikes the target. Smaller: a
 gust ends the flight."""
@@ -90,7 +90,7 @@ SATURATED_THRUST_DWELL_S = 2.0
 """Time at full thrust after which no thrust remains for a press, s."""
 HELD_BY_OTHER_DWELL_S = 2.0
 """Time after which the magnet has been distinguished from other supports, s."""
-MAX_BLIND_VARIANCE_M2PS2 = 0.02
+MAX_BLIND_VELOCITY_VARIANCE_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
 MIN_CONTRADICTING_SIGHTING_OFFSET_M = 0.3
 """Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
@@ -115,10 +115,10 @@ def has_diverged(c: Context) -> bool:
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
-        touched = b.last_contact_body_z_m is not None or c.state.stopped_s is not None
+        touched = b.last_contact_body_z_m is not None or c.state.motor_stop_ordered_s is not None
         return not touched and _setpoint_deviation_m(c) > MAX_LANDING_DEVIATION_M
     spare_m = (
-        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        EXTRA_DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
         if b.is_positioned_by_target
         else 0.0
     )
@@ -126,18 +126,21 @@ def has_diverged(c: Context) -> bool:
         return _setpoint_deviation_m(c) > MAX_GROUND_DISPLACEMENT_M + spare_m
     ground = b.takeoff_position_m
     above_start = ground is not None and (
-        math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < MAX_VERTICAL_CLIMB_OFFSET_M
+        math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
+        < MAX_LATERAL_OFFSET_IN_CLIMB_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = b.imu.t_s - b.imu.last_push_at_s <= MAX_PUSH_TO_ESTIMATE_DELAY_S  # by moving air
-    stays = b.height_m < DIVERGED_LOW_HEIGHT_M or (only_climbs and not is_pushed)
-    return _setpoint_deviation_m(c) > (MAX_LOW_DEVIATION_M + spare_m if stays else MAX_DEVIATION_M)
+    stays = b.height_m < LOW_HEIGHT_FOR_DIVERGENCE_M or (only_climbs and not is_pushed)
+    return _setpoint_deviation_m(c) > (
+        MAX_DEVIATION_AT_LOW_HEIGHT_M + spare_m if stays else MAX_SETPOINT_DEVIATION_M
+    )
 
 
 def _is_oscillating(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
-    most_mps = c.planner.ascend.speed_mps + OSCILLATION_CLIMB_EXCESS_MPS
+    most_mps = c.planner.ascend.speed_mps + OSCILLATION_CLIMB_ABOVE_ORDERED_MPS
     return moves and by_capture and not -OSCILLATION_SINK_MPS <= c.belief.climb_mps <= most_mps
 
 
@@ -181,7 +184,7 @@ def is_position_lost(c: Context) -> bool:
         and c.obs.rejected_sighting_distance_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
     ):
         return True
-    unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VARIANCE_M2PS2
+    unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VELOCITY_VARIANCE_M2PS2
     return b.is_positioned_by_target and b.is_position_stale and unsure
 
 
@@ -202,7 +205,7 @@ def is_outside_corridor(c: Context) -> bool:
     return corridor is not None and not corridor.contains(x_m, y_m, c.belief.height_m)
 
 
-def latency_reason(c: Context) -> str:
+def wrong_latency_reason(c: Context) -> str:
     """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.extra_camera_latency_s
@@ -231,7 +234,7 @@ def is_mounting_wrong(c: Context) -> bool:
     return b.mounting.is_wrong or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0 or below
 
 
-def mounting_reason(c: Context) -> str:
+def wrong_mounting_reason(c: Context) -> str:
     """Return how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
@@ -282,7 +285,7 @@ def is_blocked_off_target(c: Context) -> bool:
 def is_press_thrust_insufficient(c: Context) -> bool:
     """True if no thrust remains for a press: measured at full thrust, or predicted before the
     press. A mission that hovers does not press, so nothing is predicted for it."""
-    if c.state.pressed:
+    if c.state.began_pressed:
         return False
     if c.held_s(SATURATED_THRUST) >= SATURATED_THRUST_DWELL_S:
         return True
@@ -293,7 +296,7 @@ def is_press_thrust_insufficient(c: Context) -> bool:
     )
 
 
-def _outcome_after_lock(before: Outcome | None) -> Outcome:
+def _outcome_after_supervisor_lock(before: Outcome | None) -> Outcome:
     """Return the outcome of a locked vehicle that hangs: a landing keeps its own, except that a
     hover ends on the floor."""
     return Outcome.SAFETY if before is Outcome.HOVERED else before or Outcome.PERCHED
@@ -309,7 +312,7 @@ def is_time_over(c: Context) -> bool:
 SAFETY_ROWS: tuple[Transition, ...] = (
     motor_cut_row(
         "operator-stop",
-        lambda c: c.obs.operator_request >= Operator.STOP,
+        lambda c: c.obs.operator_request >= OperatorRequest.STOP,
         "the operator cut the motors",
         Outcome.EMERGENCY,
     ),
@@ -319,7 +322,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.telemetry.has_bit(LOCKED) and is_hanging_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=_outcome_after_lock,
+        outcome=_outcome_after_supervisor_lock,
     ),
     supervisor_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
@@ -330,25 +333,27 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     motor_cut_row(
         "tilted",
-        lambda c: c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
+        lambda c: (
+            c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.motor_stop_ordered_s is None
+        ),
         "tilted beyond the limit: motors cut",
     ),
     land_row(
         "operator-land",
-        FLYING_PHASES,
-        lambda c: c.obs.operator_request >= Operator.LAND,
+        PRE_LANDING_PHASES,
+        lambda c: c.obs.operator_request >= OperatorRequest.LAND,
         "the operator asked to land",
-        Outcome.OPERATOR,
+        Outcome.ENDED_BY_OPERATOR,
     ),
     land_row(
         "link-lost",
-        FLYING_PHASES,
+        PRE_LANDING_PHASES,
         lambda c: c.obs.link_problem is not None,
         lambda c: f"link lost: {c.obs.link_problem}",
     ),
     land_row(
         "telemetry-stale",
-        FLYING_PHASES,
+        PRE_LANDING_PHASES,
         lambda c: c.belief.telemetry_age_s > c.safety.telemetry_land_s,
         lambda c: f"the newest telemetry is {c.belief.telemetry_age_s:.1f} s old",
     ),
@@ -363,7 +368,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         FREE_AIR_PHASES | {Phase.LANDING},
         has_diverged,
         divergence_reason,
-        claims=Claim.POSITIONS_WRONG | Claim.PROFILE_SUSPECT,
+        claims=Claim.POSITIONS_WRONG | Claim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "position-lost",
@@ -402,15 +407,15 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "latency",
         FREE_AIR_PHASES,
         lambda c: c.belief.camera_imu_mismatch.camera_latency_error_s != 0.0,
-        latency_reason,
-        claims=Claim.PROFILE_SUSPECT,
+        wrong_latency_reason,
+        claims=Claim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "mounting",
         FREE_AIR_PHASES,
         is_mounting_wrong,
-        mounting_reason,
-        claims=Claim.MOUNTING_WRONG | Claim.PROFILE_SUSPECT,
+        wrong_mounting_reason,
+        claims=Claim.MOUNTING_WRONG | Claim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "height-limit",
@@ -428,7 +433,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     land_row(
         "loop-late",
-        FLYING_PHASES,
+        PRE_LANDING_PHASES,
         lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
         lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
     ),

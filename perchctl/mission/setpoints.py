@@ -6,7 +6,8 @@ reference r, the vehicle's position x (height z), its velocity v, and the accele
 leans into:
 
     p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
-                                     - LEAN_DAMPING_S2 a))                                 lateral
+                                     - LEAN_ACCELERATION_DAMPING_S2 a))
+                                     lateral
     p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                        vertical
 
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
@@ -43,7 +44,7 @@ Smaller: the thrust's fluctuation moves the vehicle further."""
 LATERAL_DAMPING_S = 0.8
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
 velocity moves the vehicle. Smaller: it oscillates."""
-LEAN_DAMPING_S2 = 0.08
+LEAN_ACCELERATION_DAMPING_S2 = 0.08
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
 MAX_FULL_FEEDBACK_AGE_S = 0.06
@@ -51,9 +52,9 @@ MAX_FULL_FEEDBACK_AGE_S = 0.06
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
 MAX_FEEDBACK_AGE_S = 0.16
 """Age of the telemetry from which the onboard controllers are left alone, s."""
-LATERAL_FEEDBACK_START_M = 0.8
+LATERAL_FEEDBACK_START_BELOW_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
-LATERAL_FEEDBACK_RANGE_M = 0.4
+LATERAL_FEEDBACK_FADE_IN_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
 MAX_LATERAL_CORRECTION_M = 0.1
 """Largest correction of a setpoint by the lateral feedback, m."""
@@ -61,7 +62,7 @@ GROUND_CLEARANCE_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
 MAX_INTEGRATED_ERROR_M = 0.06
 """Position error below which the integral also accumulates in motion, m."""
-MAX_INTEGRAL_M = 0.4
+MAX_LATERAL_INTEGRAL_M = 0.4
 """Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
 further. Smaller: a wind keeps the vehicle off its target permanently."""
 MAX_IN_PLACE_SPEED_MPS = 0.1
@@ -82,7 +83,7 @@ def hold_here(c: Context) -> PositionSetpoint:
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
-def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
+def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Return the body's world x and y (m) with the gear below the target at heading `yaw_rad`."""
     target = c.belief.target.world_m
     assert target is not None
@@ -95,7 +96,7 @@ def setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
     `z_m`."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
-    x, y = body_xy_under_target(c, yaw)
+    x, y = body_world_xy_under_target(c, yaw)
     return PositionSetpoint(x, y, z_m, yaw)
 
 
@@ -106,17 +107,17 @@ def step_towards(
     *,
     up_mps: float = 0.0,
     down_mps: float = 0.4,
-    is_cautious: bool = False,
-    turns: bool = True,
+    is_slow_until_mounting_confirmed: bool = False,
+    changes_heading: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint one tick after `old`: towards `goal`, with at most `up_mps` upwards and
     `down_mps` downwards. `is_cautious` limits the lateral speed while the camera's mounting is
     unconfirmed; without `turns`, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
-    if not turns:
+    if not changes_heading:
         yaw_radps = 0.0
-    if is_cautious and c.belief.mounting.is_awaiting_evidence:
+    if is_slow_until_mounting_confirmed and c.belief.mounting.is_awaiting_evidence:
         xy_mps = min(xy_mps, UNCONFIRMED_MOUNTING_SPEED_MPS) if c.belief.target.is_fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
@@ -129,23 +130,25 @@ def step_towards(
     )
 
 
-def fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Action:
+def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = True) -> Action:
     """Store the reference and send it corrected; without `lift`, its height is not corrected."""
     return replace(c.state, setpoint=reference), limit_setpoint(
-        c, correct_setpoint(c, reference, lift=lift)
+        c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
 
 
 def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
     """Move under the target at height `z_m`, and learn the integral that keeps the gear there."""
     goal = setpoint_under_target(c, z_m)
-    integral_m = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
-    c = Context(replace(c.state, integral_m=integral_m))
+    lateral_integral_m = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
+    c = Context(replace(c.state, lateral_integral_m=lateral_integral_m))
     old = c.state.setpoint or hold_here(c)
-    return fly_to(c, step_towards(c, old, goal, up_mps=up_mps, is_cautious=True))
+    return fly_to(
+        c, step_towards(c, old, goal, up_mps=up_mps, is_slow_until_mounting_confirmed=True)
+    )
 
 
-def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
+def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """Return the integral (x, y) of the position error to `goal_xy`, m, world axes, which removes
     the offset that a steady wind leaves.
 
@@ -153,11 +156,11 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
     accumulates, and the integral may become large, only while the vehicle hovers in place.
     """
     planner = c.planner
-    ex = goal_xy[0] - c.telemetry.position_m[0]
-    ey = goal_xy[1] - c.telemetry.position_m[1]
-    tx, ty = c.state.integral_m
+    ex = goal_xy_m[0] - c.telemetry.position_m[0]
+    ey = goal_xy_m[1] - c.telemetry.position_m[1]
+    tx, ty = c.state.lateral_integral_m
     stands = c.belief.speed_mps < MAX_IN_PLACE_SPEED_MPS
-    most_m = MAX_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
+    most_m = MAX_LATERAL_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
     if stands or math.hypot(ex, ey) < MAX_INTEGRATED_ERROR_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
@@ -171,25 +174,25 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     zero."""
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
-        return replace(c.state, integral_m=(0.0, 0.0))
+        return replace(c.state, lateral_integral_m=(0.0, 0.0))
     if not c.belief.is_position_valid or c.belief.speed_mps > MAX_IN_PLACE_SPEED_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        integral_m=limit_vector(sent.x_m - x_m, sent.y_m - y_m, MAX_INTEGRAL_M),
+        lateral_integral_m=limit_vector(sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_M),
     )
 
 
-def limit_vector(x: float, y: float, most: float) -> tuple[float, float]:
+def limit_vector(x: float, y: float, max_length: float) -> tuple[float, float]:
     """Return the vector (x, y), shortened to at most the length `most`."""
     size = math.hypot(x, y)
-    return (x, y) if size <= most else (x * most / size, y * most / size)
+    return (x, y) if size <= max_length else (x * max_length / size, y * max_length / size)
 
 
 def correct_setpoint(
-    c: Context, reference: PositionSetpoint, *, lift: bool = True
+    c: Context, reference: PositionSetpoint, *, corrects_height: bool = True
 ) -> PositionSetpoint:
     """Return the setpoint that brings the vehicle to `reference`, by the equations in the module
     docstring; without `lift`, at the reference's own height."""
@@ -198,12 +201,16 @@ def correct_setpoint(
         HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])
         - HEIGHT_DAMPING_S * tel.velocity_mps[2]
     )
-    lifted = max(-MAX_HEIGHT_CORRECTION_M, min(MAX_HEIGHT_CORRECTION_M, rise)) if lift else 0.0
+    lifted = (
+        max(-MAX_HEIGHT_CORRECTION_M, min(MAX_HEIGHT_CORRECTION_M, rise))
+        if corrects_height
+        else 0.0
+    )
     dx, dy = _lateral_feedback(c, reference)
     return replace(
         reference,
-        x_m=reference.x_m + c.state.integral_m[0] + dx,
-        y_m=reference.y_m + c.state.integral_m[1] + dy,
+        x_m=reference.x_m + c.state.lateral_integral_m[0] + dx,
+        y_m=reference.y_m + c.state.lateral_integral_m[1] + dy,
         z_m=reference.z_m + lifted,
     )
 
@@ -211,7 +218,7 @@ def correct_setpoint(
 def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Return the lateral feedback on top of the onboard controllers; zero far from the target or
     with old telemetry."""
-    near = (LATERAL_FEEDBACK_START_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_RANGE_M
+    near = (LATERAL_FEEDBACK_START_BELOW_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_FADE_IN_M
     prompt = (MAX_FEEDBACK_AGE_S - c.belief.attitude_age_s) / (
         MAX_FEEDBACK_AGE_S - MAX_FULL_FEEDBACK_AGE_S
     )
@@ -220,8 +227,16 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
         return 0.0, 0.0
     (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps
     ax, ay = c.belief.acceleration_from_lean_mps2
-    dx = LATERAL_ERROR_GAIN * (reference.x_m - x) - LATERAL_DAMPING_S * vx - LEAN_DAMPING_S2 * ax
-    dy = LATERAL_ERROR_GAIN * (reference.y_m - y) - LATERAL_DAMPING_S * vy - LEAN_DAMPING_S2 * ay
+    dx = (
+        LATERAL_ERROR_GAIN * (reference.x_m - x)
+        - LATERAL_DAMPING_S * vx
+        - LEAN_ACCELERATION_DAMPING_S2 * ax
+    )
+    dy = (
+        LATERAL_ERROR_GAIN * (reference.y_m - y)
+        - LATERAL_DAMPING_S * vy
+        - LEAN_ACCELERATION_DAMPING_S2 * ay
+    )
     dx, dy = gain * dx, gain * dy
     size = math.hypot(dx, dy)
     part = 1.0 if size <= MAX_LATERAL_CORRECTION_M else MAX_LATERAL_CORRECTION_M / size

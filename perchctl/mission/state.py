@@ -19,9 +19,9 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 class BatteryOutlook:
     """Prediction of the energy model: remaining time and attempts; None means unknown."""
 
-    left_s: float | None = None  # hover time until `battery-low` would land the vehicle
+    hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # including the landing after the last one; None before the first sighting
-    attempts: int | None = None
+    affordable_attempts: int | None = None
     used_mah: float = 0.0  # charge consumed by the assumed current
     rest_v: float | None = None  # estimated resting voltage
 
@@ -32,7 +32,7 @@ class LevelDescent:
 
     thrust: float = 0.0  # last ordered thrust
     climb_measured_s: float = -math.inf  # time of the newest sample at the last tick
-    pending_climb_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
+    unmeasured_climb_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
     floor_detected_s: float | None = None  # time at which the floor was detected
 
 
@@ -49,7 +49,7 @@ class HoverErrors:
     began_s: float = 0.0  # start of the hover
     newest_s: float = 0.0  # time of the newest of these frames
     frames: int = 0
-    squares: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    squared_error_sums: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Sums of the squares of x, y, z and yaw."""
 
     def with_error(
@@ -57,7 +57,7 @@ class HoverErrors:
     ) -> HoverErrors:
         """Return the errors with those of one more frame at `t_s`."""
         errors = (*e_m, e_yaw_rad)
-        x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squares, errors, strict=True))
+        x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squared_error_sums, errors, strict=True))
         return HoverErrors(self.began_s, t_s, self.frames + 1, (x2, y2, z2, yaw2))
 
     @property
@@ -66,11 +66,11 @@ class HoverErrors:
         return self.newest_s - self.began_s
 
     @property
-    def rms(self) -> tuple[float, float, float, float]:
+    def rms_xyz_yaw(self) -> tuple[float, float, float, float]:
         """Root mean squares of the errors in x, y, z, m, and heading, rad; NaN without a frame."""
         if not self.frames:
             return math.nan, math.nan, math.nan, math.nan
-        x, y, z, yaw = (math.sqrt(each / self.frames) for each in self.squares)
+        x, y, z, yaw = (math.sqrt(each / self.frames) for each in self.squared_error_sums)
         return x, y, z, yaw
 
 
@@ -101,24 +101,25 @@ class PlannerState:
     since: dict[Condition[Any], float] = field(default_factory=dict)
     """Start time of each true condition of the phases."""
     failed_attempts: int = 0  #: number of failed attempts
-    confirmed_frames: int = 0  #: number of successive frames in this phase that measured the target
+    #: number of successive frames in this phase that measured the target
+    consecutive_target_frames: int = 0
     searched_positions: int = 0
-    search_step_s: float = 0.0
+    search_step_began_s: float = 0.0
     setpoint: PositionSetpoint | None = None
-    integral_m: tuple[float, float] = (0.0, 0.0)
-    pressed: bool = False  #: the phase began with the vehicle pressed at high thrust
-    catch_above_m: float | None = None
+    lateral_integral_m: tuple[float, float] = (0.0, 0.0)
+    began_pressed: bool = False  #: the phase began with the vehicle pressed at high thrust
+    catch_setpoint_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
     blocked_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
-    released_s: float | None = None  #: start of the release by raw thrust
-    stopped_s: float | None = None  #: first order to stop the motors
-    last_order_s: float | None = None  #: last order to land or to stop the motors
-    order_count: int = 0
+    release_began_s: float | None = None  #: start of the release by raw thrust
+    motor_stop_ordered_s: float | None = None  #: first order to stop the motors
+    last_stop_or_land_order_at_s: float | None = None  #: last order to land or to stop the motors
+    stop_or_land_order_count: int = 0
     raw_thrust_order: int | None = None  #: last ordered raw thrust; None in position mode
     descent: LevelDescent = LevelDescent()
-    hold: str = ""  #: why the vehicle holds its position; empty without a hold
+    hold_reason: str = ""  #: why the vehicle holds its position; empty without a hold
     waiting_reason: str = ""  #: why your own row keeps the mission in its phase; empty if none does
-    waited_s: float = 0.0  #: total waiting time in this phase
+    waited_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
     hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
 
@@ -136,12 +137,12 @@ class PlannerState:
     def pause_reason(self) -> str:
         """Why the mission pauses: the reason of the hold or of your own row. Empty if it does not
         pause."""
-        return self.hold or self.waiting_reason
+        return self.hold_reason or self.waiting_reason
 
     @property
     def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.released_s is None and self.stopped_s is None
+        return self.release_began_s is None and self.motor_stop_ordered_s is None
 
     def sent(self, maneuver: Maneuver) -> SentOrders:
         """Return the orders so far, in the form that the belief uses."""
@@ -150,19 +151,19 @@ class PlannerState:
             maneuver_start_m=self.entry.position_m,
             setpoint=self.setpoint,
             raw_thrust=self.raw_thrust_order,
-            released_s=self.released_s,
-            stopped_s=self.stopped_s,
+            release_began_s=self.release_began_s,
+            motor_stop_ordered_s=self.motor_stop_ordered_s,
             floor_detected_s=self.descent.floor_detected_s,
         )
 
     @classmethod
-    def on_ground(cls, obs: Observation, profile: Profile) -> PlannerState:
+    def initial_on_ground(cls, obs: Observation, profile: Profile) -> PlannerState:
         """Return the memory before the first decision, for a vehicle at its take-off position."""
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
-            belief=Belief.on_ground(obs, profile),
+            belief=Belief.initial_on_ground(obs, profile),
             entry=PhaseEntry(t_s=t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
             started_s=t_s,
             t_s=t_s,
-            search_step_s=t_s,
+            search_step_began_s=t_s,
         )

@@ -14,7 +14,7 @@ from perchctl.errors import InvalidValue
 from perchctl.extensions import error_at, load_extension
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import FLYING_PHASES, PRE_CONTACT_PHASES, Outcome, Phase, Severity
+from perchctl.mission.phase import PRE_CONTACT_PHASES, PRE_LANDING_PHASES, Outcome, Phase, Severity
 from perchctl.mission.phases.align import ALIGN
 from perchctl.mission.phases.approach import APPROACH
 from perchctl.mission.phases.ascend import ASCEND
@@ -65,11 +65,11 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None
     for row in table:
-        undoes = landing and row.to in FLYING_PHASES
+        undoes = landing and row.to in PRE_LANDING_PHASES
         goes_on = waits is not None and row.severity is Severity.CONTINUE
         if undoes or goes_on or phase not in row.phases or not row.when(c):
             continue
-        if not row.is_waiting_row_of(phase):
+        if not row.keeps_mission_in(phase):
             return row
         waits = waits or row
     return waits

@@ -34,7 +34,7 @@ class Transition:
     stop: EmergencyStop | StopMotors | None = None
     claims: Claim = Claim.NONE
 
-    def is_waiting_row_of(self, phase: Phase) -> bool:
+    def keeps_mission_in(self, phase: Phase) -> bool:
         """True if the row keeps the mission in this phase instead of leaving it."""
         return self.to is phase and self.severity is Severity.HOLD
 
@@ -105,7 +105,7 @@ def back_off_row(
     return Transition(name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, claims=claims)
 
 
-def give_up_row(
+def abort_landing_row(
     name: str, when: Predicate, reason: Reason, claims: Claim = Claim.NONE
 ) -> Transition:
     """Return a row that ends a landing which could not be completed normally."""

@@ -160,13 +160,22 @@ def tick_record(
         "true_miss_m": true_miss_m,
         **_xyz("true_", true_position_m),
         **_external_values(tick.external_positions),
-        **({} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}),
+        **_battery_values(battery),
         **_telemetry_values(tick.telemetry),
         **_output_values(tick.output),
         **_target_values(tick.target),
         **command_values(tick.command),
     }
     return {key: values.get(key) for key in FIELDS}
+
+
+def _battery_values(battery: Any) -> dict[str, Any]:
+    return {
+        "battery_left_s": battery.hover_time_left_s,
+        "battery_attempts": battery.affordable_attempts,
+        "battery_used_mah": battery.used_mah,
+        "battery_rest_v": battery.rest_v,
+    }
 
 
 def _external_values(external: ExternalPositions | None) -> dict[str, Any]:

@@ -12,9 +12,9 @@ import numpy as np
 
 from perchctl.errors import LogIncomplete
 from perchctl.mission import (
+    CameraFindings,
     Claim,
     ContactOffset,
-    Findings,
     HoverReport,
     Outcome,
     Touchdown,
@@ -72,7 +72,7 @@ class FlightSummary:
     battery_min_v: float | None = None
     locked: bool = False
     fell: bool = False
-    findings: Findings | None = None
+    findings: CameraFindings | None = None
     contact: ContactOffset | None = None
     touchdown: Touchdown | None = None
     hover: HoverReport | None = None
@@ -100,7 +100,7 @@ class FlightSummary:
         last = log.records[-1] if log.records else {}
         battery_min_v = float(np.min(known_v)) if known_v.size else None
         simulated = is_simulated(log.header)
-        findings = _part_in(end, Findings, _FINDINGS)
+        findings = _part_in(end, CameraFindings, _FINDINGS)
         if simulated and findings is not None:  # logs by 0.3.0 have advice in spite of it
             findings = replace(findings, advice=())
         return cls(
@@ -121,7 +121,7 @@ class FlightSummary:
             log_problem=end.get("problem"),
             simulated=simulated,
             is_profile_suspect=any(
-                Claim.PROFILE_SUSPECT in find_row_claims(str(event.get("row")))
+                Claim.PROFILE_MAY_BE_WRONG in find_row_claims(str(event.get("row")))
                 for event in log.events
             ),
         )
@@ -219,14 +219,14 @@ _CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {
     "hover_s": "duration_s",
-    "hover_below_m": "below_m",
+    "hover_below_m": "below_target_m",
     "hover_rms_m": "rms_m",
     "hover_yaw_rms_rad": "rms_yaw_rad",
 }
 _FINDINGS = {
-    "latency_s": "latency_s",
+    "latency_s": "measured_latency_s",
     "latency_sigma_s": "latency_sigma_s",
-    "mount_turn_deg": "rotation_deg",
+    "mount_turn_deg": "rotation_error_deg",
     "mount_turn_sigma_deg": "rotation_sigma_deg",
     "advice": "advice",
 }

@@ -22,7 +22,7 @@ from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.mission import (
     Event,
     FlightReport,
-    Operator,
+    OperatorRequest,
     Outcome,
     Phase,
     RestReport,
@@ -166,14 +166,14 @@ def test_land_is_one_ctrl_c_and_never_two_and_cut_motors_stops_at_once(
     with flight_page(OPTIONS, True, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
-        assert switch.read() is Operator.NONE
+        assert switch.read() is OperatorRequest.NONE
         for _ in range(2):
             assert press(flight.page.url, flight.page.token) == 200
-            assert switch.read() is Operator.LAND
+            assert switch.read() is OperatorRequest.LAND
         switch.press()
-        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats Land
+        assert switch.read() is OperatorRequest.LAND  # the first Ctrl-C repeats Land
         assert press(flight.page.url, flight.page.token, "cut") == 200
-        assert switch.read() is Operator.STOP
+        assert switch.read() is OperatorRequest.STOP
 
 
 # --- how it ended ----------------------------------------------------------------------------
@@ -237,7 +237,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         report = FlightReport(
             Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
         )
-        return replace(report, detached=("a callback was detached",)), None
+        return replace(report, detached_watchers=("a callback was detached",)), None
 
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, view=True) == 50

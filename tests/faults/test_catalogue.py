@@ -16,7 +16,7 @@ from perchctl.faults import FAULTS, select_faults
 from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, draw_fault_case
 from perchctl.faults.oracle import emergency_stop_s
 from perchctl.flight import OperatorSwitch
-from perchctl.mission import Operator, Phase
+from perchctl.mission import OperatorRequest, Phase
 from perchctl.sim import Neighbour, Scenario
 
 SCENARIO = Scenario(seed=5)
@@ -83,7 +83,7 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
         for now_s[0] in presses_s:
             switch.press()
         now_s[0] += 1.0
-        assert (switch.read() is Operator.STOP) is stops
+        assert (switch.read() is OperatorRequest.STOP) is stops
         assert (emergency_stop_s(presses_s) is not None) is stops
 
 

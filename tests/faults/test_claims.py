@@ -71,7 +71,7 @@ def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
 def test_a_report_claims_all_that_it_says() -> None:
     perched = report(Phase.PERCHED, Outcome.PERCHED, "perched")
     assert report_claims(perched) == {"hangs on the target", "hangs"}
-    landed = report(Phase.LANDED, Outcome.OPERATOR, "landed")
+    landed = report(Phase.LANDED, Outcome.ENDED_BY_OPERATOR, "landed")
     assert report_claims(landed) == {"stands", "hangs or stands"}
     hung = report(Phase.PERCHED, Outcome.TARGET_NOT_FOUND, "hung")
     assert report_claims(hung) == {"hangs", "stands"}  # exit 50 says that it landed

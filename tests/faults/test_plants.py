@@ -19,7 +19,7 @@ from perchctl.faults.oracle import Flag
 from perchctl.flight import OperatorSwitch, loop
 from perchctl.mission import (
     Observation,
-    Operator,
+    OperatorRequest,
     Phase,
     PlannerState,
     descent,
@@ -50,7 +50,7 @@ def stops_after_contact(patch: Patch) -> None:
 
 def ignores_the_second_press(patch: Patch) -> None:
     read = OperatorSwitch.read
-    patch.setattr(OperatorSwitch, "read", lambda self: min(read(self), Operator.LAND))
+    patch.setattr(OperatorSwitch, "read", lambda self: min(read(self), OperatorRequest.LAND))
 
 
 def lands_fast(patch: Patch) -> None:

@@ -15,7 +15,7 @@ from perchctl.fleet import make_plan
 from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, START_HUNG_S, Coordinator
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
 from perchctl.flight import OperatorSwitch
-from perchctl.mission import Operator, Phase
+from perchctl.mission import OperatorRequest, Phase
 from tests.fleet.rig import fleet
 
 FAR: tuple[tuple[Point, Point], ...] = tuple(((4.0 * n, 0.0), (4.0 * n, 0.5)) for n in range(4))
@@ -119,7 +119,7 @@ class Rig:
         return [name for name, child in self.children.items() if child.order.may_take_off]
 
     @property
-    def words(self) -> list[Operator]:
+    def words(self) -> list[OperatorRequest]:
         return [child.order.word for child in self.children.values()]
 
 
@@ -150,7 +150,7 @@ def test_groups_fly_in_their_order_each_after_the_one_before() -> None:
     assert not rig.fleet.has_ended
     rig.end("v3")
     assert rig.fleet.has_ended
-    assert rig.words == [Operator.NONE] * 4
+    assert rig.words == [OperatorRequest.NONE] * 4
 
 
 def test_a_fleet_has_not_ended_before_each_view_has_its_result(
@@ -189,7 +189,7 @@ def test_one_that_is_not_ready_keeps_all_on_the_floor() -> None:
         "v3", Result(exit_code=10, outcome=VehicleOutcome.FAILED, reason="no Crazyflie answers")
     )
     assert rig.permitted == []
-    assert rig.words[:3] == [Operator.LAND] * 3
+    assert rig.words[:3] == [OperatorRequest.LAND] * 3
     assert not rig.fleet.started
     rig["v3"].ended = None
     rig.ready()
@@ -218,7 +218,7 @@ def test_one_that_ended_somewhere_keeps_its_neighbour_on_the_floor() -> None:
     assert rig.permitted == ["v0"]
     rig.fly("v0")
     rig.end("v0", ABORTED)
-    assert rig["v1"].order == Order(may_take_off=False, word=Operator.LAND)
+    assert rig["v1"].order == Order(may_take_off=False, word=OperatorRequest.LAND)
     assert "v0 may be in its corridor" in rig.fleet.reasons["v1"]
 
 
@@ -248,7 +248,7 @@ def test_one_far_away_flies_on_unless_a_failure_lands_all() -> None:
     rig = Rig(on_failure="land-all").started()
     rig.fly("v0", "v1")
     rig.end("v0", ABORTED)
-    assert rig.words[1:] == [Operator.LAND] * 3
+    assert rig.words[1:] == [OperatorRequest.LAND] * 3
     assert rig.fleet.reasons["v1"] == "v0 has failed"
 
 
@@ -262,12 +262,17 @@ def test_two_that_come_too_near_land_and_the_others_fly_on() -> None:
             Stage.FLYING, phase=Phase.ALIGN, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(x_m, 0.0)
         )
     rig.pass_s()
-    assert rig.words == [Operator.LAND, Operator.LAND, Operator.NONE, Operator.NONE]
+    assert rig.words == [
+        OperatorRequest.LAND,
+        OperatorRequest.LAND,
+        OperatorRequest.NONE,
+        OperatorRequest.NONE,
+    ]
     rig["v0"].tell(
         Stage.FLYING, phase=Phase.LANDING, telemetry_age_s=0.1, loop_age_s=0.0, place_m=(0.0, 0.0)
     )
     rig.pass_s()
-    assert rig.words[:2] == [Operator.LAND] * 2, "also once they are apart again"
+    assert rig.words[:2] == [OperatorRequest.LAND] * 2, "also once they are apart again"
     assert [str(pair) for pair in rig.fleet.near_pairs] == [
         "v0 and v1 were 0.20 m apart in the air"
     ]
@@ -306,7 +311,7 @@ def test_a_position_that_grows_old_lands_nobody_and_is_named() -> None:
     rig["v0"].hangs = True
     rig.pass_s(0.6)
     assert rig.fleet.unwatched == ("v0",)
-    assert rig.words == [Operator.NONE] * 4
+    assert rig.words == [OperatorRequest.NONE] * 4
 
 
 # --- Stop ---
@@ -317,12 +322,12 @@ def test_ctrl_c_lands_all_and_again_cuts_all() -> None:
     rig.fly("v0", "v1")
     rig.switch.press()
     rig.fleet.step()
-    assert rig.words == [Operator.LAND] * 4, "at once, not at the next beat"
+    assert rig.words == [OperatorRequest.LAND] * 4, "at once, not at the next beat"
     assert not rig.permitted
     rig.pass_s(1.5)
     rig.switch.press()
     rig.fleet.step()
-    assert rig.words == [Operator.STOP] * 4
+    assert rig.words == [OperatorRequest.STOP] * 4
 
 
 def test_a_stop_in_the_round_of_the_start_keeps_the_fleet_on_the_floor(
@@ -331,14 +336,14 @@ def test_a_stop_in_the_round_of_the_start_keeps_the_fleet_on_the_floor(
     """A fleet that has never taken off must not be reported as one that has."""
     rig = Rig()
     rig.fleet.confirm()
-    words = [Operator.NONE, Operator.LAND]
+    words = [OperatorRequest.NONE, OperatorRequest.LAND]
     monkeypatch.setattr(rig.switch, "read", lambda: words.pop(0) if len(words) > 1 else words[0])
     for child in rig.children.values():
         child.tell(Stage.READY)
     rig.fleet.step()
     assert rig.fleet.started == (rig.permitted != [])
     rig.fleet.step()
-    assert rig.words == [Operator.LAND] * 4
+    assert rig.words == [OperatorRequest.LAND] * 4
 
 
 class Rounds(threading.Event):
@@ -370,18 +375,18 @@ def failed(monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 def test_a_round_that_raises_lands_all(failed: Rig) -> None:
     assert "RuntimeError: a status that nobody foresaw" in (failed.fleet.failure or "")
-    assert failed.words == [Operator.LAND] * 4
+    assert failed.words == [OperatorRequest.LAND] * 4
     assert failed.permitted == []
 
 
 def test_after_a_failure_the_operator_still_cuts_all_and_orders_are_repeated(failed: Rig) -> None:
     before = len(failed["v1"].orders)
     failed.fleet.run(Rounds(failed, 5))
-    assert failed.words == [Operator.LAND] * 4
+    assert failed.words == [OperatorRequest.LAND] * 4
     assert len(failed["v1"].orders) - before == 5, "signs of life"
     failed.switch.cut()
     failed.fleet.run(Rounds(failed, 1))
-    assert failed.words == [Operator.STOP] * 4
+    assert failed.words == [OperatorRequest.STOP] * 4
     assert failed.fleet.failure is not None
 
 
@@ -406,11 +411,15 @@ def test_one_that_cannot_be_ordered_keeps_no_other_from_its_order(
     monkeypatch.setattr(failed["v0"], "send", send)
     failed.switch.cut()
     failed.fleet.run(Rounds(failed, 1))
-    assert failed.words[1:] == [Operator.STOP] * 3
+    assert failed.words[1:] == [OperatorRequest.STOP] * 3
 
 
-@pytest.mark.parametrize(("code", "word"), [(130, Operator.NONE), (52, Operator.LAND)])
-def test_a_vehicle_landed_by_key_has_not_failed_unless_it_has(code: int, word: Operator) -> None:
+@pytest.mark.parametrize(
+    ("code", "word"), [(130, OperatorRequest.NONE), (52, OperatorRequest.LAND)]
+)
+def test_a_vehicle_landed_by_key_has_not_failed_unless_it_has(
+    code: int, word: OperatorRequest
+) -> None:
     """The others continue also with ``on_failure: land-all``."""
     rig = Rig(on_failure="land-all").started()
     rig.fly("v0", "v1")
@@ -426,7 +435,7 @@ def test_one_that_sends_nonsense_lands_and_says_why() -> None:
     rig.pass_s()
     rig["v0"].garbled = None
     rig.pass_s()
-    assert rig.words == [Operator.LAND, *[Operator.NONE] * 3], "for good"
+    assert rig.words == [OperatorRequest.LAND, *[OperatorRequest.NONE] * 3], "for good"
     rig.end("v0", replace(ABORTED, outcome=VehicleOutcome.LANDED, exit_code=130))
     result = rig.fleet.views[0].result
     assert result is not None
@@ -439,7 +448,7 @@ def test_a_key_lands_one_and_the_next_group_still_flies() -> None:
     rig.fly("v0", "v1")
     rig.fleet.land("v0")
     rig.fleet.step()
-    assert rig.words == [Operator.LAND, *[Operator.NONE] * 3]
+    assert rig.words == [OperatorRequest.LAND, *[OperatorRequest.NONE] * 3]
     rig.end(
         "v0",
         Result(exit_code=130, outcome=VehicleOutcome.LANDED, reason="operator", has_flown=True),
@@ -460,7 +469,7 @@ def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:
     rig["v0"].hangs = True
     rig.switch.press()
     rig.pass_s()
-    assert rig["v1"].order.word is Operator.LAND
+    assert rig["v1"].order.word is OperatorRequest.LAND
     rig.pass_s(HUNG_S + 1.0)
     assert rig["v0"].killed
     result = rig.fleet.views[0].result
@@ -496,7 +505,7 @@ def test_a_process_that_was_killed_in_the_air_counts_as_somewhere() -> None:
     rig.pass_s()
     rig["v0"].gone = "its process has ended unexpectedly (signal 9)"
     rig.pass_s()
-    assert rig["v1"].order.word is Operator.LAND
+    assert rig["v1"].order.word is OperatorRequest.LAND
     result = rig.fleet.views[0].result
     assert result is not None
     assert (result.has_flown, result.log) == (True, "logs/flight.jsonl")
@@ -512,7 +521,7 @@ def test_a_process_that_was_lost_after_its_permission_may_have_flown() -> None:
     assert result is not None
     assert (result.exit_code, result.has_flown) == (52, True)
     assert "look where the vehicle is" in result.reason
-    assert rig["v1"].order == Order(may_take_off=False, word=Operator.LAND)
+    assert rig["v1"].order == Order(may_take_off=False, word=OperatorRequest.LAND)
 
 
 def test_a_process_that_was_lost_without_permission_has_not_flown() -> None:

@@ -38,7 +38,7 @@ from perchctl.fleet import (
 )
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.flight import FlyOptions, OperatorSwitch
-from perchctl.mission import Operator, Phase
+from perchctl.mission import OperatorRequest, Phase
 from perchctl.profile import load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -136,7 +136,7 @@ class FakeProcess:
             self._status = Status(stage=Stage.FLYING, phase=Phase.ALIGN)
             if sum(order.may_take_off for order in self.orders) > 7:
                 self._result = self.END
-        elif order.word is not Operator.NONE and self._result is None:
+        elif order.word is not OperatorRequest.NONE and self._result is None:
             self._result = Result(
                 exit_code=130,
                 outcome=VehicleOutcome.LANDED,

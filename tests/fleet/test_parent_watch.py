@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.fleet.messages import BEAT_S, Order
 from perchctl.fleet.parent_watch import LONGEST_WATCH_STEP_S, PARENT_SILENCE_S, ParentSwitch
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 
 READ_S = 0.02
 """Between two readings by the flight loop."""
@@ -23,7 +23,9 @@ class Clock:
         return self.now_s
 
 
-def readings(switch: ParentSwitch, clock: Clock, for_s: float, every_s: float = READ_S) -> Operator:
+def readings(
+    switch: ParentSwitch, clock: Clock, for_s: float, every_s: float = READ_S
+) -> OperatorRequest:
     """The word at the end of a time in which it was read regularly."""
     word, end_s = switch.read(), clock.now_s + for_s
     while clock.now_s < end_s:
@@ -41,8 +43,8 @@ def listening() -> tuple[ParentSwitch, Clock]:
 
 def test_a_parent_that_dies_in_silence_lands_the_vehicle_within_a_second() -> None:
     switch, clock = listening()
-    assert readings(switch, clock, PARENT_SILENCE_S - 0.1) is Operator.NONE
-    assert readings(switch, clock, 0.1 + 2 * READ_S) is Operator.LAND
+    assert readings(switch, clock, PARENT_SILENCE_S - 0.1) is OperatorRequest.NONE
+    assert readings(switch, clock, 0.1 + 2 * READ_S) is OperatorRequest.LAND
     assert not switch.may_take_off
     assert "silent for 1 s" in (switch.lost or "")
 
@@ -50,7 +52,7 @@ def test_a_parent_that_dies_in_silence_lands_the_vehicle_within_a_second() -> No
 def test_a_parent_that_is_gone_lands_it_at_once() -> None:
     switch, _ = listening()
     switch.lose_parent()
-    assert switch.read() is Operator.LAND
+    assert switch.read() is OperatorRequest.LAND
     assert not switch.may_take_off
 
 
@@ -58,17 +60,17 @@ def test_a_parent_that_comes_back_does_not_take_the_landing_back() -> None:
     switch, clock = listening()
     readings(switch, clock, 2 * PARENT_SILENCE_S)
     switch.take(Order(may_take_off=True))
-    assert switch.read() is Operator.LAND
+    assert switch.read() is OperatorRequest.LAND
     assert not switch.may_take_off
-    switch.take(Order(word=Operator.STOP))
-    assert switch.read() is Operator.STOP
+    switch.take(Order(word=OperatorRequest.STOP))
+    assert switch.read() is OperatorRequest.STOP
 
 
 def test_signs_of_life_keep_it_flying_for_ever() -> None:
     switch, clock = listening()
     for _ in range(1000):
         switch.take(Order(may_take_off=True))
-        assert readings(switch, clock, 5 * BEAT_S) is Operator.NONE
+        assert readings(switch, clock, 5 * BEAT_S) is OperatorRequest.NONE
 
 
 def test_its_own_pause_is_not_the_parents_silence() -> None:
@@ -76,26 +78,26 @@ def test_its_own_pause_is_not_the_parents_silence() -> None:
     switch, clock = listening()
     readings(switch, clock, PARENT_SILENCE_S / 2)
     clock.now_s += 60.0
-    assert switch.read() is Operator.NONE
+    assert switch.read() is OperatorRequest.NONE
     switch.take(Order(may_take_off=True))
-    assert readings(switch, clock, PARENT_SILENCE_S - 2 * READ_S) is Operator.NONE
+    assert readings(switch, clock, PARENT_SILENCE_S - 2 * READ_S) is OperatorRequest.NONE
 
 
 def test_a_slow_loop_notices_a_silent_parent_too() -> None:
     """The link's watchdog reads 20 times a second while the loop hangs."""
     switch, clock = listening()
     assert readings(switch, clock, 2 * PARENT_SILENCE_S, every_s=2 * LONGEST_WATCH_STEP_S) is (
-        Operator.NONE
+        OperatorRequest.NONE
     )
-    assert readings(switch, clock, 2 * LONGEST_WATCH_STEP_S, every_s=0.05) is Operator.LAND
+    assert readings(switch, clock, 2 * LONGEST_WATCH_STEP_S, every_s=0.05) is OperatorRequest.LAND
 
 
-@pytest.mark.parametrize("word", [Operator.LAND, Operator.STOP])
-def test_a_word_comes_before_a_permission_and_is_never_taken_back(word: Operator) -> None:
+@pytest.mark.parametrize("word", [OperatorRequest.LAND, OperatorRequest.STOP])
+def test_a_word_comes_before_a_permission_and_is_never_taken_back(word: OperatorRequest) -> None:
     switch, _ = listening()
     switch.take(Order(may_take_off=True, word=word))
     assert not switch.may_take_off
-    switch.take(Order(may_take_off=False, word=Operator.NONE))
+    switch.take(Order(may_take_off=False, word=OperatorRequest.NONE))
     assert switch.read() is word
 
 
@@ -104,4 +106,4 @@ def test_permission_is_taken_back_on_the_floor() -> None:
     assert switch.may_take_off
     switch.take(Order())
     assert not switch.may_take_off
-    assert switch.read() is Operator.NONE
+    assert switch.read() is OperatorRequest.NONE

@@ -18,7 +18,7 @@ from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.parent_watch import ParentSwitch
 from perchctl.fleet.vehicle_process import ParentLine, StatusReporter
 from perchctl.flight import FlyOptions
-from perchctl.mission import Event, Operator, Phase, RestState, Tick
+from perchctl.mission import Event, OperatorRequest, Phase, RestState, Tick
 from perchctl.values import replace
 from tests.helpers.live_page import press, tick
 from tests.helpers.waiting import until
@@ -210,10 +210,10 @@ def test_what_is_no_order_lands_and_the_motors_can_still_be_cut(
     assert (switch.lost or "").startswith(why)
     parent.send(Order(may_take_off=True))
     parent.send(Order(may_take_off=True))
-    assert switch.read() is Operator.LAND
+    assert switch.read() is OperatorRequest.LAND
     assert not switch.may_take_off
-    parent.send(Order(word=Operator.STOP))
-    until(lambda: switch.read() is Operator.STOP)
+    parent.send(Order(word=OperatorRequest.STOP))
+    until(lambda: switch.read() is OperatorRequest.STOP)
     assert isinstance(parent.receive(1.0), Status), "it goes on telling where it is"
 
 
@@ -222,4 +222,4 @@ def test_a_parent_that_is_gone_lands_the_vehicle(line: tuple[Channel, ParentSwit
     parent.close()
     until(lambda: switch.lost)
     assert switch.lost == "the parent process is gone"
-    assert switch.read() is Operator.LAND
+    assert switch.read() is OperatorRequest.LAND

@@ -29,7 +29,7 @@ from perchctl.errors import (
 from perchctl.flight import FlyOptions, OperatorSwitch, fly_lockstep, fly_session
 from perchctl.flight.preflight import ARMING_PAUSE_S, ARMS_WITHIN_S
 from perchctl.link.crtp import encode
-from perchctl.mission import Operator, Outcome, SentCommand, TickRecord
+from perchctl.mission import OperatorRequest, Outcome, SentCommand, TickRecord
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -87,15 +87,15 @@ class Unarmed(Vehicle):
         return replace(sample, supervisor=sample.supervisor & ~AUTO_ARM)
 
 
-def land_after(rig: Rig, t_s: float) -> Callable[[], Operator]:
-    return lambda: Operator.LAND if rig.link.now_s > t_s else Operator.NONE
+def land_after(rig: Rig, t_s: float) -> Callable[[], OperatorRequest]:
+    return lambda: OperatorRequest.LAND if rig.link.now_s > t_s else OperatorRequest.NONE
 
 
 def test_it_is_armed_once_nothing_else_is_waited_for() -> None:
     """Also if that takes longer than a vehicle stays armed."""
     rig = Rig(Unarmed(), Camera(lambda frame: frame if frame.t_arrival_s > 4.0 else None))
     rig.operator = land_after(rig, 6.0)
-    assert rig.fly().outcome is Outcome.OPERATOR
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     (asked_s,) = rig.link.said(Arm)
     assert 4.0 < asked_s < 4.1
     assert rig.link.said(PositionSetpoint)[0] >= asked_s + SPIN_UP_S
@@ -108,7 +108,7 @@ def test_the_arming_of_an_earlier_question_does_not_matter() -> None:
     link._lasts_s = 1.0
     rig = Rig(link)
     rig.operator = land_after(rig, 3.0)
-    assert rig.fly().outcome is Outcome.OPERATOR
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     assert len(link.said(Arm)) == 1
 
 
@@ -179,7 +179,7 @@ def test_a_moments_disturbance_once_it_is_armed_does_not_end_it() -> None:
     link = disturbed(Unarmed(), shaken, 0.2, 0.5)
     rig = Rig(link)
     rig.operator = land_after(rig, 3.0)
-    assert rig.fly().outcome is Outcome.OPERATOR
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     assert len(link.said(Arm)) == 1
     assert link.said(PositionSetpoint)[0] == pytest.approx(0.5, abs=0.1)
 
@@ -188,7 +188,11 @@ def test_a_word_given_in_a_slow_turn_comes_before_the_request() -> None:
     """The turn began before it, and ends with a vehicle that is ready to be armed."""
     link, camera = Unarmed(), Camera()
     hang_in_the_camera(link, camera, -1.0, 0.2)
-    rig = Rig(link, camera, operator=lambda: Operator.LAND if link.now_s > 0.1 else Operator.NONE)
+    rig = Rig(
+        link,
+        camera,
+        operator=lambda: OperatorRequest.LAND if link.now_s > 0.1 else OperatorRequest.NONE,
+    )
     with pytest.raises(Interrupted, match="nothing was started"):
         rig.fly()
     assert link.sent == []
@@ -214,7 +218,7 @@ def test_a_vehicle_that_does_not_arm_does_not_fly(
 
 def test_ctrl_c_while_its_motors_start_ends_it_on_the_ground() -> None:
     rig = Rig(Unarmed())
-    rig.operator = lambda: Operator.LAND if rig.link.said(Arm) else Operator.NONE
+    rig.operator = lambda: OperatorRequest.LAND if rig.link.said(Arm) else OperatorRequest.NONE
     with pytest.raises(Interrupted, match="before take-off: disarming"):
         rig.fly()
     assert not rig.link.said(PositionSetpoint)
@@ -228,11 +232,11 @@ class UnarmedAndGuarded(Guarded, Unarmed):
         self.own, self._asked_s = [], 0.0
 
 
-@pytest.mark.parametrize("pressed", [Operator.LAND, Operator.STOP])
-def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: Operator) -> None:
+@pytest.mark.parametrize("pressed", [OperatorRequest.LAND, OperatorRequest.STOP])
+def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: OperatorRequest) -> None:
     link, camera = UnarmedAndGuarded(), Camera()
     hang_in_the_camera(link, camera, 0.1, 3.0)
-    rig = Rig(link, camera, operator=lambda: pressed if link.now_s > 1.0 else Operator.NONE)
+    rig = Rig(link, camera, operator=lambda: pressed if link.now_s > 1.0 else OperatorRequest.NONE)
     with pytest.raises(Interrupted):
         rig.fly()
     assert link.said(Arm)[0] < 0.2
@@ -242,10 +246,11 @@ def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: Operator) ->
 
 
 @pytest.mark.parametrize(
-    ("pressed", "order"), [(Operator.LAND, Arm(False)), (Operator.STOP, EmergencyStop())]
+    ("pressed", "order"),
+    [(OperatorRequest.LAND, Arm(False)), (OperatorRequest.STOP, EmergencyStop())],
 )
 def test_the_word_reaches_an_armed_vehicle_whose_first_turn_of_flight_hangs(
-    pressed: Operator, order: Command
+    pressed: OperatorRequest, order: Command
 ) -> None:
     """Its propellers turn, and the loop has not decided anything yet."""
     link, camera = UnarmedAndGuarded(), Camera()
@@ -260,7 +265,9 @@ def test_the_word_reaches_an_armed_vehicle_whose_first_turn_of_flight_hangs(
 
     camera.poll = hang_once_ready  # type: ignore[method-assign]
     rig = Rig(link, camera)
-    rig.operator = lambda: pressed if ready and link.now_s > ready[0] + 1.0 else Operator.NONE
+    rig.operator = lambda: (
+        pressed if ready and link.now_s > ready[0] + 1.0 else OperatorRequest.NONE
+    )
     rig.fly()
     assert not link.said(PositionSetpoint)
     sent_s, sent = link.own[0]

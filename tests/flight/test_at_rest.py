@@ -16,7 +16,7 @@ from perchctl.flight import GroundCriteria, lockstep_feed
 from perchctl.flight.criteria import DRIFT_M, REST_S, STANDING_MPS
 from perchctl.flight.preflight import GroundTurn, still_waiting_for
 from perchctl.link import MockLink
-from perchctl.mission import Operator, Outcome
+from perchctl.mission import OperatorRequest, Outcome
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import SimulatedVehicle, draw_capture, draw_scenario
 from perchctl.vehicle import ExternalPosition, PositionSetpoint, Telemetry
@@ -132,8 +132,10 @@ def thinned(sample: Telemetry, every: int) -> Telemetry | None:
 
 def first_setpoint_s(vehicle: Vehicle) -> float:
     rig = Rig(vehicle)
-    rig.operator = lambda: Operator.LAND if vehicle.said(PositionSetpoint) else Operator.NONE
-    assert rig.fly().outcome is Outcome.OPERATOR
+    rig.operator = lambda: (
+        OperatorRequest.LAND if vehicle.said(PositionSetpoint) else OperatorRequest.NONE
+    )
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     return vehicle.said(PositionSetpoint)[0]
 
 

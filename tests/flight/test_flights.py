@@ -17,9 +17,9 @@ from perchctl.campaign import FlightResult
 from perchctl.campaign.flights import fly_seed
 from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
 from perchctl.link import MockLink
-from perchctl.mission import EventKind, Operator, Outcome, Phase, planner
+from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, planner
 from perchctl.mission.context import Context
-from perchctl.mission.phase import PUBLISHED_PHASES
+from perchctl.mission.phase import PAPER_METHOD_PHASES
 from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.record.fields import tick_record
@@ -27,7 +27,7 @@ from perchctl.sim import Neighbour, SimulatedVehicle, draw_scenario
 from tests.helpers.flights import DATA_SHEET, SEED, SHORT, Flown, fly_short, short_profile
 from tests.helpers.loop_rig import Watcher
 
-SEVEN_NAMES = [phase.value for phase in PUBLISHED_PHASES]
+SEVEN_NAMES = [phase.value for phase in PAPER_METHOD_PHASES]
 MISS_LIMIT_M = 0.020
 ON_THE_FLOOR_M = 0.05
 SLIPPERY_N = 0.1  # a quarter of the weight
@@ -39,7 +39,7 @@ def assert_perched(flown: Flown, attempts: int = 1) -> None:
     assert flight.hanging
     assert flight.miss_m < MISS_LIMIT_M
     assert report.attempts == attempts
-    assert not any((flight.locked, report.locked, flight.fell))
+    assert not any((flight.locked, report.is_vehicle_locked, flight.fell))
 
 
 def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "") -> None:
@@ -48,7 +48,7 @@ def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "
     assert outcome.exit_code == exit_code
     assert words in report.reason
     assert flown.z_m < ON_THE_FLOOR_M
-    assert not any((flight.hanging, flight.locked, report.locked, flight.fell))
+    assert not any((flight.hanging, flight.locked, report.is_vehicle_locked, flight.fell))
 
 
 # --- A flight under good conditions ---------------------------------------------------
@@ -112,7 +112,7 @@ def test_the_full_scenario_perches() -> None:
     found = flight.report.findings
     assert found is not None
     assert found.advice == ()
-    assert abs(found.latency_s - scenario.camera_latency_s) < 2.0 * found.latency_sigma_s
+    assert abs(found.measured_latency_s - scenario.camera_latency_s) < 2.0 * found.latency_sigma_s
 
 
 @pytest.mark.long
@@ -180,14 +180,14 @@ SOFT_MPS = 0.35
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("phase", PUBLISHED_PHASES, ids=lambda p: p.value)
+@pytest.mark.parametrize("phase", PAPER_METHOD_PHASES, ids=lambda p: p.value)
 def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     """On the floor; or, where the magnet has it already, peeled off in vain and left hanging,
     and reported so."""
-    flown = fly_short(operator_at={phase: Operator.LAND})
+    flown = fly_short(operator_at={phase: OperatorRequest.LAND})
     report, hanging = flown.report, flown.flight.hanging
     assert flown.way[-3:] == [phase.value, "LANDING", "PERCHED" if hanging else "LANDED"]
-    assert report.outcome is Outcome.OPERATOR
+    assert report.outcome is Outcome.ENDED_BY_OPERATOR
     assert report.outcome.exit_code == 130
     words = "hanging with" if hanging else "motors off"
     assert report.reason.startswith(f"the operator asked to land; {words}")
@@ -202,13 +202,15 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     "phase", [Phase.APPROACH, Phase.ASCEND, Phase.COMPLETE], ids=lambda p: p.value
 )
 def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
-    flown = fly_short(operator_at={phase: Operator.LAND, Phase.LANDING: Operator.STOP})
+    flown = fly_short(
+        operator_at={phase: OperatorRequest.LAND, Phase.LANDING: OperatorRequest.STOP}
+    )
     report = flown.report
     assert flown.way[-3:] == [phase.value, "LANDING", "ABORTED"]
     assert (report.phase, report.outcome) == (Phase.ABORTED, Outcome.EMERGENCY)
     assert report.outcome.exit_code == 53
     assert flown.flight.locked  # docs/firmware.md, "Emergency stop"
-    assert report.locked  # which is said, though no telemetry has told it yet
+    assert report.is_vehicle_locked  # which is said, though no telemetry has told it yet
 
 
 # --- Receivers that repeat ------------------------------------------------------------------------

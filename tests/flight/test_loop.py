@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import fly
 from perchctl.flight.preflight import GroundTurn, still_waiting_for
-from perchctl.mission import EventKind, FlightReport, Operator, Outcome, Tick
+from perchctl.mission import EventKind, FlightReport, OperatorRequest, Outcome, Tick
 from perchctl.perception import perception
 from perchctl.vehicle import (
     CRASHED,
@@ -53,8 +53,8 @@ def landed_for(rig: Rig, words: str) -> FlightReport:
     return report
 
 
-def land_after(rig: Rig, t_s: float) -> Callable[[], Operator]:
-    return lambda: Operator.LAND if rig.link.now_s > t_s else Operator.NONE
+def land_after(rig: Rig, t_s: float) -> Callable[[], OperatorRequest]:
+    return lambda: OperatorRequest.LAND if rig.link.now_s > t_s else OperatorRequest.NONE
 
 
 # --- Bad measurements ---------------------------------------------------------------------------
@@ -65,7 +65,7 @@ def test_telemetry_that_is_no_number_is_left_out() -> None:
     nan = (math.nan, 0.0, 0.5)
     rig = Rig(Vehicle(lambda s: replace(s, position_m=nan) if 1.5 < s.t_s < 1.6 else s))
     rig.operator = land_after(rig, 3.0)
-    assert rig.fly().outcome is Outcome.OPERATOR
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     assert all(math.isfinite(v) for t in rig.watcher.ticks for v in t.telemetry.position_m)
     assert 0.08 < max(t.telemetry_age_s for t in rig.watcher.ticks) < 0.15
 
@@ -124,7 +124,7 @@ def test_a_log_that_fails_is_said_once_and_landed_for_where_the_profile_wants_it
 
     rig.watcher.on_tick = fill_up
     report = rig.fly()
-    assert report.outcome is (Outcome.SAFETY if strict else Outcome.OPERATOR)
+    assert report.outcome is (Outcome.SAFETY if strict else Outcome.ENDED_BY_OPERATOR)
     assert ("the disk is full" in report.reason) is strict
     said = [e for e in rig.watcher.events if "incomplete" in e.reason]
     assert [e.kind for e in said] == [EventKind.NOTE]
@@ -231,8 +231,8 @@ def test_a_profile_may_say_what_its_vehicle_never_reports(
     rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
     rig.profile = changed({"link.unreported": (unreported,)})
     rig.operator = land_after(rig, 3.0)
-    assert rig.fly().outcome is Outcome.OPERATOR
-    assert not any(tick.state.hold for tick in rig.watcher.ticks)
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
+    assert not any(tick.state.hold_reason for tick in rig.watcher.ticks)
 
 
 @pytest.mark.parametrize("changes", [{"battery_v": 3.4}, {"velocity_variance_m2ps2": 0.5}])
@@ -325,15 +325,19 @@ def test_a_camera_that_fell_silent_is_refused_by_its_own_words() -> None:
 
 
 def first_setpoint_s(rig: Rig) -> float:
-    rig.operator = lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE
-    assert rig.fly().outcome is Outcome.OPERATOR
+    rig.operator = lambda: (
+        OperatorRequest.LAND if rig.link.said(PositionSetpoint) else OperatorRequest.NONE
+    )
+    assert rig.fly().outcome is Outcome.ENDED_BY_OPERATOR
     return rig.link.said(PositionSetpoint)[0]
 
 
 def test_begin_turn_is_called_in_every_turn_from_the_first_one_on() -> None:
     """Your `should_stop` is asked while the vehicle is not ready yet, too."""
     rig = Rig(is_late())
-    rig.operator = lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE
+    rig.operator = lambda: (
+        OperatorRequest.LAND if rig.link.said(PositionSetpoint) else OperatorRequest.NONE
+    )
     called_s: list[float] = []
     fly(replace(rig.parts(), begin_turn=lambda: called_s.append(rig.link.now_s)))
     period_s = 1.0 / PROFILE.link.loop_hz
@@ -412,7 +416,7 @@ def test_a_log_that_fails_on_the_ground_is_no_flight_where_it_would_be_landed_fo
 
 
 def test_ctrl_c_on_the_ground_starts_nothing() -> None:
-    Rig(operator=lambda: Operator.LAND).refused(Interrupted, "nothing was started")
+    Rig(operator=lambda: OperatorRequest.LAND).refused(Interrupted, "nothing was started")
 
 
 def waits(z_m: float = 0.0, waited_s: float = 0.0, age_s: float = 0.0, target: Any = None,

@@ -12,7 +12,7 @@ import pytest
 
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
-from perchctl.mission import EventKind, Operator, Outcome, Phase, RestState, Tick
+from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, RestState, Tick
 from perchctl.mission.descent import MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
 from perchctl.perception import perception
 from perchctl.profile import Profile
@@ -190,7 +190,7 @@ def test_without_positions_from_outside_it_comes_down_level() -> None:
 
 def test_ctrl_c_twice_stops_it_too() -> None:
     rig = rescuing(supervisor=AIRBORNE | HL_ACTIVE)
-    rig.operator = lambda: Operator.STOP if rig.link.now_s > 0.5 else Operator.NONE
+    rig.operator = lambda: OperatorRequest.STOP if rig.link.now_s > 0.5 else OperatorRequest.NONE
     rig.rescue(telemetry(0.0))
     assert rig.link.said(EmergencyStop)[0] == pytest.approx(0.5, abs=0.05)
     assert rig.link.now_s < 1.0
@@ -200,7 +200,7 @@ def test_the_operators_stop_in_it_is_repeated() -> None:
     """Until the vehicle says that it is locked, and also while the link is closing."""
     link = Guarded()
     rig = Rig(link, watcher=breaks_at(1.5))
-    rig.operator = lambda: Operator.STOP if link.now_s > 1.8 else Operator.NONE
+    rig.operator = lambda: OperatorRequest.STOP if link.now_s > 1.8 else OperatorRequest.NONE
     with pytest.raises(Broken):
         rig.fly()
     ended_s = link.now_s
@@ -245,8 +245,8 @@ def test_a_hang_of_half_a_second_is_held_and_the_flight_goes_on_with_what_is_new
     first = after_the_hang(rig)
     assert first.t_s == pytest.approx(HANG_AT_S + 0.62, abs=0.05)  # not the time before it
     assert first.telemetry_age_s < 0.05
-    assert "late" in first.state.hold
-    assert report.outcome is Outcome.OPERATOR
+    assert "late" in first.state.hold_reason
+    assert report.outcome is Outcome.ENDED_BY_OPERATOR
 
 
 def test_what_was_decided_before_a_hang_is_not_sent_after_it(
@@ -303,7 +303,9 @@ def test_a_landing_that_nobody_saw_is_no_landing(
 ) -> None:
     rig = Rig(Vehicle(changed), profile=SOON_GIVEN_UP)
     if len(words) == 1:
-        rig.operator = lambda: Operator.LAND if rig.link.now_s > 2.0 else Operator.NONE
+        rig.operator = lambda: (
+            OperatorRequest.LAND if rig.link.now_s > 2.0 else OperatorRequest.NONE
+        )
     report = rig.fly()
     assert report.phase is Phase.ABORTED
     assert report.outcome is Outcome.SAFETY

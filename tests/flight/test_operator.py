@@ -26,7 +26,7 @@ from perchctl.flight.operator import (
     SAME_PRESS_S,
     STOP_HANG_S,
 )
-from perchctl.mission import Operator
+from perchctl.mission import OperatorRequest
 from perchctl.profile import load_profile
 from tests.helpers.waiting import until
 
@@ -46,7 +46,7 @@ class Pressed:
         self.now_s = 50.0 + t_s
         self.switch.press()
 
-    def at(self, t_s: float) -> Operator:
+    def at(self, t_s: float) -> OperatorRequest:
         self.now_s = 50.0 + t_s
         return self.switch.read()
 
@@ -57,28 +57,30 @@ ANSWER_S = 0.25
 
 
 @pytest.mark.parametrize(("presses_s", "read_s", "order"), [
-    ([], 0.0, Operator.NONE),
-    ([0.0], 0.0, Operator.LAND),
-    ([0.0], 100.0, Operator.LAND),
-    ([0.0, SAME_PRESS_S - 0.01], 9.0, Operator.LAND),  # too soon to count
-    ([0.0, 0.2, 0.3], 0.3, Operator.STOP),  # but three do
-    ([0.0, LONGEST_DELAY_S], LONGEST_DELAY_S, Operator.STOP),  # no keyboard waits so long
-    ([0.0, 0.5, 0.53, 0.56], 9.0, Operator.LAND),  # held for half a second
-    ([0.0, 0.2, 0.22, 0.24], 9.0, Operator.LAND),  # by a keyboard that is set to be fast
-    ([0.0, 0.4, 0.55, 0.7], 9.0, Operator.STOP),  # a key or a hand: nobody can tell
-    ([0.0, 0.4, 0.49, 0.58, 0.67], 9.0, Operator.LAND),
-    ([0.0, 0.24, 0.46], 0.46, Operator.STOP),  # a key's first gap is longer
-    ([0.0, 0.4, 0.6, 0.7], 0.7, Operator.STOP),  # and the others are alike
+    ([], 0.0, OperatorRequest.NONE),
+    ([0.0], 0.0, OperatorRequest.LAND),
+    ([0.0], 100.0, OperatorRequest.LAND),
+    ([0.0, SAME_PRESS_S - 0.01], 9.0, OperatorRequest.LAND),  # too soon to count
+    ([0.0, 0.2, 0.3], 0.3, OperatorRequest.STOP),  # but three do
+    ([0.0, LONGEST_DELAY_S], LONGEST_DELAY_S, OperatorRequest.STOP),  # no keyboard waits so long
+    ([0.0, 0.5, 0.53, 0.56], 9.0, OperatorRequest.LAND),  # held for half a second
+    ([0.0, 0.2, 0.22, 0.24], 9.0, OperatorRequest.LAND),  # by a keyboard that is set to be fast
+    ([0.0, 0.4, 0.55, 0.7], 9.0, OperatorRequest.STOP),  # a key or a hand: nobody can tell
+    ([0.0, 0.4, 0.49, 0.58, 0.67], 9.0, OperatorRequest.LAND),
+    ([0.0, 0.24, 0.46], 0.46, OperatorRequest.STOP),  # a key's first gap is longer
+    ([0.0, 0.4, 0.6, 0.7], 0.7, OperatorRequest.STOP),  # and the others are alike
 ])  # fmt: skip
-def test_the_table_of_presses(presses_s: list[float], read_s: float, order: Operator) -> None:
+def test_the_table_of_presses(
+    presses_s: list[float], read_s: float, order: OperatorRequest
+) -> None:
     assert Pressed(*presses_s).at(read_s) is order
 
 
 @given(again_s=st.floats(SAME_PRESS_S, 60.0))
 def test_a_second_press_stops_within_a_quarter_of_a_second(again_s: float) -> None:
     it = Pressed(0.0, again_s)
-    assert it.at(again_s + ANSWER_S) is Operator.STOP
-    assert it.at(99.0) is Operator.STOP
+    assert it.at(again_s + ANSWER_S) is OperatorRequest.STOP
+    assert it.at(99.0) is OperatorRequest.STOP
 
 
 # --- a hand, or a key that is held: by the times of the presses alone ----------------------------
@@ -110,16 +112,19 @@ def keys(
 def test_a_hand_that_hammers_stops_at_its_third_press_or_soon_after(presses_s: list[float]) -> None:
     """What might still be a key is waited for: until it lets go, or for a second."""
     second_s = next((t for t in presses_s if t >= LONGEST_DELAY_S), 99.0)
-    assert Pressed(*presses_s).at(presses_s[-1] + ANSWER_S) is Operator.STOP
+    assert Pressed(*presses_s).at(presses_s[-1] + ANSWER_S) is OperatorRequest.STOP
     heard = [t for t in presses_s if t <= second_s]
-    assert Pressed(*heard).at(heard[-1] + (0.0 if second_s < 99.0 else ANSWER_S)) is Operator.STOP
+    assert (
+        Pressed(*heard).at(heard[-1] + (0.0 if second_s < 99.0 else ANSWER_S))
+        is OperatorRequest.STOP
+    )
 
 
 @given(st.floats(3.0, 10.0), st.floats(0.98, 1.02))
 def test_presses_that_are_alike_stop_at_the_third(rate_hz: float, off: float) -> None:
     """Three within a second, none of them a key's: its first gap is longer."""
     gap_s = 1.0 / rate_hz
-    assert Pressed(0.0, gap_s, gap_s * (1.0 + off)).at(gap_s * 2.1) is Operator.STOP
+    assert Pressed(0.0, gap_s, gap_s * (1.0 + off)).at(gap_s * 2.1) is OperatorRequest.STOP
 
 
 @given(keys())
@@ -128,9 +133,9 @@ def test_a_key_that_is_held_lands_for_a_second_and_then_stops(presses_s: list[fl
     for t_s, next_s in itertools.pairwise(presses_s):
         it.press(t_s)
         over = t_s - presses_s[0] >= LONGEST_DELAY_S - 1e-9
-        assert it.at(t_s) is (Operator.STOP if over else Operator.LAND)
-        assert it.at(next_s) is (Operator.STOP if over else Operator.LAND)
-    assert it.at(2.0) is Operator.STOP
+        assert it.at(t_s) is (OperatorRequest.STOP if over else OperatorRequest.LAND)
+        assert it.at(next_s) is (OperatorRequest.STOP if over else OperatorRequest.LAND)
+    assert it.at(2.0) is OperatorRequest.STOP
 
 
 @given(st.floats(0.25, 1.0, exclude_max=True), st.floats(0.03, 0.2), st.floats(0.0, 0.99))
@@ -140,7 +145,7 @@ def test_each_keyboard_between_the_slowest_and_the_fastest_lands(
     """Also where the delay is hardly longer than the repeats, if these come on time."""
     count = int((1.0 - delay_s) / period_s)
     it = Pressed(0.0, *(t for k in range(count) if (t := delay_s + period_s * k) <= for_s))
-    assert it.at(for_s) is Operator.LAND
+    assert it.at(for_s) is OperatorRequest.LAND
 
 
 @given(keys(slowest_s=FASTER_THAN_A_HAND_S - KEY_JITTER_S), st.integers(3, 50))
@@ -148,9 +153,9 @@ def test_a_key_let_go_is_one_press(presses_s: list[float], count: int) -> None:
     """No hand repeats so fast. After one repeat it cannot be told from two presses."""
     heard = [t for t in presses_s[:count] if t - presses_s[0] < LONGEST_DELAY_S - 1e-9]
     it = Pressed(*heard)
-    assert len(heard) < 3 or it.at(60.0) is Operator.LAND
+    assert len(heard) < 3 or it.at(60.0) is OperatorRequest.LAND
     it.press(61.0)
-    assert it.at(61.0) is Operator.STOP
+    assert it.at(61.0) is OperatorRequest.STOP
 
 
 @given(st.lists(st.floats(0.001, 1.5), min_size=1, max_size=20), st.floats(0.01, 0.1))
@@ -168,7 +173,7 @@ def test_how_often_it_is_read_changes_nothing(silences_s: list[float], every_s: 
 
 @given(st.lists(st.floats(0.001, 1.5), min_size=1, max_size=20))
 def test_an_order_never_falls(silences_s: list[float]) -> None:
-    it, t_s, before = Pressed(), 0.0, Operator.NONE
+    it, t_s, before = Pressed(), 0.0, OperatorRequest.NONE
     for silence_s in silences_s:
         it.press(t_s)
         for read_s in (t_s, t_s + 0.5 * silence_s):
@@ -179,16 +184,16 @@ def test_an_order_never_falls(silences_s: list[float]) -> None:
 
 
 @pytest.mark.parametrize(("count", "after_s", "order"), [
-    (1, 0.3, Operator.LAND),  # until no third has come
-    (2, 0.3, Operator.STOP),  # three within a second
-    (3, 0.09, Operator.LAND),  # faster than a hand, from 0.5 s on
-    (3, 0.45, Operator.STOP),
+    (1, 0.3, OperatorRequest.LAND),  # until no third has come
+    (2, 0.3, OperatorRequest.STOP),  # three within a second
+    (3, 0.09, OperatorRequest.LAND),  # faster than a hand, from 0.5 s on
+    (3, 0.45, OperatorRequest.STOP),
 ])  # fmt: skip
 def test_presses_that_are_heard_late_and_together(
-    count: int, after_s: float, order: Operator
+    count: int, after_s: float, order: OperatorRequest
 ) -> None:
     """Several signals arrive as one while no thread gets a turn; when each came is unknown."""
-    it = Pressed(0.0) if order is Operator.STOP or count == 1 else Pressed(-0.5, 0.0)
+    it = Pressed(0.0) if order is OperatorRequest.STOP or count == 1 else Pressed(-0.5, 0.0)
     it.now_s = 50.0 + after_s
     it.switch.press(count)
     assert it.switch.read() is order
@@ -200,7 +205,7 @@ def test_signals_that_are_read_together_are_all_presses() -> None:
         wakeup = signal.set_wakeup_fd(-1)
         signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         os.write(wakeup, bytes([signal.SIGINT] * 3))
-        until(lambda: switch.read() is Operator.STOP)
+        until(lambda: switch.read() is OperatorRequest.STOP)
 
 
 @given(st.lists(st.sampled_from(["land", "read"]), max_size=50))
@@ -208,9 +213,9 @@ def test_landing_is_never_a_stop_and_cutting_is_one_at_once(acts: list[str]) -> 
     it = Pressed()
     for act in acts:
         getattr(it.switch, act)()
-        assert it.at(0.0) <= Operator.LAND
+        assert it.at(0.0) <= OperatorRequest.LAND
     it.switch.cut()
-    assert it.at(0.0) is Operator.STOP
+    assert it.at(0.0) is OperatorRequest.STOP
 
 
 def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
@@ -220,7 +225,7 @@ def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
         it.now_s = 50.0 + STOP_HANG_S
         it.switch.interrupt()  # it may still land, or be stopped
     it = Pressed(0.0, SAME_PRESS_S)
-    assert it.at(1.0) is Operator.STOP
+    assert it.at(1.0) is OperatorRequest.STOP
     it.now_s = 51.0 + STOP_HANG_S
     with pytest.raises(Interrupted, match="the flight did not end after the motors were cut"):
         it.switch.interrupt()

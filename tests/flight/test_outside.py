@@ -18,7 +18,7 @@ from perchctl.flight import GroundCriteria
 from perchctl.flight.criteria import RestCheck, estimate_problem, up_axis_problem
 from perchctl.flight.preflight import refuse_wrong_positions
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.mission import Operator, Outcome
+from perchctl.mission import OperatorRequest, Outcome
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition, PositionSetpoint
@@ -174,7 +174,7 @@ def test_an_occlusion_is_held_and_a_lasting_one_landed(for_s: float, lands: bool
         return bool(first) and first[0] + 1.0 <= t_s < first[0] + 1.0 + for_s
 
     it, _ = rig(hidden=hidden)
-    it.operator = lambda: Operator.LAND if it.link.now_s > 9.0 else Operator.NONE
+    it.operator = lambda: OperatorRequest.LAND if it.link.now_s > 9.0 else OperatorRequest.NONE
     report = it.fly()
     held = [e for e in it.watcher.events if e.kind.value == "hold" and HIDDEN in e.reason]
     assert len(held) == 1

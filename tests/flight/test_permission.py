@@ -9,7 +9,7 @@ import pytest
 from perchctl.errors import Interrupted, SafetyAbort
 from perchctl.flight import fly
 from perchctl.flight.loop import PERMISSION_PERIOD_S
-from perchctl.mission import Operator, Phase
+from perchctl.mission import OperatorRequest, Phase
 from perchctl.vehicle import Idle, Telemetry
 from tests.helpers.loop_rig import Rig, Vehicle
 
@@ -50,7 +50,9 @@ def test_permission_does_not_replace_its_own_checks() -> None:
 
 def test_a_word_while_it_waits_ends_it_on_the_ground() -> None:
     rig = Rig()
-    rig.operator = lambda: Operator.LAND if rig.link.now_s > PATIENCE_S else Operator.NONE
+    rig.operator = lambda: (
+        OperatorRequest.LAND if rig.link.now_s > PATIENCE_S else OperatorRequest.NONE
+    )
     with pytest.raises(Interrupted, match="nothing was started"):
         fly(replace(rig.parts(), may_take_off=lambda waiting: False))
     assert all(isinstance(command, Idle) for _, command in rig.link.sent)

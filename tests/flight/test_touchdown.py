@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import ImuMotion, Observation, Operator, Phase, Touchdown
+from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, Touchdown
 from perchctl.mission.belief.motion import Impact
 from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
 from perchctl.mission.report import HARD_TOUCHDOWN_MPS, find_touchdown
@@ -135,7 +135,7 @@ def test_the_report_has_it_whether_the_planner_or_the_watchdog_brought_it_down(h
     if hung:
         hang_in_the_camera(link, rig.camera, HANG_AT_S, 12.0)
     else:
-        rig.operator = lambda: Operator.LAND if link.now_s > 4.0 else Operator.NONE
+        rig.operator = lambda: OperatorRequest.LAND if link.now_s > 4.0 else OperatorRequest.NONE
     report = rig.fly()
     assert bool(link.own) is hung
     assert report.phase is Phase.LANDED

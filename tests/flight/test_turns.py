@@ -11,7 +11,7 @@ from perchctl.analysis.decide import replay_decisions
 from perchctl.flight import fly
 from perchctl.mission import (
     Observation,
-    Operator,
+    OperatorRequest,
     PlannerState,
     SentCommand,
     Tick,
@@ -48,7 +48,7 @@ class Told(LooksOn):
 
 def flown(rig: Rig, for_s: float = 0.3) -> Told:
     told = Told()
-    rig.operator = lambda: Operator.LAND if rig.link.now_s > for_s else Operator.NONE
+    rig.operator = lambda: OperatorRequest.LAND if rig.link.now_s > for_s else OperatorRequest.NONE
     fly(replace(rig.parts(), watchers=(told,)))
     return told
 

@@ -10,10 +10,10 @@ from functools import partial
 import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
-from perchctl.mission import Observation, Operator, Phase, PlannerState
+from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.update import KEEPALIVE_THRUST
 from perchctl.mission.descent import LANDING_ORDER_PERIOD_S, MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
-from perchctl.mission.release import CATCH_ABOVE_MOTORS_OFF_M, STOP_ORDER_COUNT
+from perchctl.mission.release import CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M, STOP_ORDER_COUNT
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -45,7 +45,7 @@ AT_CEILING = state_with(
     t_s=T_S,
     takeoff_position_m=(0.0, 0.0, 0.0),
     last_contact_body_z_m=CEILING_M,
-    released_s=T_S - 1.0,
+    release_began_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
 IN_AIR = state_with(
@@ -60,7 +60,7 @@ class Rig:
     def __init__(
         self, command: Command = HOVER, state: PlannerState = IN_AIR, z_m: float = 1.0
     ) -> None:
-        self.operator = Operator.NONE
+        self.operator = OperatorRequest.NONE
         self.dog = Watchdog(PROFILE, lambda: self.operator)
         self.z_m = z_m
         self.turn(T_S, command, state)
@@ -86,23 +86,23 @@ class Rig:
 @pytest.mark.parametrize("silent_s", [0.0, 0.02, 0.1, 0.29])
 def test_a_loop_that_lives_or_has_not_begun_is_left_alone(silent_s: float) -> None:
     assert Rig().after(silent_s) is None
-    assert Watchdog(PROFILE, lambda: Operator.NONE).poll(1e6, telemetry(1e6)) is None
+    assert Watchdog(PROFILE, lambda: OperatorRequest.NONE).poll(1e6, telemetry(1e6)) is None
 
 
 ARMED_BITS = ARMED | CAN_FLY
 
 
 @pytest.mark.parametrize(("word", "bits", "sent"), [
-    (Operator.STOP, ARMED_BITS, EmergencyStop()),
-    (Operator.STOP, AIRBORNE, EmergencyStop()),  # the first command may have gone out
-    (Operator.LAND, ARMED_BITS, Arm(False)),
-    (Operator.LAND, ARMED_BITS | FLYING, None),  # in the air disarming would drop it
-    (Operator.LAND, READY, None),
-    (Operator.NONE, ARMED_BITS, None),
+    (OperatorRequest.STOP, ARMED_BITS, EmergencyStop()),
+    (OperatorRequest.STOP, AIRBORNE, EmergencyStop()),  # the first command may have gone out
+    (OperatorRequest.LAND, ARMED_BITS, Arm(False)),
+    (OperatorRequest.LAND, ARMED_BITS | FLYING, None),  # in the air disarming would drop it
+    (OperatorRequest.LAND, READY, None),
+    (OperatorRequest.NONE, ARMED_BITS, None),
 ])  # fmt: skip
 @pytest.mark.parametrize("has_failed", [False, True])
 def test_the_operators_word_counts_before_the_first_tick(
-    word: Operator, bits: int, sent: Command | None, has_failed: bool
+    word: OperatorRequest, bits: int, sent: Command | None, has_failed: bool
 ) -> None:
     dog = Watchdog(PROFILE, lambda: word)
     if has_failed:
@@ -111,7 +111,7 @@ def test_the_operators_word_counts_before_the_first_tick(
 
 
 def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
-    dog = Watchdog(PROFILE, lambda: Operator.STOP)
+    dog = Watchdog(PROFILE, lambda: OperatorRequest.STOP)
     times_s = [T_S + CUT_PERIOD_S * k for k in range(4)]
     bits = [ARMED_BITS, ARMED_BITS, ARMED_BITS, LOCKED]
     sent = [
@@ -126,7 +126,9 @@ def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
 HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
-PRESSING = remembering(AT_CEILING, phase=Phase.PERCH, last_contact_body_z_m=None, released_s=None)
+PRESSING = remembering(
+    AT_CEILING, phase=Phase.PERCH, last_contact_body_z_m=None, release_began_s=None
+)
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
 
@@ -171,7 +173,9 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig.z_m = CEILING_M - 0.05
     rig.after(0.33, **FALLS)
     caught = rig.after(0.35, **FALLS)
-    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_ABOVE_MOTORS_OFF_M, 3.0), 0.0)
+    assert caught == PositionSetpoint(
+        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M, 3.0), 0.0
+    )
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
         assert isinstance(rig.after(0.4 + 0.05 * i, **FALLS), PositionSetpoint)
@@ -227,7 +231,7 @@ def test_from_the_ceiling_it_peels_off_before_it_lands() -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_what_hangs_released_is_not_landed(known: bool) -> None:
     rig = Rig(RELEASED, AT_CEILING, CEILING_M)
-    rig.operator = Operator.LAND
+    rig.operator = OperatorRequest.LAND
     for i in range(200):
         silent_s = 1.1 + 0.05 * i
         command = rig.after(silent_s, thrust=1000.0) if known else rig.poll(silent_s, None)
@@ -236,7 +240,10 @@ def test_what_hangs_released_is_not_landed(known: bool) -> None:
 
 def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
     landing = remembering(
-        IN_AIR, phase=Phase.LANDING, order_count=MIN_LANDING_ORDERS, last_order_s=T_S
+        IN_AIR,
+        phase=Phase.LANDING,
+        stop_or_land_order_count=MIN_LANDING_ORDERS,
+        last_stop_or_land_order_at_s=T_S,
     )
     rig = Rig(Idle(), landing)
     assert rig.after(0.5, supervisor=READY | HL_ACTIVE) is None
@@ -244,7 +251,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
 
 
 def test_only_stops_after_the_motors_were_stopped_for_good() -> None:
-    rig = Rig(StopMotors(), remembering(AT_CEILING, stopped_s=T_S), CEILING_M)
+    rig = Rig(StopMotors(), remembering(AT_CEILING, motor_stop_ordered_s=T_S), CEILING_M)
     sent = [rig.after(s, thrust=0.0) for s in (0.5, 1.1, 9.0)]
     assert all(command in (None, StopMotors()) for command in sent)
 
@@ -263,7 +270,7 @@ def test_a_loop_that_revives_is_believed_and_a_second_silence_begins_anew() -> N
 
 def test_the_operator_lands_a_silent_loop_at_once() -> None:
     rig = Rig()
-    rig.operator = Operator.LAND
+    rig.operator = OperatorRequest.LAND
     assert rig.after(0.2) is None  # the loop's own, if it lives
     assert isinstance(rig.after(0.31), Land)
     assert rig.dog.state is not None
@@ -271,7 +278,7 @@ def test_the_operator_lands_a_silent_loop_at_once() -> None:
 
 def test_the_operators_stop_cuts_while_the_loop_is_silent() -> None:
     rig = Rig()
-    rig.operator = Operator.STOP
+    rig.operator = OperatorRequest.STOP
     assert rig.after(0.02) is None  # the loop's own: its row records it
     assert rig.after(0.15) == EmergencyStop()
 
@@ -280,7 +287,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     """A loop that fell silent as it peeled off in vain, and hangs for ever, would else leave it
     there with turning motors. It stays where it is, and its thrust follows the orders."""
     below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, remembering(AT_CEILING, released_s=None), CEILING_M)
+    rig = Rig(below, remembering(AT_CEILING, release_began_s=None), CEILING_M)
     sent: list[Command] = []
     thrust = 20000.0
     for i in range(395):
@@ -308,14 +315,14 @@ def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -
     else:
         rig.dog.end(motors_off=closing == "motors off")
     assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4
-    rig.operator = Operator.STOP
+    rig.operator = OperatorRequest.STOP
     assert rig.after(0.06) == (None if closing == "motors off" else EmergencyStop())
 
 
 @pytest.mark.parametrize("by_planner", [True, False])
 def test_an_emergency_stop_is_repeated_until_it_is_confirmed(by_planner: bool) -> None:
     rig = Rig(EmergencyStop() if by_planner else HOVER)
-    rig.operator = Operator.STOP
+    rig.operator = OperatorRequest.STOP
     times = [0.2 + 0.05 * i for i in range(20)]
     cuts = [s for s in times if rig.after(s) == EmergencyStop()]
     assert len(cuts) == 10
@@ -328,7 +335,7 @@ def test_an_emergency_stop_is_repeated_until_it_is_confirmed(by_planner: bool) -
 
 def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
     rig = Rig()
-    rig.operator = Operator.STOP
+    rig.operator = OperatorRequest.STOP
     cuts = [rig.poll(0.2 + 0.05 * i, None) for i in range(1000)]
     assert cuts.count(EmergencyStop()) == MAX_CUTS
 
@@ -339,7 +346,7 @@ def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
 class Noting(Watchdog):
     """Notes which fields are written."""
 
-    def __init__(self, operator: Callable[[], Operator]) -> None:
+    def __init__(self, operator: Callable[[], OperatorRequest]) -> None:
         object.__setattr__(self, "written", set())
         super().__init__(PROFILE, operator)
         self.written.clear()
@@ -357,7 +364,7 @@ def test_no_field_is_written_by_both_threads() -> None:
     """They share no lock: what both wrote, one of them could undo."""
     by_loop: set[str] = set()
     by_link: set[str] = set()
-    for order, command in itertools.product(Operator, (HOVER, EmergencyStop())):
+    for order, command in itertools.product(OperatorRequest, (HOVER, EmergencyStop())):
         rig = Rig()
         rig.operator = order
         rig.dog = dog = Noting(partial(getattr, rig, "operator"))
@@ -383,7 +390,7 @@ def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
 ) -> None:
     """No sight comes without the loop, and its own landing would fly by none."""
     profile = Profile.model_validate({"positioning": by})
-    dog = Watchdog(profile, lambda: Operator.NONE, lambda now_s: now_s - T_S + age_s)
+    dog = Watchdog(profile, lambda: OperatorRequest.NONE, lambda now_s: now_s - T_S + age_s)
     obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=age_s)
     dog.tick(T_S + PERIOD_S, remembering(IN_AIR, last_telemetry=obs.telemetry), HOVER, obs)
     for i in range(60):
@@ -397,7 +404,7 @@ def test_what_has_waited_for_the_loop_is_felt_too() -> None:
     profile = Profile.model_validate({"positioning": "target"})
     felt = []
     for waits in (True, False):
-        dog = Watchdog(profile, lambda: Operator.NONE)
+        dog = Watchdog(profile, lambda: OperatorRequest.NONE)
         obs = Observation(T_S, telemetry(T_S, 0.1), position_age_s=0.05)
         low = remembering(IN_AIR, phase=Phase.LANDING, last_telemetry=obs.telemetry)
         dog.tick(T_S + PERIOD_S, low, RawThrust(HOVER_THRUST), obs)

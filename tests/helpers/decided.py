@@ -47,7 +47,7 @@ def decided_here(name: str) -> tuple[bytes, ...]:
                 turn,
                 phase=new.phase,
                 row_name=new.row_name,
-                is_holding_position=bool(new.hold),
+                is_holding_position=bool(new.hold_reason),
                 failed_attempts=new.failed_attempts,
                 command=command,
                 outcome=new.outcome,

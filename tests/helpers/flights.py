@@ -11,7 +11,7 @@ import cv2
 
 from perchctl.flight import fly_lockstep
 from perchctl.flight.lockstep import LockstepFlight
-from perchctl.mission import Event, FlightReport, Operator, Phase, Watcher
+from perchctl.mission import Event, FlightReport, OperatorRequest, Phase, Watcher
 from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
 from perchctl.record.write import Truth
@@ -106,18 +106,18 @@ def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -
 class OperatorAt(Watcher):
     """Gives an operator's command as soon as a phase has been reached."""
 
-    def __init__(self, at: Mapping[Phase, Operator]) -> None:
+    def __init__(self, at: Mapping[Phase, OperatorRequest]) -> None:
         self._at = at
-        self._command = Operator.NONE
+        self._command = OperatorRequest.NONE
 
-    def read(self) -> Operator:
+    def read(self) -> OperatorRequest:
         return self._command
 
     def tick(self, tick: Tick) -> None:
-        self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
+        self._command = max(self._command, self._at.get(tick.state.phase, OperatorRequest.NONE))
 
 
-def ordered(at: Mapping[Phase, Operator]) -> dict[str, Any]:
+def ordered(at: Mapping[Phase, OperatorRequest]) -> dict[str, Any]:
     """What `fly_lockstep` takes for these commands."""
     operator = OperatorAt(at)
     return {"watchers": (operator,), "operator": operator.read}
@@ -125,7 +125,7 @@ def ordered(at: Mapping[Phase, Operator]) -> dict[str, Any]:
 
 def fly_short(
     changes: Mapping[str, Any] | None = None,
-    operator_at: Mapping[Phase, Operator] | None = None,
+    operator_at: Mapping[Phase, OperatorRequest] | None = None,
     *,
     base: str = SHORT,
     seed: int = SEED,

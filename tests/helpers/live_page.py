@@ -34,7 +34,7 @@ def tick(
             synthetic.target(t_s, 1.0), e_m=np.array(e_m), e_yaw_rad=e_yaw_rad, tracked=tracked
         )
     state = state_with(
-        phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, failed_attempts=1,
+        phase=Phase(phase), entered_s=entered_s, reason=reason, hold_reason=hold, failed_attempts=1,
         takeoff_position_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)

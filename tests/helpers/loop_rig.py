@@ -19,7 +19,7 @@ from perchctl.mission import (
     Event,
     FlightReport,
     Observation,
-    Operator,
+    OperatorRequest,
     Phase,
     PlannerState,
     RestReport,
@@ -284,7 +284,7 @@ class Rig:
     clock: Clock | None = None
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
-    operator: Callable[[], Operator] = lambda: Operator.NONE
+    operator: Callable[[], OperatorRequest] = lambda: OperatorRequest.NONE
     positions: PositionStatus | None = None
 
     def parts(self) -> FlightParts:
@@ -306,7 +306,7 @@ class Rig:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last_telemetry": known} | state
-        before = PlannerState.on_ground(Observation(known.t_s, ground), self.profile)
+        before = PlannerState.initial_on_ground(Observation(known.t_s, ground), self.profile)
         before = remembering(before, **told)
         began_s = self.link.now_s
         return rescue(
@@ -330,5 +330,7 @@ def hung_rig(for_s: float) -> tuple[Rig, Guarded]:
     link = Guarded()
     rig = Rig(link)
     hang_in_the_camera(link, rig.camera, HANG_AT_S, for_s)
-    rig.operator = lambda: Operator.LAND if link.now_s > HANG_AT_S + 2.0 + for_s else Operator.NONE
+    rig.operator = lambda: (
+        OperatorRequest.LAND if link.now_s > HANG_AT_S + 2.0 + for_s else OperatorRequest.NONE
+    )
     return rig, link

@@ -216,7 +216,7 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
 
 def state_with(**changes: Any) -> PlannerState:
     """A planner's state with nothing but these fields of it and of its belief."""
-    return remembering(PlannerState.on_ground(observation(0.0, 0.0), PROFILE), **changes)
+    return remembering(PlannerState.initial_on_ground(observation(0.0, 0.0), PROFILE), **changes)
 
 
 def context_at(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> Context:
@@ -238,7 +238,7 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         phase=phase,
         entered_s=t_s,
         t_s=t_s,
-        search_step_s=t_s,
+        search_step_began_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
         last_target_world_m=np.array([0.0, 0.0, CEILING_M]),

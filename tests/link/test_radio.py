@@ -144,10 +144,10 @@ def flown(connected: Flown) -> Iterator[Flown]:
     yield connected
     connected.air.unplugged.clear()
     connected.air.silent.clear()
-    connected.link.set_guard(Operator().guard)
+    connected.link.set_guard(OperatorRequest().guard)
 
 
-class Operator:
+class OperatorRequest:
     """Sends the operator's stop as the link's guard once it was pressed."""
 
     def __init__(self) -> None:
@@ -202,7 +202,7 @@ def test_after_silence_a_landing_and_a_stop_go_out_again(flown: Flown, silent_s:
 
 
 def test_the_operators_stop_goes_out_after_silence_though_the_loop_hangs(flown: Flown) -> None:
-    operator = Operator()
+    operator = OperatorRequest()
     flown.link.set_guard(operator.guard)
     flown.air.silent.set()
     flown.stream(0.2)  # and then nothing of the loop's
@@ -311,7 +311,7 @@ def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
     told: list[SentCommand] = []
-    flown.link.set_guard(Operator().guard, told.append)
+    flown.link.set_guard(OperatorRequest().guard, told.append)
     began_s = time.monotonic()
     flown.link.send(LAND)
     flown.heard_after_s(LAND, began_s)

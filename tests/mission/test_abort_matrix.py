@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
-from perchctl.mission.phase import FLYING_PHASES, Severity
+from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
+from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -59,22 +59,23 @@ STOP, LAND = "stop", "land"
 CAMERA_PHASES = {
     Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER, Phase.HOVER,
 }  # fmt: skip
-PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
-ALL = FLYING_PHASES | {Phase.LANDING}
+PRE_CONTACT_PHASES = PRE_LANDING_PHASES - {Phase.COMPLETE}
+ALL = PRE_LANDING_PHASES | {Phase.LANDING}
 
 # event: (what happens, seconds it lasts, where it counts, how it ends, outcome)
 EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcome]] = {
-    "operator-stop": (_obs(operator_request=Operator.STOP), 0.1, ALL, STOP, Outcome.EMERGENCY),
+    "operator-stop": (_obs(operator_request=OperatorRequest.STOP), 0.1, ALL, STOP,
+        Outcome.EMERGENCY),
     "locked": (_bits(LOCKED), 0.1, ALL, STOP, Outcome.SAFETY),
     "tumbled": (_bits(TUMBLED), 0.1, ALL, STOP, Outcome.SAFETY),
     "crashed": (_bits(CRASHED), 0.1, ALL, STOP, Outcome.SAFETY),
     "tilted": (_tel(roll_rad=1.5), 0.5, ALL, STOP, Outcome.SAFETY),
-    "operator-land": (_obs(operator_request=Operator.LAND), 0.1, FLYING_PHASES, LAND,
-        Outcome.OPERATOR),
-    "link-lost": (_obs(link_problem="gone"), 0.1, FLYING_PHASES, LAND, Outcome.SAFETY),
+    "operator-land": (_obs(operator_request=OperatorRequest.LAND), 0.1, PRE_LANDING_PHASES, LAND,
+        Outcome.ENDED_BY_OPERATOR),
+    "link-lost": (_obs(link_problem="gone"), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
     "telemetry-stale": (
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=9.9)),
-        1.5, FLYING_PHASES, LAND, Outcome.SAFETY,
+        1.5, PRE_LANDING_PHASES, LAND, Outcome.SAFETY,
     ),
     "position-lost": (
         _obs(position_age_s=0.8, position_problem="occluded"), 0.1,
@@ -105,7 +106,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _obs(last_good_frame_age_s=4.0, has_new_frame=False, camera_problem="camera unplugged"),
         0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
-    "loop-late": (_obs(loop_late_s=1.2), 0.1, FLYING_PHASES, LAND, Outcome.SAFETY),
+    "loop-late": (_obs(loop_late_s=1.2), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
     "markers-disagree": (
         _obs(successive_marker_conflicts=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
@@ -230,7 +231,7 @@ def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
         assert before is not None
         assert command.z_m < before.z_m
     else:
-        assert state.hold
+        assert state.hold_reason
         assert state.phase is not phase or command == before
 
 
@@ -268,7 +269,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
-    held = {"last_contact_body_z_m": HANG_Z_M, "released_s": 10.0, **changes}
+    held = {"last_contact_body_z_m": HANG_Z_M, "release_began_s": 10.0, **changes}
     return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 
@@ -341,7 +342,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
     falls = dict(falls)
     z_m, velocity = HANG_Z_M + falls.pop("z_m"), (0.0, 0.0, falls.pop("vz_mps"))
     look = at(z_m, velocity_mps=velocity, **falls)
-    flight = fly(hanging(released_s=released_s), look, ticks * TICK_S)
+    flight = fly(hanging(release_began_s=released_s), look, ticks * TICK_S)
     assert flight.state.phase is Phase.RECOVER
     assert is_setpoint(flight.command, HANG_Z_M + above_m[0], HANG_Z_M + above_m[1])
     if above_m[0] >= 0.0:
@@ -351,12 +352,14 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
 
 
 @pytest.mark.parametrize(
-    "stopped", [{}, {"stopped_s": 9.5, "order_count": 5}], ids=["turns", "stopped"]
+    "stopped",
+    [{}, {"motor_stop_ordered_s": 9.5, "stop_or_land_order_count": 5}],
+    ids=["turns", "stopped"],
 )
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str, Any]) -> None:
     """Released, or with the motors stopped already: they spin again, and then it goes down."""
     falls = at(HANG_Z_M - 0.01, velocity_mps=(0.0, 0.0, -0.3), acc_z_g=0.2, thrust=0.0)
-    flight = fly(hanging(Phase.LANDING, released_s=9.0, **stopped), falls, 0.06)
+    flight = fly(hanging(Phase.LANDING, release_began_s=9.0, **stopped), falls, 0.06)
     state = flight.state
     assert state.phase is Phase.LANDING
     assert is_setpoint(flight.command, above_m=HANG_Z_M + 0.5)
@@ -364,7 +367,7 @@ def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str
         held = at(HANG_Z_M - 0.2)(10.2 + TICK_S * i)
         state, command = planner.step_mission(state, held, PROFILE)
         assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.2 + 1e-9)
-    assert state.stopped_s is None
+    assert state.motor_stop_ordered_s is None
 
 
 def _heard_last(z_m: float, **tel: Any) -> Look:

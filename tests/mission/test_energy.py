@@ -121,7 +121,7 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
         state = remembering(state_in(Phase.ALIGN), battery_fit=moment.energy, hover_thrust=0.0)
-        left_s = compute_battery_outlook(context_at(state, obs, profile)).left_s
+        left_s = compute_battery_outlook(context_at(state, obs, profile)).hover_time_left_s
         assert left_s is not None
         assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
 
@@ -210,7 +210,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
     assert gated or phase is not Phase.ALIGN or state.row_name == "aligned"
     if gated and energy.rest_v is None:
         assert "unknown" in state.reason
-        assert state.battery.left_s is None
+        assert state.battery.hover_time_left_s is None
 
 
 def test_a_reading_that_stands_still_is_none() -> None:
@@ -218,7 +218,7 @@ def test_a_reading_that_stands_still_is_none() -> None:
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
         state = replace(observing(state, later), t_s=later.t_s)
-        assert (compute_battery_outlook(Context(state)).left_s is not None) is known
+        assert (compute_battery_outlook(Context(state)).hover_time_left_s is not None) is known
 
 
 @pytest.mark.parametrize(

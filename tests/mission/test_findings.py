@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import Findings, FlightReport, ImuMotion, Observation, Phase
+from perchctl.mission import CameraFindings, FlightReport, ImuMotion, Observation, Phase
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.phase import Claim
 from perchctl.mission.table import TABLE
@@ -51,12 +51,12 @@ CAMERA = CameraConfig(latency_s=0.06)
 def test_only_what_is_surely_beyond_its_gate_is_an_advice(
     seen: CameraErrors, camera: CameraConfig, words: str
 ) -> None:
-    found = Findings.from_camera_errors(seen, camera)
-    assert found.latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
+    found = CameraFindings.from_camera_errors(seen, camera)
+    assert found.measured_latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
     assert bool(found.advice) is bool(words)
     assert words in "".join(found.advice)
     # The scenario's camera is nobody's: it says nothing of the profile.
-    dreamt = Findings.from_camera_errors(seen, camera, simulated=True)
+    dreamt = CameraFindings.from_camera_errors(seen, camera, simulated=True)
     assert dreamt == replace(found, advice=())
 
 
@@ -69,7 +69,7 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
         if callable(row.reason)
         and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
     }
-    assert blames == {row.name for row in TABLE if Claim.PROFILE_SUSPECT in row.claims}
+    assert blames == {row.name for row in TABLE if Claim.PROFILE_MAY_BE_WRONG in row.claims}
 
 
 @pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED])
@@ -79,14 +79,14 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
     reckoning = DeadReckoning(
         imu=ImuMotion(t_s=BEGIN_S), lateral_offset_m=(0.03, 0.04), lateral_sigma_m=0.01
     )
-    state = remembering(state_in(phase), reckoning=reckoning, contact=None)
+    state = remembering(state_in(phase), reckoning=reckoning, last_contact_offset=None)
     report = FlightReport.from_state(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
-        assert report.contact is None
+        assert report.last_contact_offset is None
         return
-    assert report.contact is not None
-    assert report.contact.lateral_offset_m == pytest.approx(0.05)
-    assert 0.01 <= report.contact.sigma_m < 0.02
+    assert report.last_contact_offset is not None
+    assert report.last_contact_offset.lateral_offset_m == pytest.approx(0.05)
+    assert 0.01 <= report.last_contact_offset.sigma_m < 0.02
 
 
 def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
@@ -100,7 +100,7 @@ def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
         reckoning=reckoning, last_contact_body_z_m=1.9, in_magnet_reach_since_s=BEGIN_S,
-        stopped_s=BEGIN_S,
+        motor_stop_ordered_s=BEGIN_S,
         dead_reckoning_since_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)

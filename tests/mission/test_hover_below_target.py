@@ -93,7 +93,7 @@ def test_a_hover_that_ends_on_the_magnet_is_no_hover(seen: str) -> None:
     """Its exit code says that the vehicle has landed."""
     off = {"thrust": 0.0, "supervisor": READY | (LOCKED if seen == "locked" else 0)}
     state = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stopped_s=BEGIN_S - 1.0,
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), motor_stop_ordered_s=BEGIN_S - 1.0,
         last_contact_body_z_m=HANG_Z_M, outcome=Outcome.HOVERED,
     )  # fmt: skip
     end = fly(state, at(HANG_Z_M, **off), 0.3, HOVERING).state
@@ -156,7 +156,7 @@ def test_each_frame_counts_once_and_the_errors_are_those_of_the_place() -> None:
     assert report.duration_s == pytest.approx(4 * TICK_S)
     assert "RMS error x 30.0, y 0.0, z 40.0 mm, heading 5.7 deg" in report.text
     assert HoverReport.from_state(state, PROFILE) is None
-    assert all(math.isnan(each) for each in HoverErrors().rms)
+    assert all(math.isnan(each) for each in HoverErrors().rms_xyz_yaw)
 
 
 def hovers_at(below_m: float, **safety: float) -> Profile:

@@ -15,7 +15,7 @@ from perchctl.mission import (
     CameraImuMismatch,
     ImuMotion,
     Observation,
-    Operator,
+    OperatorRequest,
     Phase,
     PlannerState,
     RestState,
@@ -31,7 +31,7 @@ from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
 from perchctl.mission.descent import PEEL_TIMEOUT_S
-from perchctl.mission.phase import FLYING_PHASES, Claim
+from perchctl.mission.phase import PRE_LANDING_PHASES, Claim
 from perchctl.mission.table import PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -84,10 +84,14 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
 BEGUN: dict[str, tuple[dict[str, Any], type[Any]]] = {
-    "ordered": ({"order_count": 1, "last_order_s": NOW_S - 1.0}, Land),
-    "released": ({"released_s": NOW_S - 0.5}, RawThrust),
+    "ordered": ({"stop_or_land_order_count": 1, "last_stop_or_land_order_at_s": NOW_S - 1.0}, Land),
+    "released": ({"release_began_s": NOW_S - 0.5}, RawThrust),
     "stopped": (
-        {"stopped_s": NOW_S - 0.2, "order_count": 1, "last_order_s": NOW_S - 0.2},
+        {
+            "motor_stop_ordered_s": NOW_S - 0.2,
+            "stop_or_land_order_count": 1,
+            "last_stop_or_land_order_at_s": NOW_S - 0.2,
+        },
         StopMotors,
     ),
 }
@@ -162,13 +166,13 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     assert is_setpoint(descent.act(context(known, True, since_s=PEEL_TIMEOUT_S - 0.1))[1])
     state, command = descent.act(context(known, True, since_s=PEEL_TIMEOUT_S + 0.1))
     assert isinstance(command, RawThrust)
-    assert state.released_s == NOW_S
+    assert state.release_began_s == NOW_S
     if known == "onboard":
         deaf, command = descent.act(
             context(known, True, since_s=PEEL_TIMEOUT_S + 0.1, tel={"t_s": 8.0})
         )
         assert is_setpoint(command, distance_below_m=HANG_Z_M)
-        assert deaf.released_s is None
+        assert deaf.release_began_s is None
 
 
 # --- What each part of it takes --------------------------------------------------------------
@@ -285,7 +289,9 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
 def test_a_way_down_that_is_spent_ends_without_a_lock(
     known: str, changes: dict[str, Any], spent: bool
 ) -> None:
-    c = context(known, known == "onboard", phase=Phase.ABORTED, claims=Claim.UNCONFIRMED, **changes)
+    c = context(
+        known, known == "onboard", phase=Phase.ABORTED, claims=Claim.LANDING_UNCONFIRMED, **changes
+    )
     _, command = PHASES[Phase.ABORTED].act(c)
     assert isinstance(command, StopMotors if spent else Idle)
 
@@ -435,7 +441,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_HANGING_HEIGHT_M),
-        last_telemetry=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_above_m=1.0,
+        last_telemetry=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_setpoint_above_vehicle_m=1.0,
         since={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
@@ -444,10 +450,10 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     after = observing(state, obs, profile)
     assert after.belief.since[MOTORS_STOPPED] == (later_s if stale else 0.0)
     assert after.belief.since[BATTERY_LOW] == 1.0
-    assert (after.catch_above_m is None) is stale
+    assert (after.catch_setpoint_above_vehicle_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
-    held = remembering(state, catch_above_m=None)
+    held = remembering(state, catch_setpoint_above_vehicle_m=None)
     assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
         assert (after.belief.dead_reckoning_since_s is not None) is stale
@@ -468,7 +474,7 @@ def ended(
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_ordered_s=NOW_S - 1.0,
         in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_s=floor_detected_s,
         reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
@@ -511,7 +517,8 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
         return at(HANG_Z_M, obs=unseen, roll_rad=shakes_rad, **tel)(t_s)
 
     begun = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), order_count=6, last_order_s=BEGIN_S,
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_order_count=6,
+        last_stop_or_land_order_at_s=BEGIN_S,
         in_magnet_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
@@ -552,7 +559,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     new = descent.enter_descent(
         context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
     )
-    assert new.stopped_s == NOW_S
+    assert new.motor_stop_ordered_s == NOW_S
     assert rest.find_rest_state(context_at(new, obs, BY_TARGET)) is RestState.HANGS
 
 
@@ -585,7 +592,7 @@ BIT = st.fixed_dictionaries(
                 {"has_estimate_jumped": True, "heading_jump_rad": 1.5},
                 {"loop_late_s": 1.2},
                 {"link_problem": "gone"},
-                {"operator_request": Operator.LAND},
+                {"operator_request": OperatorRequest.LAND},
             ]
         ),
     }
@@ -595,16 +602,16 @@ REMEMBERED = st.sampled_from(
     [
         {},
         {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0},
-        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0, "released_s": 9.9},
+        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0, "release_began_s": 9.9},
         {
             "last_contact_body_z_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
-            "released_s": 9.0,
-            "stopped_s": 9.8,
-            "order_count": 2,
+            "release_began_s": 9.0,
+            "motor_stop_ordered_s": 9.8,
+            "stop_or_land_order_count": 2,
         },
-        {"catch_above_m": 1.0},
-        {"pressed": True},
+        {"catch_setpoint_above_vehicle_m": 1.0},
+        {"began_pressed": True},
         {"hover_thrust": 0.0},
         {"dead_reckoning_since_s": 9.0, "reckoned_height_m": 1.0},
     ]
@@ -644,7 +651,8 @@ def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
 @settings(max_examples=60)
 @given(
     positioning=st.sampled_from(sorted(PROFILES)),
-    phase=st.sampled_from(sorted(FLYING_PHASES, key=lambda p: p.value)) | st.just(Phase.LANDING),
+    phase=st.sampled_from(sorted(PRE_LANDING_PHASES,
+        key=lambda p: p.value)) | st.just(Phase.LANDING),
     remembered=REMEMBERED, bits=BITS, alone=st.booleans(),
 )  # fmt: skip
 def test_nothing_climbs_but_a_catch_and_severity_only_rises(
@@ -667,7 +675,7 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         floor_m = takeoff_position_m[2] if takeoff_position_m else 0.0
         if (
             isinstance(command, PositionSetpoint)
-            and state.catch_above_m is None
+            and state.catch_setpoint_above_vehicle_m is None
             and before.phase is state.phase
         ):
             assert command.z_m <= max(z_m, floor_m + 0.05) + 1e-9

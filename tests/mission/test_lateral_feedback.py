@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import Observation, Operator, Phase, PlannerState
+from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import HANG_Z_M, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, fly
@@ -83,7 +83,7 @@ def test_a_landing_begins_without_a_step_of_the_setpoint(
 
     def lands(t_s: float) -> Observation:
         obs = stands(t_s)
-        operator = Operator.LAND if t_s > BEGIN_S + 1.5 * TICK_S else Operator.NONE
+        operator = OperatorRequest.LAND if t_s > BEGIN_S + 1.5 * TICK_S else OperatorRequest.NONE
         moves = replace(obs.telemetry, velocity_mps=velocity_mps)
         return replace(obs, telemetry=moves, operator_request=operator)
 

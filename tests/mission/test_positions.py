@@ -67,11 +67,11 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
 
     flight = fly(state_in(phase, z_m=z_m), look, 0.5, MOCAP)
     assert flight.state.phase in (*HELD_PHASES, Phase.PERCH)
-    assert not flight.state.hold
+    assert not flight.state.hold_reason
     held = [tick for tick in flight.ticks if tick.obs.position_age_s > HOLD_S]
     assert len(held) >= 7
     for tick in held:
-        assert HIDDEN in tick.state.hold
+        assert HIDDEN in tick.state.hold_reason
         assert tick.state.setpoint == held[0].state.setpoint
         assert isinstance(tick.command, PositionSetpoint)
 
@@ -120,7 +120,7 @@ def test_an_unsure_estimate_is_held_and_its_variance_named(
     state = state_in(Phase.ALIGN)
     obs = observation(BEGIN_S + TICK_S)
     obs = replace(obs, telemetry=replace(obs.telemetry, **claims))
-    held = step_mission(state, obs, profile)[0].hold
+    held = step_mission(state, obs, profile)[0].hold_reason
     assert (words in held) if words else not held
 
 
@@ -191,7 +191,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
     drift_mps: float,
 ) -> None:
     """To thrust again for a slide of the estimate would take a vehicle off its magnet."""
-    begin = at_the_magnet(released_s=BEGIN_S)
+    begin = at_the_magnet(release_began_s=BEGIN_S)
     flight = fly(begin, Hangs(drift_mps), 12.0, MOCAP, feels=True)
     assert flight.state.phase is Phase.PERCHED
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
@@ -202,7 +202,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
 def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     carries: float, drift_mps: float
 ) -> None:
-    it, begin = Hangs(drift_mps, carries), at_the_magnet(released_s=BEGIN_S)
+    it, begin = Hangs(drift_mps, carries), at_the_magnet(release_began_s=BEGIN_S)
     flight = fly(begin, it, 4.0, MOCAP, feels=True, one_phase=True)
     assert not flight.stops_s
     assert it.fell_s is not None
@@ -211,9 +211,9 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
 
 
 STOPPED: dict[str, Any] = {
-    "stopped_s": BEGIN_S - 1.0,
-    "released_s": BEGIN_S - 3.0,
-    "order_count": 5,
+    "motor_stop_ordered_s": BEGIN_S - 1.0,
+    "release_began_s": BEGIN_S - 3.0,
+    "stop_or_land_order_count": 5,
 }
 
 
@@ -252,8 +252,9 @@ def test_what_nobody_saw_hang_has_not_perched(
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, last_contact_body_z_m=0.6, released_s=9.0,
-        stopped_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
+        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, last_contact_body_z_m=0.6,
+        release_began_s=9.0,
+        motor_stop_ordered_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -475,7 +476,9 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
 ) -> None:
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(
-        state_in(Phase.LANDING), order_count=MIN_LANDING_ORDERS, last_order_s=BEGIN_S
+        state_in(Phase.LANDING),
+        stop_or_land_order_count=MIN_LANDING_ORDERS,
+        last_stop_or_land_order_at_s=BEGIN_S,
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.is_position_diverged is (

@@ -17,13 +17,13 @@ from perchctl.mission import (
     ContactOffset,
     ImuMotion,
     Observation,
-    Operator,
+    OperatorRequest,
     Outcome,
     Phase,
     planner,
 )
 from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
-from perchctl.mission.phase import FLYING_PHASES, Severity
+from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
     ALLOWED_TRANSITIONS,
@@ -147,11 +147,12 @@ OFF = {"thrust": 0.0, "supervisor": READY}
 # row of the table: its case
 CASES: dict[str, Case] = {
     "operator-stop": Case(
-        P.ALIGN, P.ABORTED, seen(operator_request=Operator.STOP), 0.1, O.EMERGENCY, EmergencyStop
+        P.ALIGN, P.ABORTED, seen(operator_request=OperatorRequest.STOP), 0.1, O.EMERGENCY,
+        EmergencyStop
     ),
     "hung-but-locked": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
-        O.PERCHED, state={"stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
+        O.PERCHED, state={"motor_stop_ordered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "locked": Case(P.ALIGN, P.ABORTED, at(supervisor=AIRBORNE | LOCKED), 0.1, O.SAFETY,
@@ -161,8 +162,8 @@ CASES: dict[str, Case] = {
     "crashed": Case(P.ALIGN, P.ABORTED, at(supervisor=AIRBORNE | CRASHED), 0.1, O.SAFETY,
                     StopMotors),
     "tilted": Case(P.ALIGN, P.ABORTED, at(roll_rad=1.5), 0.5, O.SAFETY, EmergencyStop),
-    "operator-land": Case(P.ALIGN, P.LANDING, seen(operator_request=Operator.LAND), 0.1,
-        O.OPERATOR),
+    "operator-land": Case(P.ALIGN, P.LANDING, seen(operator_request=OperatorRequest.LAND), 0.1,
+        O.ENDED_BY_OPERATOR),
     "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), BEGIN_S), 1.5, O.SAFETY),
     "heading-lost": Case(
@@ -217,7 +218,7 @@ CASES: dict[str, Case] = {
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
             "entered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M,
-            "contact": ContactOffset(0.01, 0.05),
+            "last_contact_offset": ContactOffset(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
     ),
@@ -231,7 +232,7 @@ CASES: dict[str, Case] = {
     ),
     "too-weak": Case(
         P.SEARCH, P.LANDING, blind(at(thrust=FULL)), 2.3, O.SAFETY,
-        state={"search_step_s": BEGIN_S + 9.0},
+        state={"search_step_began_s": BEGIN_S + 9.0},
     ),
     "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
     "approach-timeout": Case(
@@ -282,15 +283,18 @@ CASES: dict[str, Case] = {
     ),
     "perched": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
-        state={"stopped_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+        state={"motor_stop_ordered_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M},
+        z_m=CONTACT_Z_M,
     ),
     "fell-unseen": Case(
         P.COMPLETE, P.LANDING, at(0.02, **OFF), 0.3, O.SAFETY,
-        state={"stopped_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+        state={"motor_stop_ordered_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M},
+        z_m=CONTACT_Z_M,
     ),
     "not-stopped": Case(
         P.COMPLETE, P.LANDING, at(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
-        state={"stopped_s": BEGIN_S - 12.0, "order_count": 5, "last_contact_body_z_m": CONTACT_Z_M},
+        state={"motor_stop_ordered_s": BEGIN_S - 12.0, "stop_or_land_order_count": 5,
+            "last_contact_body_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "attempts-used": Case(
@@ -307,30 +311,34 @@ CASES: dict[str, Case] = {
     "hovered": Case(P.HOVER, P.LANDING, seen(), 5.1, O.HOVERED, profile=HOVERING),
     "sunk": Case(P.HOVER, P.ASCEND, seen(0.9), 0.5, profile=HOVERING),
     "hung": Case(
-        P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.OPERATOR,
-        state={"outcome": O.OPERATOR, "stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
+        P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.ENDED_BY_OPERATOR,
+        state={"outcome": O.ENDED_BY_OPERATOR, "motor_stop_ordered_s": BEGIN_S,
+            "last_contact_body_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "landed": Case(
-        P.LANDING, P.LANDED, at(0.02, **OFF), 0.3, O.OPERATOR,
-        state={"outcome": O.OPERATOR, "order_count": 1}, z_m=0.02,
+        P.LANDING, P.LANDED, at(0.02, **OFF), 0.3, O.ENDED_BY_OPERATOR,
+        state={"outcome": O.ENDED_BY_OPERATOR, "stop_or_land_order_count": 1}, z_m=0.02,
     ),
     "held-elsewhere": Case(
         P.LANDING, P.ABORTED, at(CONTACT_Z_M - 0.2, **OFF), 0.3, O.SAFETY,
-        state={"outcome": O.SAFETY, "stopped_s": BEGIN_S, "row": "held", "entered_s": BEGIN_S},
+        state={"outcome": O.SAFETY, "motor_stop_ordered_s": BEGIN_S, "row": "held",
+            "entered_s": BEGIN_S},
         z_m=CONTACT_Z_M - 0.2,
     ),
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
-            "outcome": O.SAFETY, "stopped_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M,
+            "outcome": O.SAFETY, "motor_stop_ordered_s": BEGIN_S,
+            "last_contact_body_z_m": CONTACT_Z_M,
             "in_magnet_reach_since_s": BEGIN_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),
     "landing-timeout": Case(
         P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,
-        state={"entered_s": -40.0, "order_count": 1, "last_order_s": BEGIN_S},
+        state={"entered_s": -40.0, "stop_or_land_order_count": 1,
+            "last_stop_or_land_order_at_s": BEGIN_S},
     ),
 }  # fmt: skip
 
@@ -355,15 +363,15 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     """It hangs, but nobody has seen whether it hangs on the target: its outcome is that of what led
     to the landing."""
     state = remembering(
-        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), stopped_s=BEGIN_S - 1.0,
-        last_contact_body_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
+        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), motor_stop_ordered_s=BEGIN_S - 1.0,
+        last_contact_body_z_m=CONTACT_Z_M, outcome=O.ENDED_BY_OPERATOR,
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
     state, _ = planner.step_mission(state, locked, PROFILE)
     assert (state.phase, state.row_name, state.outcome) == (
         P.PERCHED,
         "hung-but-locked",
-        O.OPERATOR,
+        O.ENDED_BY_OPERATOR,
     )
 
 
@@ -385,12 +393,14 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
 
 # --- severity ------------------------------------------------------------------------------
 
-ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
+ROGUE = Transition(
+    "rogue", PRE_LANDING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again"
+)
 
 
 def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
-    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, order_count=1)
+    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, stop_or_land_order_count=1)
     context = context_at(landing, observation(BEGIN_S), PROFILE)
     assert first_transition(context, (ROGUE,)) is None
     flying = context_at(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
@@ -411,7 +421,7 @@ def test_a_row_of_your_own_comes_after_every_safety_row() -> None:
     assert names == ["too-weak", "mine", "back", "approached"]
     assert tuple(row for row in table if row.name not in ("mine", "back")) == TABLE
     assert table[at].outcome is Outcome.SAFETY
-    stopped = replace(observation(BEGIN_S), operator_request=Operator.LAND)
+    stopped = replace(observation(BEGIN_S), operator_request=OperatorRequest.LAND)
     for obs, name in ((observation(BEGIN_S), "mine"), (stopped, "operator-land")):
         row = first_transition(context_at(state_in(P.ALIGN), obs, PROFILE), table)
         assert row is not None
@@ -429,14 +439,15 @@ def test_no_row_of_your_own_may_climb_stop_or_prove() -> None:
     assert {to for _, to, _ in ALLOWED_TRANSITIONS} == {P.SEARCH, P.ALIGN, P.RECOVER, P.LANDING}
     assert all(how >= Severity.HOLD for *_, how in ALLOWED_TRANSITIONS)
     assert [at for at, to, _ in ALLOWED_TRANSITIONS if at is to] == [P.ALIGN]  # where it waits
-    assert {at for at, _, _ in ALLOWED_TRANSITIONS} == FLYING_PHASES - {P.COMPLETE}
+    assert {at for at, _, _ in ALLOWED_TRANSITIONS} == PRE_LANDING_PHASES - {P.COMPLETE}
 
 
 @pytest.mark.parametrize("change", [
     {"to": P.PERCH}, {"to": P.ASCEND}, {"to": P.PERCHED}, {"to": P.ABORTED}, {"to": P.SEARCH},
     {"severity": Severity.CONTINUE}, {"severity": Severity.STOP}, {"phases": {P.COMPLETE}},
     {"phases": {P.LANDING}}, {"stop": StopMotors()}, {"outcome": Outcome.PERCHED},
-    {"outcome": Outcome.OPERATOR}, {"phases": set()}, {"phases": iter([P.ALIGN])}, {"reason": None},
+    {"outcome": Outcome.ENDED_BY_OPERATOR}, {"phases": set()}, {"phases": iter([P.ALIGN])},
+    {"reason": None},
     {"name": "fence"}, {"phases": {"ALIGN"}}, {"phases": P.ALIGN}, {"to": "LANDING"},
     {"severity": 3}, {"when": True},
 ])  # fmt: skip
@@ -460,17 +471,17 @@ def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     state = waiting = remembering(state_in(P.ALIGN), since={ALIGNED: 10.0})
     for t_s in range(11, 50):
         waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
-    assert (waiting.phase, waiting.pause_reason, waiting.hold) == (P.ALIGN, "mine", "")
+    assert (waiting.phase, waiting.pause_reason, waiting.hold_reason) == (P.ALIGN, "mine", "")
     assert isinstance(command, PositionSetpoint)
-    assert waiting.waited_s == 39.0 > PROFILE.planner.align.timeout_s
+    assert waiting.waited_in_phase_s == 39.0 > PROFILE.planner.align.timeout_s
     after, _ = planner.step_mission(waiting, observation(50.0), PROFILE, table)
     assert (after.phase, after.pause_reason) == (P.ALIGN, "")  # it has yet to stay aligned
     for tick in range(1, 25):
         after, _ = planner.step_mission(after, observation(50.0 + TICK_S * tick), PROFILE, table)
-    assert (after.phase, after.pause_reason, after.waited_s) == (P.ASCEND, "", 0.0)
+    assert (after.phase, after.pause_reason, after.waited_in_phase_s) == (P.ASCEND, "", 0.0)
     lost = observation(11.0, target=None)
     assert planner.step_mission(state, lost, PROFILE, table)[0].phase is P.SEARCH
-    stopped = observation(11.0, operator_request=Operator.LAND)
+    stopped = observation(11.0, operator_request=OperatorRequest.LAND)
     assert planner.step_mission(state, stopped, PROFILE, table)[0].phase is P.LANDING
 
 

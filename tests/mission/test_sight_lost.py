@@ -13,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
+from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.belief import GUST_SPEED_THRESHOLD_MPS, MAX_FUSED_POSITION_EXTRA_AGE_S
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import (
@@ -23,7 +23,7 @@ from perchctl.mission.level_descent import (
 )
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import MAX_BRAKED_SPEED_MPS, ONBOARD_POSITION_GAIN_PER_S
+from perchctl.mission.release import MAX_SPEED_USED_FOR_BRAKING_MPS, ONBOARD_POSITION_GAIN_PER_S
 from perchctl.mission.setpoints import MIN_HOLD_HEIGHT_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
@@ -86,7 +86,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
             assert isinstance(tick.command, PositionSetpoint)
             assert tick.state.setpoint is not None
             heights.append(tick.state.setpoint.z_m)
-            assert unseen_s <= HOLD_S + TICK_S + 1e-6 or "not seen" in tick.state.hold
+            assert unseen_s <= HOLD_S + TICK_S + 1e-6 or "not seen" in tick.state.hold_reason
         elif unseen_s > LAND_S + TICK_S + 1e-6:
             assert tick.state.phase is Phase.LANDING
             assert isinstance(tick.command, RawThrust)
@@ -114,7 +114,7 @@ def test_what_sightings_contradict_is_not_flown_by(
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
-    state = remembering(state_in(phase, z_m=z_m), searched_positions=2, search_step_s=0.0)
+    state = remembering(state_in(phase, z_m=z_m), searched_positions=2, search_step_began_s=0.0)
     after = fly(state, unseen(z_m, for_s=max(age_s, HOLD_S + 0.01)), profile=PROFILE).state
     assert after.setpoint is None or after.setpoint.z_m <= z_m
 
@@ -194,7 +194,7 @@ def test_pictures_that_come_late_are_no_blow(later_s: float, lost: int) -> None:
 
 
 def test_a_landing_that_loses_it_goes_on_blindly() -> None:
-    ordered = at(obs={"operator_request": Operator.LAND})
+    ordered = at(obs={"operator_request": OperatorRequest.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
     assert state.phase is Phase.LANDING
     assert state.belief.dead_reckoning_since_s is None
@@ -211,7 +211,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     assume(abs(unknown_mps - GUST_SPEED_THRESHOLD_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.9), last_contact_body_z_m=1.9, released_s=BEGIN_S - 1.0,
+        state_in(Phase.LANDING, z_m=1.9), last_contact_body_z_m=1.9, release_began_s=BEGIN_S - 1.0,
         in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
         reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5), lateral_gain_of_imu_only_mps=(x_mps, y_mps)
@@ -224,7 +224,9 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     assert isinstance(command, PositionSetpoint)
     if unknown_mps > GUST_SPEED_THRESHOLD_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
-            braked_mps = max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps))
+            braked_mps = max(
+                -MAX_SPEED_USED_FOR_BRAKING_MPS, min(MAX_SPEED_USED_FOR_BRAKING_MPS, mps)
+            )
             assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)
     else:
         assert (command.x_m, command.y_m) == (0.0, 0.0)

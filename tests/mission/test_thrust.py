@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
+from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
 from perchctl.mission.belief.contact import MAGNET_HOLDS, SATURATED_THRUST
-from perchctl.mission.phase import FLYING_PHASES
+from perchctl.mission.phase import PRE_LANDING_PHASES
 from perchctl.mission.setpoints import GROUND_CLEARANCE_M, limit_setpoint
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
@@ -147,7 +147,7 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
     """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
     state = remembering(
         state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_thrust_order=raw_thrust_order,
-        released_s=9.5,
+        release_began_s=9.5,
         setpoint=None if raw_thrust_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
     for t_s in times(0.38):
@@ -176,11 +176,11 @@ def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     t_s = 10.1 + PROFILE.planner.perch.timeout_s
     saturated = {SATURATED_THRUST: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
-    state = remembering(above, since=saturated, catch_above_m=None)
+    state = remembering(above, since=saturated, catch_setpoint_above_vehicle_m=None)
     for _ in range(2):
         state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)
         assert state.phase is Phase.RECOVER  # and full thrust is no sign of a heavy vehicle
-        assert state.hold
+        assert state.hold_reason
         assert isinstance(command, PositionSetpoint)
         assert command.z_m < CONTACT_Z_M - 0.5
         t_s += 0.3
@@ -193,7 +193,7 @@ GROUND_Z_M = 0.4
 """A table, in a world whose zero is the floor."""
 
 
-@given(st.floats(-5, 5), st.sampled_from(sorted(FLYING_PHASES | {Phase.LANDING}, key=str)))
+@given(st.floats(-5, 5), st.sampled_from(sorted(PRE_LANDING_PHASES | {Phase.LANDING}, key=str)))
 def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = remembering(state_in(phase), takeoff_position_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
@@ -232,8 +232,8 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
 def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     """The lowest setpoint of a landing still leads below where it is handed over."""
     profile = changed({"planner.landing.handover_m": handover_m})
-    it = Follows(0.1, operator_request=Operator.LAND)
+    it = Follows(0.1, operator_request=OperatorRequest.LAND)
     flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
     ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
-    assert flight.ticks[ordered].state.order_count == 1
+    assert flight.ticks[ordered].state.stop_or_land_order_count == 1
     assert GROUND_CLEARANCE_M <= it.sent_m[ordered] < handover_m

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import CONTACT
 from perchctl.mission.descent import (
-    MAX_HEIGHT_DRIFT_M,
+    MAX_HEIGHT_ESTIMATE_DRIFT_M,
     ONBOARD_LANDING_MARGIN_S,
     ONBOARD_LANDING_MEAN_MPS,
     make_onboard_landing,
 )
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import UNCONFIRMED_THRUST_EXTRA_S
+from perchctl.mission.release import EXTRA_HANG_IF_THRUST_UNCONFIRMED_S
 from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
@@ -78,11 +78,11 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
 @pytest.mark.parametrize("phase", [Phase.LANDING, Phase.RECOVER])
 def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
     """The integrators that a second of full thrust has wound up hold it there for seconds."""
-    pressing = fly(landing(1.0, phase, pressed=True), at(1.0, thrust=65535.0))
+    pressing = fly(landing(1.0, phase, began_pressed=True), at(1.0, thrust=65535.0))
     assert is_setpoint(pressing.command, distance_below_m=0.2)
     away = at(0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
     state, command = step_mission(pressing.state, away(10.5), PROFILE)
-    assert not state.pressed
+    assert not state.began_pressed
     assert is_setpoint(command, above_m=0.4)
 
 
@@ -102,8 +102,8 @@ BITS = st.tuples(
 STATES: tuple[dict[str, Any], ...] = (
     {},
     {"last_contact_body_z_m": HANG_Z_M},
-    {"last_contact_body_z_m": HANG_Z_M, "released_s": 9.9},
-    {"order_count": 2, "last_order_s": 9.9},
+    {"last_contact_body_z_m": HANG_Z_M, "release_began_s": 9.9},
+    {"stop_or_land_order_count": 2, "last_stop_or_land_order_at_s": 9.9},
     {"hover_thrust": 0.0},
 )
 
@@ -139,7 +139,10 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     """The whole weight for as long as it takes, where the target is or the contact was; longer
     where the thrust that is read does not follow what is ordered."""
     hang_s = PROFILE.planner.complete.hang_s
-    recent, longer = _was_fresh(seen, hang_s), _was_fresh(seen, hang_s + UNCONFIRMED_THRUST_EXTRA_S)
+    recent, longer = (
+        _was_fresh(seen, hang_s),
+        _was_fresh(seen, hang_s + EXTRA_HANG_IF_THRUST_UNCONFIRMED_S),
+    )
     if longer is not None and all(_at_rest(o) for o in longer):
         return True
     return recent is not None and all(_at_rest(o) and o.telemetry.thrust <= 5000.0 for o in recent)
@@ -175,7 +178,7 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
                 floor = on_the_floor(
                     seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
                 )
-                assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
+                assert floor or ((begin or state.release_began_s) and on_the_ceiling(seen))
                 return
             if state.phase is not Phase.LANDING:
                 return
@@ -210,7 +213,7 @@ def test_motors_that_are_off_despite_an_order_are_stopped_before_the_flight_ends
     """The supervisor ends a flight whose motors idle, and soon lets them turn by the last order
     again: seed 20731163 ended with raw thrust as its last order, and a motor turned 5 s later."""
     idles = at(z_m, acc_z_g=1.15, **OFF)
-    ticks = fly(hanging(raw_thrust_order=1000, released_s=BEGIN_S), idles, 3.0).ticks
+    ticks = fly(hanging(raw_thrust_order=1000, release_began_s=BEGIN_S), idles, 3.0).ticks
     assert ticks[-1].state.phase is ends
     orders = [tick.command for tick in ticks if not isinstance(tick.command, Idle)]
     assert isinstance(orders[-1], StopMotors)
@@ -242,7 +245,7 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
     """Its own landing ended up there, motors off."""
     z_m = HANG_Z_M - distance_below_m
     target = target_at(BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
-    begin = landing(z_m, order_count=3, last_order_s=9.9)
+    begin = landing(z_m, stop_or_land_order_count=3, last_stop_or_land_order_at_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
     assert state.phase is ends
     assert words in state.reason
@@ -382,8 +385,10 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
     assert {"beside-the-magnet", row} <= flight.rows
     assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
     if ends is Phase.PERCHED:
-        assert flight.state.belief.contact is not None
-        assert flight.state.belief.contact.lateral_offset_m == pytest.approx(lateral_offset_m)
+        assert flight.state.belief.last_contact_offset is not None
+        assert flight.state.belief.last_contact_offset.lateral_offset_m == pytest.approx(
+            lateral_offset_m
+        )
 
 
 # --- Where it touched, as it is remembered -------------------------------------------------------
@@ -402,14 +407,14 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_steady_since_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
-    assert (after.belief.contact is not None) is touched
+    assert (after.belief.last_contact_offset is not None) is touched
 
 
 def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_recovered() -> None:
     """Steady because it sticks there, the next attempt would begin pressed."""
-    touched = hanging(Phase.RECOVER, contact=ContactOffset(0.01, 0.02))
+    touched = hanging(Phase.RECOVER, last_contact_offset=ContactOffset(0.01, 0.02))
     state = fly(touched, at(HANG_Z_M - 0.1)).state
-    assert (state.belief.last_contact_body_z_m, state.belief.contact) == (None, None)
+    assert (state.belief.last_contact_body_z_m, state.belief.last_contact_offset) == (None, None)
     assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
@@ -428,12 +433,12 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
     on the floor before the link counts as lost. Seen again, it begins anew."""
     look = at(HANG_Z_M, thrust=1000.0)
-    half_way = hanging(Phase.COMPLETE, entered_s=8.0, released_s=9.5, t_s=9.98)
+    half_way = hanging(Phase.COMPLETE, entered_s=8.0, release_began_s=9.5, t_s=9.98)
     state, command = step_mission(half_way, look(10.0), PROFILE)
     assert isinstance(command, RawThrust)
     state, command = step_mission(state, replace(look(10.0), t_s=10.2), PROFILE)
     assert is_setpoint(command, above_m=HANG_Z_M)
-    assert state.released_s is None
+    assert state.release_began_s is None
     for i in range(12):
         seen_again = at(HANG_Z_M, thrust=20000.0)(10.22 + TICK_S * i)
         state, command = step_mission(state, seen_again, PROFILE)
@@ -458,10 +463,10 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     stopped = hanging(
         Phase.COMPLETE,
         in_magnet_reach_since_s=9.0,
-        released_s=9.0,
-        stopped_s=10.0,
-        last_order_s=10.0,
-        order_count=1,
+        release_began_s=9.0,
+        motor_stop_ordered_s=10.0,
+        last_stop_or_land_order_at_s=10.0,
+        stop_or_land_order_count=1,
     )
     flight = fly(stopped, at(HANG_Z_M, **frozen), 50.0, PROFILES[positioning], feels=True)
     assert all(isinstance(command, StopMotors | Idle) for command in flight.commands)
@@ -482,7 +487,8 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     """Locked by a lost notify while it slips: it is not reported as perched."""
     locked = {**OFF, "supervisor": READY | LOCKED, "velocity_mps": (0.0, 0.0, -0.9)}
     flight = fly(
-        hanging(Phase.COMPLETE, stopped_s=9.0, order_count=5), at(HANG_Z_M - 0.05, **locked)
+        hanging(Phase.COMPLETE, motor_stop_ordered_s=9.0, stop_or_land_order_count=5),
+        at(HANG_Z_M - 0.05, **locked),
     )
     assert flight.state.phase is not Phase.PERCHED
 
@@ -490,7 +496,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
 def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
-    slipped = landing(HANG_Z_M, Phase.RECOVER, catch_above_m=1.0, setpoint=below)
+    slipped = landing(HANG_Z_M, Phase.RECOVER, catch_setpoint_above_vehicle_m=1.0, setpoint=below)
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
     assert is_setpoint(command, distance_below_m=HANG_Z_M + 0.1)
@@ -521,7 +527,10 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     """By the line in the world that was it would dive by the step."""
     lands = AIRBORNE | HL_ACTIVE
     state = landing(
-        0.4, order_count=3, last_order_s=9.0, last_telemetry=telemetry(9.98, 0.4, supervisor=lands)
+        0.4,
+        stop_or_land_order_count=3,
+        last_stop_or_land_order_at_s=9.0,
+        last_telemetry=telemetry(9.98, 0.4, supervisor=lands),
     )
     up = at(0.9, obs={"has_estimate_jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
     state, command = step_mission(state, up(10.0), PROFILE)
@@ -543,10 +552,10 @@ def cut(z_m: float, climb_mps: float, **obs: Any) -> Look:
 
 OVERDUE = landing(3.0, entered_s=10.0 - 0.6 * PROFILE.planner.landing.timeout_s)
 ORDERED, LOW = (
-    landing(1.5, order_count=1, last_order_s=9.5),
-    landing(1.5, order_count=3, last_order_s=5.0),
+    landing(1.5, stop_or_land_order_count=1, last_stop_or_land_order_at_s=9.5),
+    landing(1.5, stop_or_land_order_count=3, last_stop_or_land_order_at_s=5.0),
 )
-HIGH = landing(1.8, order_count=3, last_order_s=5.0)
+HIGH = landing(1.8, stop_or_land_order_count=3, last_stop_or_land_order_at_s=5.0)
 
 
 @pytest.mark.parametrize(
@@ -584,7 +593,7 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
     order = make_onboard_landing(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MAX_HEIGHT_DRIFT_M, config.drift_mps * flown_s)
+    drift_m = min(MAX_HEIGHT_ESTIMATE_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
     assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_MARGIN_S) == pytest.approx(

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import ImuMotion, Observation, Operator, Phase
+from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase
 from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
 from perchctl.mission.phases.recover import STEADY
-from perchctl.mission.setpoints import MAX_IN_PLACE_SPEED_MPS, MAX_INTEGRAL_M
+from perchctl.mission.setpoints import MAX_IN_PLACE_SPEED_MPS, MAX_LATERAL_INTEGRAL_M
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import BY_TARGET, MOCAP, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Look, at, fly
@@ -76,10 +76,10 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
 ) -> None:
     """The setpoint goes on to the other side of the target until the vehicle follows."""
     flight = fly(state_in(Phase.ALIGN), blown(lateral_offset_m, 0.0, towards_rad), 1.5, MOCAP)
-    x_m, y_m = flight.state.integral_m
+    x_m, y_m = flight.state.lateral_integral_m
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
-    assert along_m == pytest.approx(-min(gain * lateral_offset_m, MAX_INTEGRAL_M), rel=0.1)
+    assert along_m == pytest.approx(-min(gain * lateral_offset_m, MAX_LATERAL_INTEGRAL_M), rel=0.1)
 
 
 @BRIEFLY
@@ -87,7 +87,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
 def test_an_offset_on_the_way_is_not_trimmed(flown_mps: float) -> None:
     flight = fly(state_in(Phase.ALIGN), blown(0.3, 0.0, 0.0, flown_mps), 0.4, MOCAP)
     assert flight.state.phase is Phase.ALIGN
-    assert flight.state.integral_m == (0.0, 0.0)
+    assert flight.state.lateral_integral_m == (0.0, 0.0)
 
 
 @BRIEFLY
@@ -100,7 +100,7 @@ def test_what_holds_it_in_the_wind_goes_down_with_it(
     look, lands_s = blown(lateral_offset_m, 0.0, towards_rad), BEGIN_S + 0.5
 
     def lands(t_s: float) -> Observation:
-        operator = Operator.LAND if t_s > lands_s else Operator.NONE
+        operator = OperatorRequest.LAND if t_s > lands_s else OperatorRequest.NONE
         return replace(look(t_s), operator_request=operator)
 
     flight = fly(state_in(Phase.ALIGN), lands, 0.6, MOCAP)

@@ -233,7 +233,7 @@ def test_closing_does_not_wait_for_ever(hung: tuple[LogWatcher, Disk]) -> None:
     [
         (Outcome.PERCHED, False, 0),
         (Outcome.PERCHED, True, LogIncomplete.exit_code),
-        (Outcome.OPERATOR, True, 130),
+        (Outcome.ENDED_BY_OPERATOR, True, 130),
     ],
 )
 def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(

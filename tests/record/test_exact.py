@@ -18,7 +18,7 @@ from perchctl.mission import (
     ExternalPositions,
     FrameRecord,
     Observation,
-    Operator,
+    OperatorRequest,
     Outcome,
     Phase,
     SentCommand,
@@ -69,9 +69,9 @@ def comes_back(kind: Any, value: Any) -> bool:
     return bool(bits(from_exact_json(kind, json.loads(text))) == bits(value))
 
 
-@given(vectors, vectors, st.none() | vectors, floats, st.sampled_from(Operator))
+@given(vectors, vectors, st.none() | vectors, floats, st.sampled_from(OperatorRequest))
 def test_an_observation_comes_back(
-    place: Any, e_m: Any, world_m: Any, number: float, operator: Operator
+    place: Any, e_m: Any, world_m: Any, number: float, operator: OperatorRequest
 ) -> None:
     telemetry = Telemetry(
         number, place, place, number, -0.0, 5e-324, 1e308, 0.1 + 0.2, math.inf, 542,

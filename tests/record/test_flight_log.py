@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from perchctl.mission import (
+    CameraFindings,
     Event,
     EventKind,
     ExternalPositions,
-    Findings,
     FlightReport,
     Outcome,
     Phase,
@@ -99,7 +99,9 @@ def test_every_field_is_filled_by_something() -> None:
     frame.poses["joint"] = frame.poses["large"]
     frame = replace(frame, lock_note="not the tracked target")
     battery = BatteryOutlook(60.0, 3, 12.5, 3.9)
-    state = state_with(phase=Phase.ALIGN, reason="steady", hold="no picture", battery=battery)
+    state = state_with(
+        phase=Phase.ALIGN, reason="steady", hold_reason="no picture", battery=battery
+    )
     place = ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0))
     seen: set[str] = set()
     for command, name in (
@@ -140,9 +142,9 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     """As it ends, and as its log is read: the simulated camera is the scenario's."""
     landing = Event(
         1.0, EventKind.PHASE, "the camera seems to be rotated", Phase.LANDING, "mounting",
-        claims=Claim.PROFILE_SUSPECT,
+        claims=Claim.PROFILE_MAY_BE_WRONG,
     )  # fmt: skip
-    found = Findings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
+    found = CameraFindings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(uri=uri))
     log.event(landing)
     ended = log.close(

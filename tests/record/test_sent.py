@@ -10,7 +10,7 @@ from perchctl.analysis import FlightAnalysis, show_record, show_text
 from perchctl.analysis.story import tell_story
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
-from perchctl.mission import Operator, SentCommand
+from perchctl.mission import OperatorRequest, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
@@ -77,7 +77,9 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
 def test_a_rescue_s_orders_are_told() -> None:
     link, told = Vehicle(), []
     flown = History((telemetry(0.0, 1.0),))
-    rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, on_sent=told.append)
+    rescue(
+        link, Clock(link), PROFILE, lambda: OperatorRequest.NONE, None, flown, on_sent=told.append
+    )
     assert told
     assert [(each.t_s, each.command) for each in told] == link.sent
     assert {each.sender for each in told} == {"rescue"}

@@ -16,7 +16,7 @@ from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import Picture
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly
-from perchctl.mission import Operator, Phase, Tick
+from perchctl.mission import OperatorRequest, Phase, Tick
 from perchctl.perception import perception
 from perchctl.profile import apply_settings
 from perchctl.record import FlightLog, LogWatcher, read_log
@@ -44,13 +44,13 @@ class Kept:
 
 def flown(folder: Path, rig: Rig) -> tuple[FlightLog, list[Picture]]:
     """A flight on a scripted vehicle, ended by the operator while it approaches."""
-    kept, pressed = Kept(), [Operator.NONE]
+    kept, pressed = Kept(), [OperatorRequest.NONE]
     rig.camera.alter = kept.keep
     rig.operator = lambda: pressed[0]
 
     def press(tick: Tick) -> None:
         if tick.t_s > 0.3 and tick.state.phase is Phase.APPROACH:
-            pressed[0] = Operator.LAND
+            pressed[0] = OperatorRequest.LAND
 
     rig.watcher.on_tick = press
     header = make_header(PROFILE, uri="sim://", source="sim:", lockstep=True)

@@ -101,7 +101,7 @@ class Belief:
     #: low-passed `lean`, with the time constant `LEAN_TIME_CONSTANT_S`
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
     last_contact_body_z_m: float | None = None  #: height of the body where the magnet may hold it
-    contact: ContactOffset | None = None  #: offset at the last contact
+    last_contact_offset: ContactOffset | None = None  #: offset at the last contact
     #: time since which the gear is within the magnet's reach
     in_magnet_reach_since_s: float | None = None
     #: start time of each true condition
@@ -118,7 +118,7 @@ class Belief:
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
     @classmethod
-    def on_ground(cls, obs: Observation, profile: Profile) -> Belief:
+    def initial_on_ground(cls, obs: Observation, profile: Profile) -> Belief:
         """Return the belief about a vehicle that stands at its take-off position."""
         return cls(
             obs=obs, profile=profile, t_s=obs.t_s, takeoff_position_m=obs.telemetry.position_m

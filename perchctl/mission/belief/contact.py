@@ -131,14 +131,14 @@ def current_gear_offset(b: Belief) -> ContactOffset:
 def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
     """Return the `current_gear_offset` of the last touch, during a retreat only. None with a fresh
     sighting, or once motion capture shows that the vehicle has left the position of that touch."""
-    if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
+    if not b.sent.maneuver.retreats or b.last_contact_offset is None or b.target.is_fresh:
         return None
     x_m, y_m, _ = b.telemetry.position_m
     away_m = math.hypot(x_m - b.sent.maneuver_start_m[0], y_m - b.sent.maneuver_start_m[1])
     by_capture = b.profile.positioning.source.is_mocap and b.is_position_valid
     if by_capture and away_m > b.profile.planner.perch.contact_xy_m:
         return None
-    return b.contact
+    return b.last_contact_offset
 
 
 def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
@@ -286,7 +286,7 @@ def _is_magnet_holding(b: Belief) -> bool:
 def _is_weight_hanging(b: Belief) -> bool:
     """True if the motors stand still and the vehicle hangs where it made contact."""
     return (
-        b.sent.released_s is not None
+        b.sent.release_began_s is not None
         and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
         and is_still(b)
         and not is_slipping(b)
@@ -317,8 +317,11 @@ def _is_hanging(b: Belief) -> bool:
 
 def _are_motors_off(b: Belief) -> bool:
     """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
-    stopped_s = b.sent.stopped_s
-    long_off = stopped_s is not None and b.obs.t_s - stopped_s > MOTORS_OFF_AFTER_STOP_ORDER_S
+    motor_stop_ordered_s = b.sent.motor_stop_ordered_s
+    long_off = (
+        motor_stop_ordered_s is not None
+        and b.obs.t_s - motor_stop_ordered_s > MOTORS_OFF_AFTER_STOP_ORDER_S
+    )
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
 
@@ -500,7 +503,7 @@ def has_slipped(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: after a dwell time, or at once in free
     fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
-    falls = b.sent.released_s is not None and tel.acc_z_g < complete.slip_acc_g
+    falls = b.sent.release_began_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and b.is_imu_fresh and b.climb_mps < RELEASED_FALL_MPS:
         return True
     return b.held_s(SLIPPING) >= complete.slip_dwell_s

@@ -59,8 +59,8 @@ class SentOrders:
     maneuver_start_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
     raw_thrust: int | None = None  # last order; None in position mode
-    released_s: float | None = None  # start of the release by raw thrust
-    stopped_s: float | None = None  # first order to stop the motors
+    release_began_s: float | None = None  # start of the release by raw thrust
+    motor_stop_ordered_s: float | None = None  # first order to stop the motors
     # time at which a descent by raw thrust detected the floor
     floor_detected_s: float | None = None
 
@@ -72,7 +72,7 @@ class SentOrders:
     @property
     def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.released_s is None and self.stopped_s is None
+        return self.release_began_s is None and self.motor_stop_ordered_s is None
 
     def with_frame_shift(
         self, shifted_setpoint: PositionSetpoint | None, by_m: Vector

@@ -98,7 +98,7 @@ ALIGN = PhaseDefinition(
         back_off_row(
             "align-timeout",
             {Phase.ALIGN},
-            lambda c: c.in_phase_s - c.state.waited_s > c.planner.align.timeout_s,
+            lambda c: c.in_phase_s - c.state.waited_in_phase_s > c.planner.align.timeout_s,
             "the alignment took too long",
         ),
         land_row(

@@ -11,13 +11,13 @@ from perchctl.mission.setpoints import Action, fly_to, step_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_HEIGHT_CONTROL_M = 0.1
+MIN_CONTROLLED_HEIGHT_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
 stands jumps up."""
-APPROACH_HEIGHT_FRACTION = 0.7
+LATERAL_APPROACH_HEIGHT_FRACTION = 0.7
 """Share of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
-REACHED_HEIGHT_FRACTION = 0.8
+REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8
 """Share of the take-off height that counts as reached."""
 MAX_TAKEOFF_END_SPEED_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
@@ -27,7 +27,7 @@ TAKEOFF_END_DWELL_S = 0.3
 AT_TAKEOFF_HEIGHT = Condition[Context](
     "at take-off height",
     lambda c: (
-        c.belief.height_m >= REACHED_HEIGHT_FRACTION * c.planner.takeoff_height_m
+        c.belief.height_m >= REACHED_TAKEOFF_HEIGHT_FRACTION * c.planner.takeoff_height_m
         and c.belief.speed_mps <= MAX_TAKEOFF_END_SPEED_MPS
         and c.state.setpoint is not None
     ),
@@ -43,12 +43,12 @@ def act(c: Context) -> Action:
     start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
     if (
         planner.approach_xy_m is not None
-        and b.height_m > APPROACH_HEIGHT_FRACTION * planner.takeoff_height_m
+        and b.height_m > LATERAL_APPROACH_HEIGHT_FRACTION * planner.takeoff_height_m
     ):
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
     setpoint = step_towards(c, start, goal, up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, lift=b.height_m > MIN_HEIGHT_CONTROL_M)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_CONTROLLED_HEIGHT_M)
 
 
 APPROACH = PhaseDefinition(

@@ -20,7 +20,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
-CLIMB_CONE_FRACTION = 0.7
+CLIMB_ALLOWED_CONE_FRACTION = 0.7
 """Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
 returns to ALIGN."""
 MAX_SETPOINT_LEAD_M = 0.15
@@ -91,7 +91,7 @@ def _is_at_hover_place(c: Context) -> bool:
 
 def is_climbing_back(state: PlannerState) -> bool:
     """True if the ascent brings a hover that has sunk back to its place."""
-    return state.phase is Phase.ASCEND and Claim.HOVER_CONTINUES in state.entry.claims
+    return state.phase is Phase.ASCEND and Claim.RESUMES_HOVER in state.entry.claims
 
 
 def is_target_lost(c: Context) -> bool:
@@ -126,7 +126,9 @@ def act(c: Context) -> Action:
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
     goal_z = target.body_z_touching_target_m - standoff_m(c)
-    may_climb = target.is_fresh and target.error_xy_m < CLIMB_CONE_FRACTION * cone_radius_m(c)
+    may_climb = target.is_fresh and target.error_xy_m < CLIMB_ALLOWED_CONE_FRACTION * cone_radius_m(
+        c
+    )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
     speed = min(speed, max(MIN_CLIMB_MPS, goal_z - setpoint.z_m))

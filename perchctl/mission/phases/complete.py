@@ -30,26 +30,26 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     belief = replace(
         state.belief,
         last_contact_body_z_m=before.telemetry.position_m[2],
-        contact=gear_offset_at_last_touch_or_now(before.belief),
+        last_contact_offset=gear_offset_at_last_touch_or_now(before.belief),
     )
-    return replace(state, belief=belief, released_s=None)
+    return replace(state, belief=belief, release_began_s=None)
 
 
 def act(c: Context) -> Action:
     """Release in two stages, stop the motors once the whole weight hangs, and monitor the
     vehicle."""
-    if c.state.stopped_s is not None:
+    if c.state.motor_stop_ordered_s is not None:
         return stop_motors(c)
     holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
-    return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
+    return release_by_thrust(c) if holds or c.state.release_began_s is not None else lower_thrust(c)
 
 
 def time_since_stop_s(c: Context) -> float:
     """Seconds since the first order to stop the motors; -1 before it."""
-    return -1.0 if c.state.stopped_s is None else c.t_s - c.state.stopped_s
+    return -1.0 if c.state.motor_stop_ordered_s is None else c.t_s - c.state.motor_stop_ordered_s
 
 
-def is_release_monitored(c: Context) -> bool:
+def is_release_monitoring_over(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return (
         time_since_stop_s(c) >= c.planner.complete.watch_s
@@ -67,14 +67,19 @@ COMPLETE = PhaseDefinition(
             "slipped",
             {Phase.COMPLETE},
             lambda c: has_slipped(c.belief),
-            lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
+            lambda c: (
+                "slipped while hanging"
+                if c.state.motor_stop_ordered_s
+                else "the magnet does not hold"
+            ),
             claims=Claim.SLIPPED,
         ),
         back_off_row(
             "not-released",
             {Phase.COMPLETE},
             lambda c: (
-                c.state.stopped_s is None and c.in_phase_s > c.planner.complete.release_timeout_s
+                c.state.motor_stop_ordered_s is None
+                and c.in_phase_s > c.planner.complete.release_timeout_s
             ),
             "the release was not completed in time",
             claims=Claim.STILL_ATTACHED,
@@ -82,7 +87,7 @@ COMPLETE = PhaseDefinition(
         Transition(
             "perched",
             {Phase.COMPLETE},
-            lambda c: is_release_monitored(c) and is_still_hanging(c),
+            lambda c: is_release_monitoring_over(c) and is_still_hanging(c),
             Phase.PERCHED,
             "hanging still with the motors off",
             outcome=Outcome.PERCHED,
@@ -90,7 +95,7 @@ COMPLETE = PhaseDefinition(
         land_row(
             "fell-unseen",
             {Phase.COMPLETE},
-            is_release_monitored,
+            is_release_monitoring_over,
             "it is unknown whether the vehicle still hangs",
         ),
         land_row(

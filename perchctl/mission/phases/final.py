@@ -7,7 +7,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.descent import is_landing_over
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import has_ramped_down
+from perchctl.mission.release import has_thrust_ramped_down
 from perchctl.mission.setpoints import Action
 from perchctl.values import replace
 from perchctl.vehicle import Idle, StopMotors
@@ -21,10 +21,12 @@ def rest(c: Context) -> Action:
 def abort(c: Context) -> Action:
     """Stop the motors once; without a stop, the firmware would lock a vehicle that hangs with still
     motors."""
-    if c.state.order_count:
+    if c.state.stop_or_land_order_count:
         return c.state, Idle()
-    ends = StopMotors() if has_ramped_down(c) or is_landing_over(c) else Idle()
-    return replace(c.state, order_count=1, last_order_s=c.t_s), c.state.entry.stop or ends
+    ends = StopMotors() if has_thrust_ramped_down(c) or is_landing_over(c) else Idle()
+    return replace(
+        c.state, stop_or_land_order_count=1, last_stop_or_land_order_at_s=c.t_s
+    ), c.state.entry.stop or ends
 
 
 PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=rest)

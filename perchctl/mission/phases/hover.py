@@ -42,7 +42,7 @@ SUNK = Condition[Context]("sunk", lambda c: height_error_m(c) > MAX_HOVER_SINK_M
 """The vehicle is too low for a hover."""
 
 
-def hover_of(c: Context) -> HoverConfig:
+def hover_config(c: Context) -> HoverConfig:
     """Return the hover that the mission flies."""
     return c.planner.hover or HoverConfig()
 
@@ -68,13 +68,13 @@ def act(c: Context) -> Action:
     """Stay under the target at the setpoint's height; sink if the target is nearer than it should
     be."""
     old = c.state.setpoint or hold_here(c)
-    goal_z_m = c.belief.target.body_z_touching_target_m - hover_of(c).below_m
+    goal_z_m = c.belief.target.body_z_touching_target_m - hover_config(c).below_m
     return fly_under_target(c, min(old.z_m, goal_z_m + MAX_HOVER_RISE_M))
 
 
 def height_error_m(c: Context) -> float:
     """Return how far the vehicle is below its place, m; negative above it."""
-    return c.belief.target.error_z_m - hover_of(c).below_m
+    return c.belief.target.error_z_m - hover_config(c).below_m
 
 
 def has_left_place(c: Context) -> bool:
@@ -121,10 +121,12 @@ HOVER = PhaseDefinition(
         land_row(
             "hovered",
             {Phase.HOVER},
-            lambda c: hover_duration_s(c) >= hover_of(c).duration_s and c.belief.target.is_fresh,
             lambda c: (
-                f"hovered for {hover_of(c).duration_s:g} s, {hover_of(c).below_m:g} m below the "
-                f"target"
+                hover_duration_s(c) >= hover_config(c).duration_s and c.belief.target.is_fresh
+            ),
+            lambda c: (
+                f"hovered for {hover_config(c).duration_s:g} s, {hover_config(c).below_m:g} m "
+                f"below the target"
             ),
             Outcome.HOVERED,
         ),
@@ -134,7 +136,7 @@ HOVER = PhaseDefinition(
             lambda c: c.held_s(SUNK) >= HOVER_SINK_DWELL_S,
             Phase.ASCEND,
             lambda c: f"{height_error_m(c):.2f} m too low: climbing back",
-            claims=Claim.HOVER_CONTINUES,
+            claims=Claim.RESUMES_HOVER,
         ),
     ),
 )

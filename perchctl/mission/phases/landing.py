@@ -10,11 +10,11 @@ from perchctl.mission.descent import DESCENT_MANEUVER, act, enter_descent
 from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
-from perchctl.mission.transition import Predicate, Transition, give_up_row
+from perchctl.mission.transition import Predicate, Transition, abort_landing_row
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
-TARGET_LOOK_DURATION_S = 2.0
+TARGET_RECHECK_DURATION_S = 2.0
 """Time after the motors are off in which the camera may still show the target far above, s."""
 
 
@@ -30,7 +30,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
         )
         b = replace(b, is_position_diverged=True, reckoning=reckoning)
     if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
-        b = replace(b, contact=None)  # no evidence of a support at that position
+        b = replace(b, last_contact_offset=None)  # no evidence of a support at that position
     # With a wrong mounting, the setpoint leads in a wrong direction.
     setpoint = None if Claim.MOUNTING_WRONG in claims else state.setpoint
     return enter_descent(replace(state, belief=b, setpoint=setpoint), before.state)
@@ -41,7 +41,7 @@ def make_rest_predicate(rest: RestState) -> Predicate:
     return lambda c: c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S and find_rest_state(c) is rest
 
 
-def unconfirmed_reason(c: Context) -> str:
+def unconfirmed_landing_reason(c: Context) -> str:
     """Return why the landing could not be confirmed, as far as the telemetry shows."""
     age_s, proof_age_s = c.belief.attitude_age_s, c.safety.proof_age_s
     if age_s > FRESH_S:
@@ -94,23 +94,23 @@ LANDING = PhaseDefinition(
                 )
             ),
         ),
-        give_up_row(
+        abort_landing_row(
             "held-elsewhere",
             make_rest_predicate(RestState.HELD),
             "motors off; something holds the vehicle away from the target: look before you touch "
             "it",
         ),
-        give_up_row(
+        abort_landing_row(
             "hangs-or-stands",
-            lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_LOOK_DURATION_S,
+            lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_RECHECK_DURATION_S,
             "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
             "whether the vehicle hangs or stands: look before you touch it",
         ),
-        give_up_row(
+        abort_landing_row(
             "landing-timeout",
             lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-            unconfirmed_reason,
-            claims=Claim.UNCONFIRMED,
+            unconfirmed_landing_reason,
+            claims=Claim.LANDING_UNCONFIRMED,
         ),
     ),
 )

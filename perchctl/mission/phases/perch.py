@@ -48,10 +48,10 @@ def act(c: Context) -> Action:
         return c.state, RawThrust(perch.thrust)
     old = c.state.setpoint or hold_here(c)
     if target.world_m is None:
-        return fly_to(c, old, lift=False)
+        return fly_to(c, old, corrects_height=False)
     goal = setpoint_under_target(c, target.body_z_touching_target_m + perch.press_m)
     setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
-    return fly_to(c, setpoint, lift=False)
+    return fly_to(c, setpoint, corrects_height=False)
 
 
 def is_in_contact(c: Context) -> bool:

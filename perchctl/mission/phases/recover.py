@@ -17,14 +17,14 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.release import (
-    catch_setpoint_above_m,
     catch_slip,
-    clear_contact_below,
-    leave_press,
+    choose_catch_setpoint_above_m,
+    end_press,
+    forget_contact_when_below,
 )
 from perchctl.mission.setpoints import (
     Action,
-    body_xy_under_target,
+    body_world_xy_under_target,
     fly_to,
     hold_here,
     step_towards,
@@ -34,16 +34,16 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_NO_CATCH_THRUST_RATIO = 0.85
+MIN_THRUST_RATIO_WITHOUT_CATCH = 0.85
 """Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
 CONTACT_CLEARANCE_M = 0.05
 """Distance below the contact at which the vehicle has left it, m; at most half of the descent."""
 MAX_FOLLOWED_SIGHTING_AGE_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
-LAST_RECOVERY_DURATION_S = 0.5
+RECOVERY_BEFORE_GIVING_UP_S = 0.5
 """Time that the vehicle recovers before the last failed attempt ends the flight, s."""
-RECOVER_DESCENT_MPS = 10.0
+UNLIMITED_SETPOINT_DESCENT_MPS = 10.0
 """Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
 STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
@@ -56,19 +56,21 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
     # A vehicle whose motors carry most of its weight hardly falls.
-    falls = Claim.SLIPPED in claims and thrust < MIN_NO_CATCH_THRUST_RATIO * b.hover_thrust
+    falls = Claim.SLIPPED in claims and thrust < MIN_THRUST_RATIO_WITHOUT_CATCH * b.hover_thrust
     belief = replace(
         state.belief,
-        contact=_find_touch_offset(before, claims),
+        last_contact_offset=_find_touch_offset(before, claims),
         # The vehicle counts as within the magnet's reach until its position is below.
         last_contact_body_z_m=z_m if touched else b.last_contact_body_z_m,
     )
     return replace(
         state,
         belief=belief,
-        stopped_s=None,
-        released_s=None,
-        catch_above_m=catch_setpoint_above_m(b.hover_thrust, thrust) if falls else None,
+        motor_stop_ordered_s=None,
+        release_began_s=None,
+        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_m(b.hover_thrust, thrust)
+        if falls
+        else None,
         blocked_z_m=z_m if Claim.BLOCKED in claims else old.blocked_z_m,
     )
 
@@ -77,9 +79,9 @@ def _find_touch_offset(before: Context, claims: Claim) -> ContactOffset | None:
     """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
     old, b = before.state, before.belief
     if Claim.STILL_ATTACHED in claims:  # the contact was proven, and the vehicle has not come off
-        return b.contact
+        return b.last_contact_offset
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
-        return b.contact if b.last_contact_body_z_m is not None else None
+        return b.last_contact_offset if b.last_contact_body_z_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
     # `SUPPORT_SHOWN_BY_IMU` includes that dwell time
     carried = proven or b.held_s(SUPPORT_SHOWN_BY_IMU) >= 0.0
@@ -93,26 +95,28 @@ def act(c: Context) -> Action:
     if (caught := catch_slip(c)) is not None:
         return caught
     recover = c.planner.recover
-    c = Context(clear_contact_below(c.state, min(CONTACT_CLEARANCE_M, 0.5 * recover.descend_m)))
-    state, away = leave_press(c)
+    c = Context(
+        forget_contact_when_below(c.state, min(CONTACT_CLEARANCE_M, 0.5 * recover.descend_m))
+    )
+    state, away = end_press(c)
     if away is not None:
         return state, away
-    if state.catch_above_m is not None:
+    if state.catch_setpoint_above_vehicle_m is not None:
         x, y, z = c.telemetry.position_m  # position where the fall has stopped
         entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
-        state = replace(state, catch_above_m=None, setpoint=None, entry=entry)
+        state = replace(state, catch_setpoint_above_vehicle_m=None, setpoint=None, entry=entry)
     z = state.entry.position_m[2] - recover.descend_m
     setpoint = state.setpoint or hold_here(c)
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
     target = c.belief.target
     if target.world_m is not None and target.age_s < MAX_FOLLOWED_SIGHTING_AGE_S:
-        x, y = body_xy_under_target(c, setpoint.yaw_rad)
+        x, y = body_world_xy_under_target(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
-    return fly_to(c, step_towards(c, setpoint, goal, down_mps=RECOVER_DESCENT_MPS))
+    return fly_to(c, step_towards(c, setpoint, goal, down_mps=UNLIMITED_SETPOINT_DESCENT_MPS))
 
 
 def has_recovered(c: Context) -> bool:
@@ -148,7 +152,7 @@ RECOVER = PhaseDefinition(
             {Phase.RECOVER},
             lambda c: (
                 c.state.failed_attempts >= c.planner.attempts
-                and c.in_phase_s > LAST_RECOVERY_DURATION_S
+                and c.in_phase_s > RECOVERY_BEFORE_GIVING_UP_S
             ),
             lambda c: (
                 "all perching attempts are used up"

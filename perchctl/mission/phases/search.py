@@ -9,7 +9,13 @@ from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase
-from perchctl.mission.setpoints import Action, body_xy_under_target, fly_to, hold_here, step_towards
+from perchctl.mission.setpoints import (
+    Action,
+    body_world_xy_under_target,
+    fly_to,
+    hold_here,
+    step_towards,
+)
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
@@ -17,7 +23,7 @@ from perchctl.vehicle import PositionSetpoint
 
 OBSTACLE_CLEARANCE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
-MAX_UNCONFIRMED_DISTANCE_M = 0.2
+MAX_MOVE_BEFORE_MOUNTING_CHECK_M = 0.2
 """Largest lateral distance flown to a target seen before, while the camera's mounting is
 unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
@@ -37,14 +43,18 @@ def act(c: Context) -> Action:
     search, state, b = c.planner.search, c.state, c.belief
     takeoff_position_m = b.takeoff_position_m
     assert takeoff_position_m is not None
-    if c.t_s - state.search_step_s > search.wait_s:
-        state = replace(state, searched_positions=state.searched_positions + 1, search_step_s=c.t_s)
+    if c.t_s - state.search_step_began_s > search.wait_s:
+        state = replace(
+            state, searched_positions=state.searched_positions + 1, search_step_began_s=c.t_s
+        )
         c = Context(state)
     x, y, z = state.entry.position_m
     if b.target.world_m is not None:
-        there = body_xy_under_target(c, state.entry.yaw_rad)
+        there = body_world_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_awaiting_evidence
-        x, y = _limit_distance(b.mounting, (x, y), there) if unconfirmed else there
+        x, y = (
+            _limit_move_before_mounting_check(b.mounting, (x, y), there) if unconfirmed else there
+        )
         height = min(z, b.target.body_z_touching_target_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
@@ -57,18 +67,18 @@ def act(c: Context) -> Action:
     return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
 
 
-def _limit_distance(
-    mount: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
+def _limit_move_before_mounting_check(
+    mounting: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), limited to `MAX_UNCONFIRMED_DISTANCE_M` from the last
-    sighting, else from `start`."""
-    if mount.sightings:
+    """Return the goal, world x and y (m), limited to `MAX_MOVE_BEFORE_MOUNTING_CHECK_M` from the
+    last sighting, else from `start`."""
+    if mounting.sightings:
         start = (
-            mount.sightings[-1].vehicle_world_xy_m.real,
-            mount.sightings[-1].vehicle_world_xy_m.imag,
+            mounting.sightings[-1].vehicle_world_xy_m.real,
+            mounting.sightings[-1].vehicle_world_xy_m.imag,
         )
     dx, dy = goal[0] - start[0], goal[1] - start[1]
-    part = min(1.0, MAX_UNCONFIRMED_DISTANCE_M / max(math.hypot(dx, dy), 1e-6))
+    part = min(1.0, MAX_MOVE_BEFORE_MOUNTING_CHECK_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
 
 
@@ -88,7 +98,7 @@ SEARCH = PhaseDefinition(
         Transition(
             "found",
             {Phase.SEARCH},
-            lambda c: c.state.confirmed_frames >= c.planner.search.confirm_frames,
+            lambda c: c.state.consecutive_target_frames >= c.planner.search.confirm_frames,
             Phase.ESTIMATE,
             "target seen",
         ),
