@@ -41,7 +41,7 @@ class Context:
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick; for how long is the condition's `held_s`."""
+        """What supports the vehicle in this tick. For how long, ask `held_s` of the condition."""
         return find_support(self.belief)
 
     def held_s(self, condition: Condition[Any]) -> float:

@@ -213,15 +213,16 @@ def act(c: Context) -> Action:
 
 
 def descend(c: Context) -> Action:
-    """Descend by one of the four policies.
+    """Descend by one of four policies.
 
-    Without a position, the descent is level from the start. Within the magnet's reach, the setpoint
-    is lowered until the vehicle peels off; if it does not, its weight is transferred to the magnet.
-    Otherwise the vehicle descends by setpoints to `handover_m` and from there by the firmware's own
-    landing, or by that landing at once if height, telemetry or loop are unreliable. With the target
-    as the positioning system, the firmware's landing is not used because its trajectory would
-    follow the camera's estimate to a floor of unknown height; from `handover_m` on, the descent is
-    level.
+    - Level, by raw thrust: without a position. With the target as the positioning system, also from
+      `landing.handover_m` down, because the firmware's own landing would follow the camera's
+      estimate to a floor of unknown height.
+    - Peel off: within the magnet's reach, lower the setpoint until the vehicle comes off. If it
+      does not, transfer its weight to the magnet.
+    - By setpoints: with a position, down to `landing.handover_m`.
+    - The firmware's own landing: below that height, or at once if height, telemetry or loop are
+      unreliable.
     """
     b = c.belief
     if not b.can_descend_by_position:
@@ -247,8 +248,9 @@ def descend(c: Context) -> Action:
 
 
 def is_landing_over(c: Context) -> bool:
-    """True if a landing is over: its raw thrust is at the minimum, or its setpoint at the floor.
-    Without a stop, the firmware would lock the vehicle."""
+    """True if a landing has come to its end: the raw thrust is at its minimum, or the setpoint is
+    at the floor. The motors must then be stopped, or the firmware's supervisor locks the vehicle
+    when the setpoints end."""
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
@@ -341,7 +343,8 @@ def _descend_by_setpoints(c: Context) -> Action:
 
 
 def _descend_by_thrust(c: Context) -> Action:
-    """Sink level by raw thrust; by setpoints for a while if no thrust for the descent is known."""
+    """Descend level by raw thrust. While neither climb rate nor hover thrust is known well enough,
+    descend by setpoints."""
     return _descend_by_setpoints(c) if should_wait_for_climb_rate(c) else descend_level(c)
 
 
@@ -351,8 +354,9 @@ def make_onboard_landing(
     """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
     rest.
 
-    The goal is below the ground, by a drift that grows with the flight time `flown_s`, and never
-    above the vehicle: the motors stop at the end of the trajectory.
+    The motors stop at the end of the trajectory. Its goal is therefore below the ground by more
+    than the estimated height may have drifted during `time_in_flight_s`, and never above the
+    vehicle.
     """
     drifted_m = min(
         MAX_HEIGHT_ESTIMATE_DRIFT_M, planner.landing.drift_mps * max(0.0, time_in_flight_s)
@@ -411,7 +415,8 @@ def _order_onboard_landing(c: Context) -> Action:
 
 
 def _transfer_weight_to_magnet(c: Context) -> Action:
-    """Transfer the weight to the magnet, and accept older telemetry than a perch does."""
+    """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than a perch
+    does."""
     return release_by_thrust(c, accepted_telemetry_age_s=c.safety.telemetry_hold_s)
 
 

@@ -37,8 +37,11 @@ BACK_OFF_DURATION_S = 3.0
 
 
 def compute_battery_outlook(c: Context) -> BatteryOutlook:
-    """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
-    most the time that a vehicle without a reading may fly (fault 7)."""
+    """Return how long the battery lasts, and for how many attempts.
+
+    If the charge is unknown, the remaining time for attempts is at most the time until row
+    `battery-unknown` lands the vehicle.
+    """
     energy = c.belief.battery_fit
     used_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
     thrust_fraction = (
@@ -66,8 +69,8 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
 def predict_hover_time_s(
     state: BatteryFit, profile: Profile, thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
-    """Return the hover time, s, at `load` (share of full thrust) until `battery-low` fires; None if
-    unknown."""
+    """Return the hover time, s, at `thrust_fraction` (share of full thrust) until `battery-low`
+    fires; None if unknown."""
     if (
         state.rest_v is None
         or state.time_under_load_s < MIN_TIME_UNDER_LOAD_S

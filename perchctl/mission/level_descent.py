@@ -161,15 +161,15 @@ def _climb_measurement_age_s(c: Context) -> float:
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
-    """True if the vertical speed is unknown and the hover thrust is rough: setpoints are better for
-    a while."""
+    """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
+    setpoints are then better, for at most `MAX_SETPOINT_DESCENT_S`."""
     begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover_thrust_estimate.is_imprecise
     return _is_climb_unknown(c) and begins_rough and c.in_phase_s < MAX_SETPOINT_DESCENT_S
 
 
 def descend_level(c: Context) -> Action:
-    """Sink level by raw thrust controlled by the vertical speed, tilted against the lateral
-    speed."""
+    """Descend by raw thrust: a rate controller of the vertical speed sets the thrust, and a small
+    tilt brakes the lateral speed and balances the wind."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
         _tick_duration_s(c),
@@ -248,8 +248,12 @@ def _measured_climb_mps(c: Context) -> float:
 def _find_floor_detection_s(
     c: Context, hover_thrust: float, height_m: float, *, is_sinking: bool
 ) -> float | None:
-    """Return when the floor was first detected: by a blow from below during a sink, or by pictures
-    of a motionless vehicle at a thrust too low to carry it."""
+    """Return when the floor was first detected; None if it was not.
+
+    The floor is detected by an impact from below while the vehicle came down, or by pictures that
+    show no motion at a thrust too low to carry it. `is_sinking`: the measured speed shows a
+    descent.
+    """
     descent, b, seen = c.state.descent, c.belief, _fresh_visual_motion(c)
     if descent.floor_detected_s is not None:
         return descent.floor_detected_s
@@ -283,8 +287,8 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
 
 
 def _forget_contact_after_fall(c: Context) -> PlannerState:
-    """Return the state, without its contact once a position or pictures show the vehicle lower, or
-    after a fall."""
+    """Return the state without its recorded contact if a position or pictures show the vehicle
+    clearly below it, or the accelerometer a fall; otherwise unchanged."""
     state, b, seen = c.state, c.belief, _fresh_visual_motion(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
         return forget_contact_when_below(state, MAGNET_RELEASED_BELOW_M)
@@ -306,8 +310,8 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
 
 
 def _is_touchdown_overdue(c: Context) -> bool:
-    """True if the vehicle has been without a position for so long that it must have landed or
-    hang."""
+    """True if the vehicle has descended without a position for so long that it must have landed or
+    be hanging."""
     state, b = c.state, c.belief
     if b.dead_reckoning_since_s is None and not b.is_position_diverged:
         return False
@@ -324,14 +328,15 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     """Return roll and pitch that balance the wind and brake the lateral speed; level without a
     heading.
 
-    The thrust acts along the body's z axis, so the lateral reading of the accelerometer is the
-    force w of the air per mass, m/s^2. Level thrust g tan(tilt) must provide -w. The estimated
-    attitude is wrong by b / g, where b is the bias of accelerometer and attitude, so the estimated
-    lean is (b - w) / g. Both are means over the time with a known position, and an offset of the
-    accelerometer is part of both. The present reading is not used: most of it is the drag of the
-    vehicle's own motion, which brakes it. Means over less than `BIAS_TIME_CONSTANT_S` have less
-    weight, and means from wrong positions have none; then the bias that pictures have shown
-    recently is used.
+    The lateral reading of the accelerometer is the air's force per mass w, m/s^2, because the
+    thrust acts along the body's z axis. To balance it, the thrust needs the lateral part -w. The
+    estimated attitude is wrong by b / g, where b is the bias of accelerometer and attitude. The
+    estimated lean must therefore be (b - w) / g.
+
+    Both b and w are means over the time with a known position, so an offset of the accelerometer
+    cancels. Means over less than `BIAS_TIME_CONSTANT_S` have less weight. Means from wrong
+    positions have none, and the bias that pictures have shown recently is used instead. The present
+    reading is not used, since most of it is the drag of the vehicle's own motion, which brakes it.
     """
     b = c.belief
     if b.heading_lost or b.is_in_magnet_reach:

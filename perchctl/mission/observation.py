@@ -13,8 +13,8 @@ from perchctl.vision import TargetEstimate
 @dataclass(frozen=True)
 class CameraImuMismatch:
     """An error of latency or mounting that explains why the target seems to move: pictures that are
-    `later_s` later than assumed, or a camera rotated by `turn_rad` about the vehicle's upward axis.
-    The other value is 0."""
+    `camera_latency_error_s` later than assumed, or a camera rotated by `camera_yaw_error_rad` about
+    the vehicle's upward axis. The other value is 0."""
 
     camera_latency_error_s: float = 0.0
     camera_yaw_error_rad: float = 0.0

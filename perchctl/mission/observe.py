@@ -15,8 +15,9 @@ from perchctl.values import replace
 def observe(
     state: PlannerState, obs: Observation, profile: Profile, maneuver: Maneuver
 ) -> PlannerState:
-    """Return the state with its belief updated in `maneuver`. After a gap without ticks, a catch
-    ends. After a jump of the estimate, the remembered positions move with it."""
+    """Return the state with its belief updated in `maneuver`. After a gap without ticks, the catch
+    of a falling vehicle is cancelled. After a jump of the estimate, the remembered positions move
+    with it."""
     if has_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above; keeping it would make the vehicle press.
         setpoint = state.setpoint if state.catch_setpoint_above_vehicle_m is None else None

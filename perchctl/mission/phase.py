@@ -88,7 +88,8 @@ class Severity(IntEnum):
     STOP = 4
 
     def escalate(self, transition_severity: Severity) -> Severity:
-        """Return the flight's severity after a transition of severity `transition`."""
+        """Return the flight's severity after a transition of severity
+        `transition_severity`."""
         return max(self, transition_severity) if self >= Severity.LAND else transition_severity
 
 
@@ -105,7 +106,8 @@ class Outcome(Enum):
 
     @property
     def exit_code(self) -> int:
-        """The exit code of a flight that ended so, if its log is complete."""
+        """Exit code of the command after a flight with this outcome. A flight whose log is
+        incomplete has another one."""
         return _EXIT_CODES[self]
 
 

@@ -87,7 +87,7 @@ class SentCommand:
     """A command that no tick of the loop decided, handed to the link at `t_s` on the loop's clock.
     Whether it arrived is unknown.
 
-    `by` names the sender: ``watchdog`` while the loop is silent, also for the operator's stop;
+    `sender` is ``watchdog`` while the loop is silent, also for the operator's stop;
     ``rescue`` after an error; ``reconnect`` for an order repeated after a lost link; ``preflight``
     for arming a vehicle that does not arm itself; ``farewell`` for disarming it, and for the zero
     setpoint that closes the link.
@@ -124,20 +124,18 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class TickInputs:
-    """The samples from the link and the frame from the camera in one tick. `late` are samples that
-    arrived while camera or vision blocked the loop. `look`: the frame was meant to be searched.
-    `sends_sights`: the sightings of the target were the vehicle's position. `drops_sightings`:
-    earlier sightings were discarded because positions had diverged."""
+    """The samples from the link and the frame from the camera in one tick."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order of arrival
     late_samples: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
     frame: FrameRecord | None = None
-    camera_problem: str | None = None  # problem, ended, live: reported by the camera source
+    # the next three are reported by the camera source
+    camera_problem: str | None = None
     has_source_ended: bool = False
     is_source_live: bool = True
-    is_detection_requested: bool = True
-    sends_sightings_as_position: bool = True
-    has_discarded_sightings: bool = False
+    is_detection_requested: bool = True  # the frame was meant to be searched for markers
+    sends_sightings_as_position: bool = True  # sightings are the vehicle's external position
+    has_discarded_sightings: bool = False  # earlier ones, because positions had diverged
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +149,18 @@ class UnfilteredPose:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TickRecord:
-    """One tick of the loop, complete and exact.
+    """One tick of the loop, complete and exact: its inputs and its decision. A log stores it as a
+    record of kind ``turn``.
 
-    `role` is ``waiting`` before take-off; ``flown``; ``redone`` for a decision that was made before
-    the loop noticed that it had been blocked, not sent, and made again in the next tick; or
-    ``failed`` if the planner raised an exception. The fields `phase` to `reason` show the planner's
-    state after its decision.
+    `role` is one of
+
+    - ``waiting``: before take-off;
+    - ``flown``: the command was sent;
+    - ``redone``: the loop had been blocked unnoticed, so the decision was discarded, and made again
+      in the next tick;
+    - ``failed``: the planner raised an exception.
+
+    The fields `phase` to `reason` show the planner's state after its decision.
     """
 
     number: int  # counts from 0; a gap is a missing tick
@@ -182,7 +186,7 @@ class Tick:
     """A flown tick with the planner's whole state and the pipeline's output; the log keeps only
     parts of both.
 
-    `output` is None if no new frame was searched. `consistency` holds the errors of latency and
+    `output` is None if no new frame was searched. `camera_errors` holds the errors of latency and
     mounting if they were estimated in this tick.
     """
 

@@ -120,8 +120,11 @@ def lower_thrust(c: Context) -> Action:
 
 def release_by_thrust(c: Context, *, accepted_telemetry_age_s: float = 0.0) -> Action:
     """Second stage of the release: reduce raw thrust until the motors stand still, and stop them
-    once the whole weight has hung for long enough. Telemetry that is too old as evidence and older
-    than `late_s` restarts the stage."""
+    once the whole weight has hung for long enough.
+
+    The stage starts again while the telemetry is too old as evidence and also older than
+    `accepted_telemetry_age_s`.
+    """
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > accepted_telemetry_age_s:
         return hold_contact_by_position(c)
@@ -198,8 +201,8 @@ def choose_catch_setpoint_above_m(hover_thrust: float, thrust: float) -> float:
 
 
 def catch_slip(c: Context) -> Action | None:
-    """Return the setpoint far above that catches a slip; None after the fall, or with old
-    telemetry."""
+    """Catch a vehicle that falls off the magnet: return a setpoint high above it. None if there is
+    nothing to catch, once the fall has ended, or with old telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_setpoint_above_vehicle_m is None or not b.is_imu_fresh:
         return None
@@ -226,8 +229,8 @@ def _braking_setpoint_m(c: Context) -> tuple[float, float]:
 
 
 def forget_contact_when_below(state: PlannerState, distance_below_m: float) -> PlannerState:
-    """Return the state, without its contact if the vehicle is more than `distance_below_m` below
-    it."""
+    """Return the state without its recorded contact if the vehicle is more than `distance_below_m`
+    below it; otherwise unchanged."""
     b = state.belief
     if (
         b.last_contact_body_z_m is None

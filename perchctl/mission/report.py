@@ -44,8 +44,8 @@ def find_row_claims(row_name: str) -> Claim:
 
 @dataclass(frozen=True)
 class Touchdown:
-    """The downward speed at the touchdown, and the largest specific force of samples every 10
-    ms."""
+    """Downward speed at the touchdown, and the largest specific force in it. Samples come every 10
+    ms, so the true peak may be higher."""
 
     speed_mps: float
     peak_g: float
@@ -122,7 +122,8 @@ class CameraFindings:
 
 
 def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
-    """True if the error exceeds the gate and the width of its 95 % interval."""
+    """True if the difference exceeds both the threshold and 1.96 `sigma`, the half width of its 95
+    % interval."""
     return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT * sigma)
 
 
@@ -237,7 +238,8 @@ class RestReport:
 def report_rest(
     state: PlannerState, obs: Observation, profile: Profile, min_motors_off_s: float
 ) -> RestReport | None:
-    """Return the rest state; None until telemetry has shown the motors off for `off_s`."""
+    """Return the rest state; None until telemetry has shown the motors off for
+    `min_motors_off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
     if c.held_s(MOTORS_STOPPED) < min_motors_off_s:
         return None

@@ -78,8 +78,9 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _find_rest_state_from_falls(c: Context) -> RestState:
-    """Return the rest state from the falls since the vehicle came within the magnet's reach, if
-    ever, and from silences that could hide a fall."""
+    """Return the rest state from the falls that the accelerometer has measured since the vehicle
+    came within the magnet's reach. It is UNKNOWN after a silence that was long enough to hide a
+    fall or a catch."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_magnet_reach_since_s
     floor_s = c.state.descent.floor_detected_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)

@@ -105,8 +105,9 @@ the flight."""
 
 
 def has_diverged(c: Context) -> bool:
-    """True if external positions in wrong axes lead position control away from its setpoint (fault
-    11): further than any draught does, or in oscillations."""
+    """True if position control leads the vehicle away from its setpoint, as with external positions
+    in wrong axes: it is further away than any draught could move it, it oscillates, or its
+    estimated velocity contradicts the accelerometer."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
@@ -297,8 +298,8 @@ def is_press_thrust_insufficient(c: Context) -> bool:
 
 
 def _outcome_after_supervisor_lock(before: Outcome | None) -> Outcome:
-    """Return the outcome of a locked vehicle that hangs: a landing keeps its own, except that a
-    hover ends on the floor."""
+    """Return the outcome if the supervisor has locked a vehicle that hangs. HOVERED becomes SAFETY,
+    since a hover must end on the floor; any other outcome stays; without one, it is PERCHED."""
     return Outcome.SAFETY if before is Outcome.HOVERED else before or Outcome.PERCHED
 
 

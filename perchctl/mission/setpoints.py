@@ -111,8 +111,8 @@ def step_towards(
     changes_heading: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint one tick after `old`: towards `goal`, with at most `up_mps` upwards and
-    `down_mps` downwards. `is_cautious` limits the lateral speed while the camera's mounting is
-    unconfirmed; without `turns`, the heading stays."""
+    `down_mps` downwards. `is_slow_until_mounting_confirmed` limits the lateral speed while the
+    camera's mounting is unconfirmed; without `changes_heading`, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
@@ -131,7 +131,8 @@ def step_towards(
 
 
 def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = True) -> Action:
-    """Store the reference and send it corrected; without `lift`, its height is not corrected."""
+    """Store the reference and send it corrected; without `corrects_height`, its height is not
+    corrected."""
     return replace(c.state, setpoint=reference), limit_setpoint(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
@@ -149,7 +150,7 @@ def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
 
 
 def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """Return the integral (x, y) of the position error to `goal_xy`, m, world axes, which removes
+    """Return the integral (x, y) of the position error to `goal_xy_m`, m, world axes, which removes
     the offset that a steady wind leaves.
 
     The integral is limited, and frozen while the vehicle is still on its way: a large error
@@ -168,10 +169,12 @@ def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> 
 
 
 def move_setpoint_to_vehicle(c: Context) -> PlannerState:
-    """Return the state with a setpoint at the vehicle's position and the integral that holds it
-    there, if it hovers in place; the command does not change. A vehicle on its way keeps its
-    setpoint and integral. Without a setpoint, or with diverged positions, the integral becomes
-    zero."""
+    """Return the state with its setpoint moved to the vehicle's position, if it hovers in place.
+    The integral takes up the difference, so that the command that is sent does not step.
+
+    A vehicle that moves keeps its setpoint and integral. Without a setpoint, or with diverged
+    positions, the integral becomes zero.
+    """
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
         return replace(c.state, lateral_integral_m=(0.0, 0.0))
@@ -186,7 +189,7 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
 
 
 def limit_vector(x: float, y: float, max_length: float) -> tuple[float, float]:
-    """Return the vector (x, y), shortened to at most the length `most`."""
+    """Return the vector (x, y), shortened to at most `max_length`."""
     size = math.hypot(x, y)
     return (x, y) if size <= max_length else (x * max_length / size, y * max_length / size)
 
@@ -195,7 +198,7 @@ def correct_setpoint(
     c: Context, reference: PositionSetpoint, *, corrects_height: bool = True
 ) -> PositionSetpoint:
     """Return the setpoint that brings the vehicle to `reference`, by the equations in the module
-    docstring; without `lift`, at the reference's own height."""
+    docstring; without `corrects_height`, at the reference's own height."""
     tel = c.telemetry
     rise = (
         HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])
@@ -244,8 +247,8 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
 
 
 def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """Return the held setpoint one tick later; lower if the target is the position source and out
-    of view."""
+    """Return the held setpoint one tick later. If the target is the position source and out of
+    view, it sinks slowly, to bring the target back into view."""
     b = c.belief
     if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint

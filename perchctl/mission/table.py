@@ -59,9 +59,12 @@ PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.con
 
 
 def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
-    """Return the first transition that applies, or None to stay. A transition from a landing to a
-    flying phase is skipped, whatever the table contains. Your own waiting row blocks the later
-    `CONTINUE` rows and is returned if no other row applies."""
+    """Return the first row that applies, or None to stay. A row from a landing to a phase before it
+    is skipped, whatever the table contains.
+
+    A row of your own that keeps the mission in its phase skips all later `CONTINUE` rows. It is
+    returned if no other row applies.
+    """
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None
     for row in table:
@@ -93,11 +96,12 @@ def add_rows(
     rows: Iterable[Transition], table: tuple[Transition, ...] = TABLE
 ) -> tuple[Transition, ...]:
     """Return the table with your own rows, in their order, after all safety rows and before the
-    exits of the phases. By `ALLOWED_TRANSITIONS`, each row waits in ALIGN, or returns to an earlier
-    phase, to RECOVER or to LANDING; in COMPLETE and LANDING, none applies.
+    exits of the phases.
 
-    Raises InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name
-    that is taken; in flight, for a row whose functions raise, and then the vehicle lands.
+    A row of your own may wait in ALIGN, or lead to an earlier phase, to RECOVER or to LANDING
+    (`ALLOWED_TRANSITIONS`); in COMPLETE and LANDING, none applies. Raises InvalidValue for a row
+    that is not allowed, is not a valid `Transition`, or has a name that is taken. If a function of
+    a row raises in flight, InvalidValue names the row, and the vehicle lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):
@@ -158,8 +162,13 @@ def _wrap_row_function(name: str, function: Callable[[Context], T]) -> Callable[
 
 
 def load_table(name: str | None) -> tuple[Transition, ...]:
-    """Return the table of one flight, with the rows that a profile's `planner.rows` names: rows, or
-    a function that returns rows. Raises InvalidValue as `add_rows` does, and NotFound."""
+    """Return the table of one flight: the built-in one, with your own rows if the profile's
+    `planner.rows` names them.
+
+    `name` is ``module:attribute`` of the rows, or of a function that returns them; None for the
+    built-in table. Raises NotFound if there is no such attribute, and InvalidValue as `add_rows`
+    does.
+    """
     if name is None:
         return TABLE
     own = load_extension(name, "planner.rows")

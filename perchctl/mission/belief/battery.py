@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from perchctl.values import replace
 from perchctl.vehicle import AUTO_ARM, FULL_THRUST, Telemetry, is_battery_reading
@@ -63,13 +64,37 @@ MAX_BATTERY_READING_AGE_S = 1.0
 """Age at which a voltage reading is no longer used, s."""
 
 
+class SagModel(NamedTuple):
+    """The two parameters that the fit determines."""
+
+    full_thrust_sag_v: float
+    discharge_rate_factor: float
+
+
+class FitSums(NamedTuple):
+    """Weighted sums over the readings: the normal equations of the least-squares fit.
+
+    A reading's error is its deviation from the typical model. It is explained by the thrust times
+    the sag's deviation, plus the drop of the resting voltage times the factor's deviation.
+    """
+
+    thrust_thrust: float = 0.0
+    thrust_drop: float = 0.0
+    drop_drop: float = 0.0
+    thrust_error: float = 0.0
+    drop_error: float = 0.0
+
+
+NO_READINGS = FitSums()
+
+
 @dataclass(frozen=True)
 class BatteryFit:
     """State of the battery fit after the newest reading.
 
-    Charges are shares of the full charge; loads are shares of full thrust. `fit_sums` holds the
-    normal equations of the least-squares fit: the sums of sag^2, sag * discharge_rate_factor and
-    discharge_rate_factor^2, then the two right-hand sides.
+    The fit has two unknowns: the voltage sag at full thrust, V, and the discharge rate factor, the
+    actual charge consumption divided by the one that the assumed current predicts. Charges are
+    shares of the full charge; thrusts are shares of full thrust.
     """
 
     # resting voltage before take-off, estimated if the first reading was under load
@@ -81,7 +106,7 @@ class BatteryFit:
     rest_v: float | None = None  # estimated resting voltage now
     time_under_load_s: float = 0.0  # total time of readings under load
     no_reading_s: float = 0.0  # time since the last reading
-    normal_equation_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    normal_equation_sums: FitSums = NO_READINGS
 
 
 # --- Brushed and brushless motors ---
@@ -121,8 +146,8 @@ def identify_power_train(telemetry: Telemetry) -> PowerTrain:
 def update_from_telemetry(
     old: BatteryFit, telemetry: Telemetry, reading_age_s: float, dt_s: float, battery_mah: float
 ) -> BatteryFit:
-    """Return the state after the battery reading in a sample that follows the previous one by
-    `dt_s`. A reading whose age `age_s` exceeds `MAX_BATTERY_READING_AGE_S` counts as missing."""
+    """Return the fit after a new sample, taken `dt_s` after the previous one. A battery reading
+    older than `MAX_BATTERY_READING_AGE_S` counts as missing."""
     reading_v = telemetry.battery_v if reading_age_s <= MAX_BATTERY_READING_AGE_S else math.nan
     power_train = identify_power_train(telemetry)
     return update_battery_fit(old, dt_s, reading_v, telemetry.thrust, battery_mah, power_train)
@@ -163,7 +188,7 @@ def update_battery_fit(
         if state.rest_v is None:
             return state
         spent = (
-            fit_sag_model(state)[1]
+            fit_sag_model(state).discharge_rate_factor
             * state.filtered_thrust_fraction
             * full_thrust_discharge_per_s(battery_mah, power_train)
             * dt_s
@@ -184,7 +209,7 @@ def update_battery_fit(
         state = replace(
             state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
         )
-    now_v = battery_v + fit_sag_model(state)[0] * state.filtered_thrust_fraction
+    now_v = battery_v + fit_sag_model(state).full_thrust_sag_v * state.filtered_thrust_fraction
     rest_v = (
         now_v
         if state.rest_v is None
@@ -193,18 +218,18 @@ def update_battery_fit(
     return replace(state, rest_v=rest_v)
 
 
-def fit_sag_model(state: BatteryFit) -> tuple[float, float]:
-    """Return the sag at full thrust, V, and the discharge factor by which the charge falls
-    faster than counted: a least-squares fit to the readings, regularized by the typical values and
-    bounded."""
+def fit_sag_model(state: BatteryFit) -> SagModel:
+    """Return the sag model that fits the readings best: least squares, regularized by the typical
+    values and bounded."""
     a, b, c, p, q = state.normal_equation_sums
     a += FULL_THRUST_SAG_SIGMA_V**-2
     c += DISCHARGE_RATE_FACTOR_SIGMA**-2
     det = a * c - b * b
     sag_v = TYPICAL_FULL_THRUST_SAG_V + (c * p - b * q) / det
     discharge_rate_factor = TYPICAL_DISCHARGE_RATE_FACTOR + (a * q - b * p) / det
-    return max(MIN_FULL_THRUST_SAG_V, sag_v), min(
-        MAX_DISCHARGE_RATE_FACTOR, max(MIN_DISCHARGE_RATE_FACTOR, discharge_rate_factor)
+    return SagModel(
+        max(MIN_FULL_THRUST_SAG_V, sag_v),
+        min(MAX_DISCHARGE_RATE_FACTOR, max(MIN_DISCHARGE_RATE_FACTOR, discharge_rate_factor)),
     )
 
 
@@ -214,7 +239,7 @@ def charge_from_rest_v(rest_v: float) -> float:
 
 
 def rest_v_from_charge(charge_fraction: float) -> float:
-    """Return the resting voltage, V, of a cell with the charge `share` (0..1)."""
+    """Return the resting voltage, V, of a cell with the charge `charge_fraction` (0..1)."""
     return _interpolate(CHARGE_FRACTIONS, REST_VOLTAGES_V, charge_fraction)
 
 
@@ -223,11 +248,9 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
     return ys[i - 1] + (x - xs[i - 1]) * (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
 
 
-def _add_reading_to_fit_sums(
-    state: BatteryFit, dt_s: float, battery_v: float
-) -> tuple[float, float, float, float, float]:
-    """Return `BatteryFit.fit_sums` after one more reading, as deviations from the typical
-    values."""
+def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -> FitSums:
+    """Return the sums after one more reading. The fit solves for the deviations from the typical
+    sag and the typical discharge rate factor."""
     assert state.takeoff_rest_v is not None
     begun = charge_from_rest_v(state.takeoff_rest_v)
     counted = max(
@@ -242,7 +265,7 @@ def _add_reading_to_fit_sums(
     )
     weight, keep = dt_s / VOLTAGE_READING_SIGMA_V**2, math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S)
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
-    return (
+    return FitSums(
         a + weight * state.filtered_thrust_fraction * state.filtered_thrust_fraction,
         b + weight * state.filtered_thrust_fraction * spent_v,
         c + weight * spent_v * spent_v,

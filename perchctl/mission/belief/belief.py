@@ -31,7 +31,8 @@ POSITION_SETTLING_AFTER_GAP_S = 0.5
 trusted before it has converged."""
 MAX_FUSED_POSITION_EXTRA_AGE_S = 0.13
 """How much older than the camera's latency the newest position may be while it still corrects the
-estimate, s: three pictures at 30 per second. Larger: `is_displaced` reacts to a blow later."""
+estimate, s: three pictures at 30 per second. Larger: `has_uncorrected_gust` reacts to a blow
+later."""
 GUST_SPEED_THRESHOLD_MPS = 0.2
 """Speed gained without a sighting that counts as a blow or gust, m/s; flights without a fault show
 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
@@ -53,7 +54,7 @@ class ContactOffset:
     sigma_m: float
 
     def is_within(self, radius_m: float) -> bool:
-        """True if the gear was within `radius_m` of the axis even at one standard deviation."""
+        """True if the offset plus one standard deviation is at most `radius_m`."""
         return self.lateral_offset_m + self.sigma_m <= radius_m
 
     @property
@@ -68,7 +69,7 @@ class ContactOffset:
 class Belief:
     """The belief about vehicle and target, together with the evidence for it.
 
-    Times are on the loop's clock. A time of None has not come yet.
+    Times are on the loop's clock. A time is None until the event has happened.
     """
 
     obs: Observation  #: newest observation, on which all properties depend
@@ -98,7 +99,7 @@ class Belief:
     #: vehicle's velocity from pictures alone
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
-    #: low-passed `lean`, with the time constant `LEAN_TIME_CONSTANT_S`
+    #: low-passed `lean_sine_world_xy`, with the time constant `LEAN_TIME_CONSTANT_S`
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
     last_contact_body_z_m: float | None = None  #: height of the body where the magnet may hold it
     last_contact_offset: ContactOffset | None = None  #: offset at the last contact
@@ -125,7 +126,8 @@ class Belief:
         )
 
     def with_observation(self, obs: Observation, profile: Profile) -> Belief:
-        """Return the same belief with a newer observation that no update has used yet."""
+        """Return a copy with a newer observation. Properties use it at once; the fields change only
+        in the next `update_belief`."""
         return replace(self, obs=obs, profile=profile)
 
     def held_s(self, condition: Condition[Belief]) -> float:
@@ -177,8 +179,9 @@ class Belief:
 
     @cached_property
     def velocity_variance_m2ps2(self) -> float:
-        """Variance of the estimated velocity, (m/s)^2; infinite if unknown, 0 if `link.unreported`
-        says that the vehicle does not report it."""
+        """Variance of the estimated velocity, (m/s)^2. Infinite if it is missing; 0 if
+        `link.unreported` says that the vehicle never reports it, so that no variance limit
+        applies."""
         return self._variance_or_default(self.obs.telemetry.velocity_variance_m2ps2)
 
     @cached_property
@@ -216,7 +219,7 @@ class Belief:
 
     @cached_property
     def is_position_stale(self) -> bool:
-        """True if the position is too old for position control (fault 10)."""
+        """True if the position is older than `positioning.hold_s`, too old for position control."""
         return self.position_age_s > self.profile.positioning.hold_s
 
     @cached_property
@@ -325,8 +328,8 @@ class Belief:
 
     @cached_property
     def is_reading_one_g(self) -> bool:
-        """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as on any supported
-        vehicle."""
+        """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as in hover, or at rest
+        on the floor, at the ceiling or on the magnet."""
         return abs(self.obs.telemetry.acc_z_g - 1.0) <= self.profile.planner.perch.contact_acc_g
 
     @cached_property
@@ -341,8 +344,8 @@ class Belief:
 
     @cached_property
     def lean_sine_world_xy(self) -> tuple[float, float]:
-        """Level part (x, y) of the direction of thrust in world axes: the sine of the tilt, towards
-        where the vehicle leans."""
+        """Horizontal part (x, y) of the unit vector along the thrust, world axes. Its length is the
+        sine of the tilt, and it points to where the vehicle leans."""
         tel = self.obs.telemetry
         level_x = math.sin(tel.pitch_rad) * math.cos(tel.roll_rad)
         level_y = -math.sin(tel.roll_rad)
@@ -351,10 +354,10 @@ class Belief:
 
     @cached_property
     def acceleration_from_lean_mps2(self) -> tuple[float, float]:
-        """Lateral acceleration (x, y) in world axes, m/s^2, of a hovering vehicle that leans away
-        from its mean lean. The mean lean causes no acceleration: it balances the wind, an
-        unbalanced vehicle, or an error of the estimated attitude. After a change of the wind, the
-        result is wrong until the mean has followed."""
+        """Lateral acceleration (x, y), m/s^2, world axes, that follows from the difference between
+        the present lean and the mean lean. The mean lean itself causes none: it balances the wind,
+        an unbalanced vehicle, or an error of the estimated attitude. Wrong after a change of the
+        wind, until the mean has followed."""
         (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
@@ -373,10 +376,9 @@ class Belief:
         return self.obs.telemetry.velocity_mps[2]
 
     def is_sinking(self, min_sink_mps: float) -> bool:
-        """True if the vehicle sinks faster than `mps`.
+        """True if the vehicle sinks faster than `min_sink_mps`.
 
-        Without a valid position, the speed counts only while the accelerometer also reads less than
-        the weight.
+        Without a valid position, the accelerometer must also read less than 1 g.
         """
         if self.climb_mps >= -min_sink_mps:
             return False
@@ -390,7 +392,8 @@ class Belief:
 
     @cached_property
     def is_thrust_known(self) -> bool:
-        """True if the reported thrust follows the ordered thrust."""
+        """True if the reported thrust can be used: it agrees with the ordered raw thrust if there
+        is one, or has differed from it for at most `THRUST_REPORT_DELAY_S`."""
         return (
             self.thrust_mismatch_since_s is None
             or self.obs.t_s - self.thrust_mismatch_since_s <= THRUST_REPORT_DELAY_S
@@ -407,8 +410,8 @@ class Belief:
 
     @cached_property
     def camera_imu_mismatch(self) -> CameraImuMismatch:
-        """Error of latency or mounting that makes the target appear to move; zero if there is
-        none."""
+        """Error of the camera's latency or mounting that would explain why the target appears to
+        move; zero if there is none."""
         return self.obs.camera_imu_mismatch or CameraImuMismatch()
 
     @cached_property

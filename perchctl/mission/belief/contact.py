@@ -147,12 +147,12 @@ def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
 
 
 def contact_height_tolerance_m(b: Belief) -> float:
-    """Return the height difference (m) between gear and target up to which a support may be a
-    contact.
+    """Return the largest height difference between gear and target, m, at which a support may be
+    the target.
 
-    The tolerance is capped so that it separates an obstacle from the target. The proof of a contact
-    (`CONTACT`) uses a smaller one with a positioning system; with the target alone, it allows for
-    drift of the estimated height.
+    It grows with the time since the last sighting, because the estimated height drifts, up to twice
+    `perch.contact_z_m`, so that an obstacle further below the target is not taken for it. `CONTACT`
+    has tolerances of its own.
     """
     planner = b.profile.planner
     drift_mps = (
@@ -205,8 +205,8 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
 def is_thrust_too_low_to_fly(b: Belief) -> bool:
     """True if the thrust is too small to support the vehicle.
 
-    The firmware's position mode does not go below `MIN_POSITION_MODE_THRUST`. With strong motors
-    this is more than `hold_ratio` times the hover thrust, and then it is the limit.
+    The limit is `complete.hold_ratio` times hover thrust. It is `MIN_POSITION_MODE_THRUST` if that
+    is larger and still too small to lift the vehicle, since position mode does not order less.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
     if MAX_NON_LIFTING_HOVER_FRACTION * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
@@ -215,8 +215,9 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 
 
 def is_above_hover_thrust(b: Belief) -> bool:
-    """True if the thrust exceeds hover thrust or is close to its limit. The limit is the ordered
-    thrust during a press by raw thrust, otherwise full thrust."""
+    """True if the thrust exceeds hover thrust, or is so close to its maximum that it cannot exceed
+    hover thrust by more. The maximum is the ordered thrust during a press by raw thrust, otherwise
+    full thrust."""
     most = SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
         most = PRESSING_FRACTION_OF_RAW_THRUST * max_press_thrust(b.profile)
@@ -316,7 +317,8 @@ def _is_hanging(b: Belief) -> bool:
 
 
 def _are_motors_off(b: Belief) -> bool:
-    """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
+    """True if the thrust is zero and the supervisor reports that the vehicle does not fly, or has
+    had `MOTORS_OFF_AFTER_STOP_ORDER_S` to do so."""
     motor_stop_ordered_s = b.sent.motor_stop_ordered_s
     long_off = (
         motor_stop_ordered_s is not None
@@ -448,11 +450,11 @@ class Support(Enum):
 def find_support(b: Belief) -> Support:
     """Return what supports the vehicle, from the conditions that are true in this tick.
 
-    A vehicle that hangs is on the magnet only if its gear is certainly within the magnet's radius,
-    and on something else only if it is certainly outside, or at another height than the target. In
-    between it is unknown, and a row must treat it as the worse of the two. It is also unknown while
-    the thrust or the position is, while the vehicle accelerates, and in the tick in which a new
-    maneuver begins.
+    A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
+    is on something else only if the gear is certainly outside, or at another height than the
+    target. If neither is certain, the support is UNKNOWN, and a row must assume the worse of the
+    two. The support is also UNKNOWN while thrust or position is unknown, while the vehicle
+    accelerates, and in the first tick of a maneuver.
     """
     if HANGING in b.since:
         return _find_what_vehicle_hangs_on(b)
@@ -482,10 +484,11 @@ def _find_what_vehicle_hangs_on(b: Belief) -> Support:
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     """True if the data that the condition depends on is fresh in this tick.
 
-    With the target alone, the position of the last sighting can prove a press for a while. During a
-    descent, `HANGING` starts a release. Late telemetry or a missing position may start it, too, or
-    the vehicle would hang there until its motors are cut; the release continues only with fresh
-    telemetry.
+    There are two exceptions. With the target as the only position source, `CONTACT` needs no valid
+    position during a press: the last sighting is good enough for a while. In a descent, `HANGING`
+    accepts telemetry as old as `safety.telemetry_hold_s` and needs no position: otherwise a vehicle
+    with poor telemetry would hang on the magnet with its motors running. The release that it starts
+    still needs fresh telemetry.
     """
     if condition is HANGING and b.sent.maneuver.descends:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s

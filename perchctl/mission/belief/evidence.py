@@ -52,8 +52,8 @@ StartTimes = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions o
 def update_start_times(
     old: StartTimes, conditions: Iterable[Condition[Knowledge]], knowledge: Knowledge, now_s: float
 ) -> dict[Condition[Knowledge], float]:
-    """Return the start time of each condition that is true for `seen`: the time in `old` if the
-    condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
+    """Return the start time of each condition that is true for `knowledge`: the time in `old` if
+    the condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
     return {each: old.get(each, now_s) for each in conditions if each.holds(knowledge)}
 
 

@@ -59,9 +59,9 @@ it."""
 
 
 def estimate_hover_thrust(b: Belief) -> HoverThrust:
-    """Return the filter's estimate; without one, the accelerometer's mean; without that, the value
-    of the newest sample. The fallbacks have the standard deviation
-    `FALLBACK_HOVER_THRUST_SIGMA`."""
+    """Return the filter's estimate. Without one, return the mean ratio of thrust to specific force
+    in flight, and without that, the ratio of the newest sample. Both fallbacks have the standard
+    deviation `FALLBACK_HOVER_THRUST_SIGMA`."""
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry

@@ -78,7 +78,7 @@ class SentOrders:
         self, shifted_setpoint: PositionSetpoint | None, by_m: Vector
     ) -> SentOrders:
         """Return the same orders with the start of the maneuver shifted by `by_m`, the motion
-        of the estimate's world frame, and with `setpoint` in the new frame."""
+        of the estimate's world frame, and with `shifted_setpoint`, which is in the new frame."""
         x, y, z = self.maneuver_start_m
         return replace(
             self,

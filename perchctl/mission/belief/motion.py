@@ -27,7 +27,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Self
+from typing import NamedTuple, Self
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.values import replace
@@ -207,14 +207,15 @@ class FreezeDetector:
 class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
-    Let a be the vertical acceleration minus its slowly learned offset, with decelerations harder
-    than `CEILING_IMPACT_G` cut off. The vertical speed gained recently is
+    Let a be the vertical acceleration minus its slowly learned offset, positive up, without
+    decelerations harder than `CEILING_IMPACT_G`. The climb rate v gained recently is
 
-        sink' = min(MAX_RISE_BEFORE_FALL_MPS, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
+        v' = min(MAX_RISE_BEFORE_FALL_MPS, v + a dt - v dt / SINK_TIME_CONSTANT_S)
 
-    so that braking a climb is no fall. The vehicle fell if that speed is beyond `FALL_SINK_MPS`, or
-    if the accelerometer has read less than `FREE_FALL_G` for longer than a rebound lasts. A sink
-    that is slow enough for the offset to learn it goes undetected.
+    The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
+    `FALL_SINK_MPS` (a negative limit), or if the accelerometer has read less than `FREE_FALL_G` for
+    `FREE_FALL_S`, longer than a rebound lasts. A slow sink goes undetected because it is learned as
+    an offset.
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
@@ -224,7 +225,7 @@ class FallDetector:
     vertical_offset_mps2: float = 0.0
 
     def update_fall(self, t_s: float, up_mps2: float, acc_z_g: float, dt_s: float) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `reads_g` is the
+        """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `acc_z_g` is the
         specific force along the body's z axis at the end of that time."""
         offset = self.vertical_offset_mps2 + (
             max(CEILING_IMPACT_G * GRAVITY_MPS2, min(-CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2))
@@ -255,8 +256,8 @@ class ImpactDetector:
     newest_impact: Impact = Impact()  # newest blow from below
 
     def update_impact(self, current: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `now` is the state
-        at that time, which a blow may have ended; `z_m` is the height in the state estimate."""
+        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `current` holds
+        time, speeds and specific force of the new sample, and `z_m` is its estimated height."""
         speed_gained_in_impact_mps = max(
             0.0,
             self.speed_gained_in_impact_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S)
@@ -286,9 +287,13 @@ def _newest_impact(
     recent_samples: tuple[Impact, ...],
     speed_gained_in_impact_mps: float,
 ) -> Impact:
-    """Return the newest blow, which has gained `gained_mps` so far, with the hardest peak of its
-    bounces. The speeds are minima over the last moment because the onboard estimate already
-    includes the whole blow before its second sample arrives."""
+    """Return the newest impact after one more sample.
+
+    An impact begins when the upward speed gained in it exceeds `FLOOR_IMPACT_MPS`. The speeds
+    before it are the lowest of `recent_samples`, since the onboard estimate often includes the
+    whole impact before it is detected. A bounce only adds a lower speed or a harder peak to the old
+    impact.
+    """
     follows = current.t_s - old.t_s <= BOUNCE_WINDOW_S
     if speed_gained_in_impact_mps > FLOOR_IMPACT_MPS:
         begun = Impact(
@@ -313,8 +318,8 @@ def _newest_impact(
 
 @dataclass(frozen=True)
 class SteadySpeed:
-    """Time since which the vertical speed has been constant and the lateral velocity close to its
-    mean."""
+    """Loop times since when the vertical speed has been constant, and since when the lateral
+    velocity has been close to its mean."""
 
     climb_steady_since_s: float = math.inf  # time since which the vertical speed has been constant
     steady_climb_mps: float = 0.0
@@ -348,8 +353,8 @@ class SteadySpeed:
 
 @dataclass(frozen=True)
 class PushDetector:
-    """Time of the last lateral push: the mean specific force across the body's z axis exceeded the
-    drag of any flight."""
+    """Time of the last lateral push: the mean specific force across the body's z axis exceeded
+    `MIN_PUSH_G`, more than drag in flight causes."""
 
     mean_lateral_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     last_push_at_s: float = -math.inf  # time of the last lateral push
@@ -454,8 +459,8 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
 
 
 def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """Return the motion after the first sample, or after one that does not continue the previous
-    one."""
+    """Return the motion after its first sample or after a silence: the detectors start again, and
+    the learned offsets stay. Record the silence, and whether a fall may have happened in it."""
     motion = replace(
         motion,
         climb_steady_since_s=new.t_s,
@@ -521,23 +526,33 @@ def _integrate_acceleration(
     return motion, dv[2] / dt_s
 
 
+class TiltError(NamedTuple):
+    """Error of the estimated roll and pitch, and the body's true rates about both axes."""
+
+    roll_pitch_error_rad: tuple[float, float]
+    roll_pitch_rate_radps: tuple[float, float]
+
+
 def _estimate_tilt_error(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the errors of roll and pitch due to corrections of the estimate, rad, and the
-    vehicle's own rates, rad/s. A lateral speed gained within one sample is a correction: the
-    rotation in that sample, beyond the previous rates, is not a motion of the vehicle. The error
-    decays as the firmware removes it."""
+) -> TiltError:
+    """Return the error of the estimated roll and pitch after one more sample.
+
+    If the lateral velocity steps within one sample, the estimate has been corrected, and its
+    attitude with it. The rotation in that sample beyond the previous body rates is then added to
+    the error, which decays as the firmware's filter removes it.
+    """
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
     (roll, pitch), rates = motion.roll_pitch_error_rad, motion.roll_pitch_rate_radps
     if gained_mps <= MIN_ESTIMATE_VELOCITY_STEP_MPS + ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 * dt_s:
-        return (kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s)
-    return (
+        return TiltError((kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s))
+    error = (
         kept * roll + turned[0] - rates[0] * dt_s,
         kept * pitch + turned[1] - rates[1] * dt_s,
-    ), rates
+    )
+    return TiltError(error, rates)
 
 
 _ACCELERATION = attrgetter("acc_x_g", "acc_y_g", "acc_z_g")

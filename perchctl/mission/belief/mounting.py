@@ -50,8 +50,8 @@ _MAX_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 class MountingSample:
     """Positions of vehicle and target at `t_s` in the world, as x + iy in m.
 
-    `axis_offset_m` is the vector from the vehicle to the point where its upward axis meets the
-    target's plane.
+    `up_axis_offset_xy_m` is the vector from the vehicle to the point where its upward axis meets
+    the target's plane.
     """
 
     t_s: float
@@ -66,7 +66,7 @@ class MountingSample:
 
 
 def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array) -> MountingSample:
-    """Return the sample for a target at `target_m` (3,), world, and the vehicle's pose in
+    """Return the sample for a target at `target_world_m` (3,), world, and the vehicle's pose in
     `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
@@ -82,7 +82,8 @@ def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array
 
 @dataclass(frozen=True)
 class MountingMonitor:
-    """The sightings since the target came into view, and their verdict on the mounting."""
+    """The sightings since the target came into view, and whether they contradict the camera's
+    mounting in the profile."""
 
     sightings: tuple[MountingSample, ...] = ()
     paused_until_s: float = -math.inf
@@ -99,7 +100,8 @@ class MountingMonitor:
 
     @property
     def is_awaiting_evidence(self) -> bool:
-        """True while no motion has shown yet that the target stands still."""
+        """True until the vehicle has moved far enough to show that the target stands still, as it
+        does if the mounting is right."""
         return not (self.is_confirmed or self.is_target_stationary)
 
 

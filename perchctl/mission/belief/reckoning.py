@@ -92,7 +92,7 @@ SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
 position."""
 WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
-`estimate_only_mps`."""
+`lateral_gain_of_estimate_only_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a silence."""
 
@@ -125,7 +125,7 @@ class DeadReckoning:
     # sum of the steps of the estimated position since that sighting
     position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
     last_position_step_s: float = -math.inf  # time of the newest step
-    climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
+    climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
     mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
@@ -144,10 +144,12 @@ def advance_reckoning(
 ) -> DeadReckoning:
     """Return the reckoning one tick later.
 
-    `corrected`: positions have arrived recently and correct the estimated velocity. `believed`: the
-    sample's estimated velocity is correct. With `pushed`, only its vertical part is: the firmware's
-    estimator does not see a lateral push until a position corrects it. `diverged`: the estimated
-    velocity may be in wrong axes, so the reckoned velocity is kept even after a silence.
+    - `is_estimate_believed`: adopt the sample's estimated velocity, and learn the bias from it.
+    - `is_position_correcting_velocity`: positions have corrected the estimated velocity recently.
+    - `ignores_lateral_estimate`: adopt only its vertical part, because the firmware's estimator
+      does not see a lateral push until a position corrects it.
+    - `is_position_diverged`: the estimated velocity may be in wrong axes, so keep the reckoned one,
+      even after a silence.
     """
     estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
     if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
@@ -186,8 +188,11 @@ def _restart(
     is_position_diverged: bool,
 ) -> DeadReckoning:
     """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
-    The velocity is the estimated one if believed; otherwise it changes by as much as the estimate
-    has since."""
+
+    The velocity becomes the estimated one if that is believed. If not, it changes by as much as the
+    estimated velocity did during the silence. With diverged positions, it does not use the
+    estimate.
+    """
     velocity_mps = estimated_velocity_mps if is_estimate_believed else ZERO
     if is_position_diverged:
         vx, vy, vz = old.velocity_mps
@@ -351,9 +356,9 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
 def learn_bias_at_rest(
     old: DeadReckoning, before: ImuMotion | None, now: ImuMotion
 ) -> DeadReckoning:
-    """Return the reckoning for a vehicle that is held still: all lateral acceleration between the
-    two motions is bias. The attitude error, and the bias with it, changes within a second after the
-    contact, since the wind that the estimate has taken for a tilt no longer moves the vehicle."""
+    """Return the reckoning of a vehicle that is held still, so that all lateral acceleration
+    between the two motions is bias. The bias must be learned anew: in wind, the estimated attitude
+    has an error, which disappears within a second after the contact."""
     if (
         before is None
         or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
@@ -375,7 +380,8 @@ def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the reckoning with its bias corrected for the tilt error due to wrong positions."""
+    """Return the reckoning with a corrected bias: positions in wrong axes have given the estimate a
+    velocity that the accelerometer has not measured, and a tilt error in proportion to it."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_gain_of_estimate_only_mps
     return replace(
         old,
@@ -390,9 +396,9 @@ def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
 def accumulate_position_step(
     old: DeadReckoning, last: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
-    """Return the reckoning with one more step of the estimated position: the part of its motion
-    between two samples that the velocity does not explain. After a gap in the samples, no step is
-    added."""
+    """Return the reckoning with one more step of the estimated position added to their sum, which
+    makes the offset at a contact less certain. A step is the motion between two samples beyond what
+    the estimated velocity explains. After a gap in the samples, no step is added."""
     dt_s = _position_time_s(sample) - _position_time_s(last)
     if not 0.0 < dt_s <= MAX_POSITION_STEP_INTERVAL_S:
         return old
@@ -423,9 +429,11 @@ def add_sighting(
     distance_below_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
-    """Return the reckoning restarted at a sighting: `lateral_offset_m` (world x, y) with the
-    standard deviation `sigma_m`, and `distance_below_m`, are the offset from the gear to the
-    target."""
+    """Return the reckoning restarted at a sighting.
+
+    `lateral_offset_m` is the vector from the gear to the target (world x, y), with the standard
+    deviation `sigma_m`; `distance_below_m` is how far the gear is below the target.
+    """
     return replace(
         old,
         last_sighting_at_s=t_s,

@@ -59,15 +59,16 @@ class TargetBelief:
 
     @property
     def is_far_above(self) -> bool:
-        """True if the camera sees the target so far above that it cannot hold the vehicle."""
+        """True if the target is so far above the gear that its magnet cannot be holding the
+        vehicle."""
         return self.world_m is not None and self.error_z_m > MIN_FAR_ABOVE_M
 
     @classmethod
     def from_estimate(
         cls, target: TargetEstimate | None, t_s: float, camera_latency_s: float, profile: Profile
     ) -> TargetBelief:
-        """Return the belief at `t_s` from the pipeline's estimate; `latency_s` is the age of a
-        picture on arrival."""
+        """Return the belief at `t_s` from the pipeline's estimate; `camera_latency_s` is the age of
+        a picture on arrival."""
         if target is None:
             return cls()
         goal_z_m = math.inf

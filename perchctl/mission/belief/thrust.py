@@ -52,7 +52,8 @@ class HoverThrust:
         return self.sigma > MAX_PRECISE_THRUST_SIGMA
 
     def propagate(self, dt_s: float, drift_per_sqrt_s: float) -> HoverThrust:
-        """Return the estimate `dt_s` later, with a random walk of `drift` in between."""
+        """Return the estimate `dt_s` later; its standard deviation has grown by a random walk of
+        `drift_per_sqrt_s`, a share of the thrust per square root of a second."""
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift_per_sqrt_s**2 * dt_s))
 
     def propagate_unmeasured(self, dt_s: float) -> HoverThrust:
@@ -62,7 +63,8 @@ class HoverThrust:
         return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)))
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
-        """Return the estimate after a measurement of weight `dt_s`, in seconds; unchanged for 0."""
+        """Return the estimate after a measurement: the mean thrust over `dt_s`. A longer time gives
+        it more weight; with 0, nothing changes."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma):

@@ -82,8 +82,7 @@ TARGET_SCATTER_DECAY_PER_FRAME = 0.9
 def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: Profile) -> Belief:
     """Return the belief after one more observation; `sent` holds the planner's orders so far.
 
-    A wrong observation makes the belief wrong for some seconds; each part documents the data it
-    depends on.
+    A wrong observation makes the belief wrong for up to some seconds, until the filters forget it.
     """
     b = replace(belief, obs=obs, profile=profile, sent=sent, world_frame_shift_m=ZERO)
     b = _update_target(b)
@@ -104,7 +103,8 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
 
 
 def has_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
-    """True if the planner has not run for longer than a position may be missing."""
+    """True if more time has passed since the planner's last tick than a position may be missing,
+    `positioning.hold_s`."""
     return belief.last_telemetry is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
 
 
@@ -125,8 +125,8 @@ def reset_evidence(b: Belief) -> Belief:
 
 
 def update_after_command(b: Belief, command: Command) -> Belief:
-    """Return the belief after a command was sent. A setpoint ends the comparison with a raw
-    thrust."""
+    """Return the belief after a command was sent. Any command but raw thrust or idle ends the check
+    that the reported thrust follows the ordered raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
     return replace(b, thrust_mismatch_since_s=None)
@@ -216,8 +216,8 @@ def _translate(place_m: Vector, by_m: Vector) -> Vector:
 
 
 def _compare_ordered_thrust(b: Belief) -> Belief:
-    """Return the belief with the time since which the reported thrust differs from an ordered
-    one."""
+    """Return the belief with the loop time since when the reported thrust has differed from the
+    ordered raw thrust by more than `MAX_THRUST_MISMATCH_FRACTION`; None while they agree."""
     order = b.sent.raw_thrust
     if order is None:
         return b
@@ -325,8 +325,8 @@ def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Restart at a frame that measured the target; with a deck or motion capture, also in each
-    tick, from the target's position in the world."""
+    """Restart the dead reckoning at each frame that measured the target. With a deck or motion
+    capture, restart it in every tick, from the target's known position in the world."""
     obs, target = b.obs, b.obs.target
     if target is None:
         return new
@@ -350,8 +350,12 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Correct the height with the target alone: a support just below the target is the target. Late
-    pictures make the vehicle seem lower."""
+    """Correct the reckoned height of a supported vehicle, with the target as the only position
+    source.
+
+    Late pictures make the vehicle seem lower than it is. If it is supported just below the target,
+    it touches the target, so its distance below becomes 0.
+    """
     near = (
         b.is_positioned_by_target
         and not b.sent.maneuver.descends
@@ -447,7 +451,7 @@ def _update_estimators(b: Belief) -> Belief:
 
 
 def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
-    """Return the mean lean after a sample that covers `sample_s`."""
+    """Return the mean lean after a sample that covers `sample_dt_s`."""
     gain = 1.0 - math.exp(-sample_dt_s / LEAN_TIME_CONSTANT_S)
     (x, y), (mean_x, mean_y) = b.lean_sine_world_xy, b.mean_lean_sine_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)

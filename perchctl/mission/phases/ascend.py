@@ -59,8 +59,8 @@ def is_near_standoff(c: Context) -> bool:
 
 
 def _is_settled(c: Context) -> bool:
-    """True if the vehicle is slow and below the target at the stand-off, by the small marker (fault
-    33)."""
+    """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
+    the small marker recently."""
     ascend, target = c.planner.ascend, c.belief.target
     return (
         target.is_fresh
@@ -90,7 +90,7 @@ def _is_at_hover_place(c: Context) -> bool:
 
 
 def is_climbing_back(state: PlannerState) -> bool:
-    """True if the ascent brings a hover that has sunk back to its place."""
+    """True if this ascent returns a vehicle that has sunk during its hover to the hover's place."""
     return state.phase is Phase.ASCEND and Claim.RESUMES_HOVER in state.entry.claims
 
 

@@ -43,7 +43,7 @@ SUNK = Condition[Context]("sunk", lambda c: height_error_m(c) > MAX_HOVER_SINK_M
 
 
 def hover_config(c: Context) -> HoverConfig:
-    """Return the hover that the mission flies."""
+    """Return the profile's hover section, or its defaults if the mission does not hover."""
     return c.planner.hover or HoverConfig()
 
 
@@ -58,7 +58,8 @@ def hover_duration_s(c: Context) -> float:
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Start the hover's time and its position errors, unless the vehicle has only climbed back."""
+    """Start the hover's time and its position errors. They continue if the vehicle only climbed
+    back to its place within `MAX_CLIMB_BACK_S`."""
     if is_climbing_back(before.state) and before.in_phase_s <= MAX_CLIMB_BACK_S:
         return state
     return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))

@@ -59,8 +59,9 @@ def unconfirmed_landing_reason(c: Context) -> str:
 
 
 def _outcome_after_hanging(before: Outcome | None) -> Outcome | None:
-    """Return the outcome of a vehicle that hangs: it has found its target after all. A hover that
-    ends on the magnet has gone wrong."""
+    """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
+    ATTEMPTS_USED_UP, since it hangs on a target; HOVERED becomes SAFETY, since a hover must not end
+    on the magnet; others stay."""
     if before is Outcome.HOVERED:
         return Outcome.SAFETY
     return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before

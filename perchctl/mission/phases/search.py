@@ -38,8 +38,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """Wait, climb one step, turn one step and wait again, never above the height limit. Search for
-    a target that was seen before from below its position."""
+    """Wait, climb one step, turn one step and wait again, never above the height limit. If the
+    target was seen before, search from below its last position instead."""
     search, state, b = c.planner.search, c.state, c.belief
     takeoff_position_m = b.takeoff_position_m
     assert takeoff_position_m is not None
