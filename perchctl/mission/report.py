@@ -185,7 +185,7 @@ class FlightReport:
         obs: Observation,
         profile: Profile,
         history: tuple[Event, ...],
-        consistency: CameraErrors | None,
+        camera_errors: CameraErrors | None,
         *,
         simulated: bool = False,
     ) -> FlightReport:
@@ -210,9 +210,9 @@ class FlightReport:
             is_vehicle_locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None
-            if consistency is None
+            if camera_errors is None
             else CameraFindings.from_camera_errors(
-                consistency, profile.camera, simulated=simulated
+                camera_errors, profile.camera, simulated=simulated
             ),
             last_contact_offset=contact if placed else None,
             touchdown=find_touchdown(Context(replace(state, belief=b))),

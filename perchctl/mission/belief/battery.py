@@ -119,8 +119,8 @@ class PowerTrain:
     Attributes:
         full_thrust_current_a: current of the four motors at full thrust, A; at lower thrust, the
             current is assumed proportional to the thrust.
-        low_power_v: voltage below which the firmware reports low power, V, unless `pm.lowVoltage`
-            is set.
+        low_power_warning_v: voltage below which the firmware reports low power, V, unless
+            `pm.lowVoltage` is set.
     """
 
     full_thrust_current_a: float

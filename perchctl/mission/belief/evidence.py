@@ -31,7 +31,7 @@ class Condition(Generic[Knowledge]):
     Attributes:
         name: readable name, for `repr`.
         holds: function that returns True if the condition is true in this tick.
-        is_phase_independent: True if the condition describes the vehicle independently of its
+        persists_across_phases: True if the condition describes the vehicle independently of its
             maneuver: a change of phase or a hold does not reset its start time.
         depends_on: data that must be fresh for the condition to count. A condition that may stop
             the motors or end a flight depends at least on fresh telemetry.

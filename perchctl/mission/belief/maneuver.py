@@ -31,10 +31,10 @@ class Maneuver:
         presses: the vehicle is meant to touch the target. With the target alone, the position of
             the last sighting may prove a contact. Such a maneuver is neither in free air nor guided
             by the camera, so that no hold applies: it would leave the vehicle pressed.
-        retreats: the vehicle leaves the position where an attempt ended, so the last touch still
-            counts.
-        descends: the vehicle descends. The support may be the floor; the start of the descent
-            distinguishes hanging from standing.
+        retreats: the vehicle leaves the position where an attempt ended. If something still holds
+            it there, its offset from the target is that of the last touch.
+        descends: the vehicle descends. If something supports it, it hangs if it is still where the
+            descent began, and stands on the floor if it has come down.
     """
 
     in_free_air: bool = False

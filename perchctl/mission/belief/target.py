@@ -102,9 +102,9 @@ class VisualMotion:
 
     Attributes:
         t_s: exposure of the newest detection.
-        since_s: exposure of the first detection after the last gap.
-        e_m: newest position of the target from the gear (ahead, left, up), m.
-        velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
+        detected_since_s: exposure of the first detection after the last gap.
+        target_from_gear_m: newest position of the target from the gear (ahead, left, up), m.
+        vehicle_velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf

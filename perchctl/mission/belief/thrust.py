@@ -39,7 +39,8 @@ class HoverThrust:
     Attributes:
         thrust: 0..65535; 0 while unknown.
         sigma: standard deviation, as a share of `thrust`.
-        before_descent: `thrust` and `sigma` at the start of a descent by thrust; None before one.
+        thrust_sigma_before_descent: `thrust` and `sigma` at the start of a descent by thrust; None
+            before one.
     """
 
     thrust: float = 0.0
