@@ -126,7 +126,10 @@ class FlightLog:
                 collect_written_names(TickRecord, _whole_turn(record), names)
         for each in exact_fields(TickRecord):
             is_since_4 = each.owner == "Turn" and each.name in ("outcome", "reason", "error")
-            if each.is_always_written or (is_since_4 and self.header["version"] < 4):
+            # No log without ``turn_fields`` is as new as this one.
+            is_newer = (each.owner, each.name) == ("TargetEstimate", "measured_offset_m")
+            is_newer = is_newer or (is_since_4 and self.header["version"] < 4)
+            if each.is_always_written or is_newer:
                 continue
             if each.owner in names:
                 names[each.owner].add(each.name)

@@ -375,6 +375,10 @@ def _estimate_at_frame(
     measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_track)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
+    frames = _express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline)
+    offset_m = None if previous_estimate is None else previous_estimate.measured_offset_m
+    if measured:
+        offset_m = None if attitude is None else attitude.R_world_level.dot(frames["e_m"])
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s
@@ -391,7 +395,8 @@ def _estimate_at_frame(
         measured=measured,
         tracked=True,
         unseen=merged.unseen_frames,
-        **_express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline),
+        measured_offset_m=offset_m,
+        **frames,
     )
 
 

@@ -305,6 +305,9 @@ class TargetEstimate:
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: the filter's velocity of `e_m` (`kalman.frame: level`) or of the target in the
             world (`kalman.frame: world`), in level axes, (3,).
+        measured_offset_m: vector from the gear to the target at `measured_s`, in axes of the state
+            estimate's world, (3,); None without an attitude. Unlike `e_m`, it does not depend on
+            how far the vehicle has moved since.
         world_m, world_yaw_rad: the target in the world frame of the vehicle's state estimate; None
             without an attitude. world_velocity_mps: drift of that frame relative to the target,
             None if the filter works in the level frame.
@@ -325,6 +328,7 @@ class TargetEstimate:
     world_m: Array | None = None
     world_yaw_rad: float | None = None
     world_velocity_mps: Array | None = None
+    measured_offset_m: Array | None = None
 
 
 class MotionErrors(NamedTuple):
