@@ -38,13 +38,13 @@ HEIGHT_DAMPING_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
 MAX_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
-LATERAL_ERROR_GAIN = 2.0
+LATERAL_ERROR_GAIN = 3.0
 """Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate.
 Smaller: the thrust's fluctuation moves the vehicle further."""
-LATERAL_DAMPING_S = 0.8
+LATERAL_DAMPING_S = 1.1
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
 velocity moves the vehicle. Smaller: it oscillates."""
-LEAN_ACCELERATION_DAMPING_S2 = 0.08
+LEAN_ACCELERATION_DAMPING_S2 = 0.13
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
 MAX_FULL_FEEDBACK_AGE_S = 0.06
@@ -228,22 +228,40 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
     gain = max(0.0, min(1.0, near, prompt))
     if gain == 0.0:
         return 0.0, 0.0
-    (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps
-    ax, ay = c.belief.acceleration_from_lean_mps2
+    (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error(c, reference)
+    ax_mps2, ay_mps2 = c.belief.acceleration_from_lean_mps2
     dx = (
-        LATERAL_ERROR_GAIN * (reference.x_m - x)
-        - LATERAL_DAMPING_S * vx
-        - LEAN_ACCELERATION_DAMPING_S2 * ax
+        LATERAL_ERROR_GAIN * error_x_m
+        - LATERAL_DAMPING_S * vx_mps
+        - LEAN_ACCELERATION_DAMPING_S2 * ax_mps2
     )
     dy = (
-        LATERAL_ERROR_GAIN * (reference.y_m - y)
-        - LATERAL_DAMPING_S * vy
-        - LEAN_ACCELERATION_DAMPING_S2 * ay
+        LATERAL_ERROR_GAIN * error_y_m
+        - LATERAL_DAMPING_S * vy_mps
+        - LEAN_ACCELERATION_DAMPING_S2 * ay_mps2
     )
     dx, dy = gain * dx, gain * dy
     size = math.hypot(dx, dy)
     part = 1.0 if size <= MAX_LATERAL_CORRECTION_M else MAX_LATERAL_CORRECTION_M / size
     return part * dx, part * dy
+
+
+def _lateral_error(
+    c: Context, reference: PositionSetpoint
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
+    (x, y) in world axes: from pictures and lean while recent pictures show the target, otherwise
+    from the state estimate."""
+    offset, tel = c.belief.lateral_offset, c.telemetry
+    if offset is None or c.belief.target.world_m is None:
+        x_m, y_m, _ = tel.position_m
+        return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
+    # The reference may still be on its way to the target.
+    x_m, y_m = body_world_xy_under_target(c, reference.yaw_rad)
+    return (
+        reference.x_m - x_m + offset.offset_m[0],
+        reference.y_m - y_m + offset.offset_m[1],
+    ), offset.velocity_mps
 
 
 def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:

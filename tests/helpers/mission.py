@@ -103,6 +103,7 @@ def target_at(
         world_m=np.array(world_m),
         world_yaw_rad=0.0,
         world_velocity_mps=np.zeros(3),
+        measured_offset_m=np.array(world_m) - gear_m,
     )
     return replace(pose, **changes)  # type: ignore[arg-type]
 

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
+from perchctl.mission.belief.mounting import MountingMonitor
+from perchctl.mission.setpoints import LEAN_ACCELERATION_DAMPING_S2
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
-from tests.helpers.mission import HANG_Z_M, observation, state_in, target_at, telemetry
+from tests.helpers.mission import HANG_Z_M, observation, remembering, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, fly
 
 Z_M = HANG_Z_M - 0.3
@@ -61,7 +63,9 @@ def test_a_lean_is_met_by_a_setpoint_on_its_other_side(
     assert isinstance(at_once, PositionSetpoint)
     along_m = at_once.x_m * math.cos(towards_rad) + at_once.y_m * math.sin(towards_rad)
     across_m = at_once.y_m * math.cos(towards_rad) - at_once.x_m * math.sin(towards_rad)
-    assert along_m == pytest.approx(-0.08 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05)
+    assert along_m == pytest.approx(
+        -LEAN_ACCELERATION_DAMPING_S2 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05
+    )
     assert across_m == pytest.approx(0.0, abs=1e-4)
     later = fly(ascending(), leaning(lean_rad, towards_rad, heading_rad, math.inf), 4.0).command
     assert isinstance(later, PositionSetpoint)
@@ -105,18 +109,30 @@ class Hovering(Motors):
     Setpoint to speed 2 /s, speed to lean 25 deg for 1 m/s, and a lean that follows with 6 /s and
     the rotors' 0.05 s (docs/firmware.md). `disturbed_mps2` is the deviation of a fluctuating level
     acceleration with a memory of 0.1 s, `late_s` the time from a setpoint to the controller, and
-    `age_s` the age of the telemetry.
+    `age_s` the age of the telemetry. The estimate wanders as that of a vehicle with a Flow deck: by
+    `wander_m` with a memory of 0.3 s, and its velocity by 2.5 m/s per metre of it. Every second
+    tick, the newest picture is 0.08 s old; `pictures` is False for one that measures no offset.
     """
 
     def __init__(
-        self, disturbed_mps2: float, late_s: float, begin_m: float = 0.0, age_s: float = 0.0
+        self,
+        disturbed_mps2: float,
+        late_s: float,
+        begin_m: float = 0.0,
+        age_s: float = 0.0,
+        *,
+        wander_m: float = 0.0,
+        pictures: bool = True,
     ) -> None:
         super().__init__()
+        self._wander_m, self._pictures, self._off_m, self._off_mps = wander_m, pictures, 0.0, 0.0
+        self._shown: deque[tuple[float, float]] = deque(maxlen=round(0.08 / (2 * TICK_S)) + 1)
         self._samples: deque[Telemetry] = deque(maxlen=round(age_s / TICK_S) + 1)
         self.x_m, self.speed_mps, self.lean_rad, self.rate_radps = begin_m, 0.0, 0.0, 0.0
         self.path_m: list[float] = []
         self._push_mps2, self._disturbed_mps2 = 0.0, disturbed_mps2
         self._random = np.random.default_rng(20261130)
+        self._wandering = np.random.default_rng(20261201)
         self._sent = deque([0.0] * round(late_s / TICK_S + 1))
 
     def look(self, t_s: float, state: PlannerState) -> Observation:
@@ -134,13 +150,27 @@ class Hovering(Motors):
             self.speed_mps += pull_mps2 * dt_s
             self.x_m += self.speed_mps * dt_s
         self.path_m.append(self.x_m)
+        self._off_m, self._off_mps = (
+            math.exp(-TICK_S / memory_s) * old
+            + sigma * math.sqrt(1.0 - math.exp(-2.0 * TICK_S / memory_s)) * self._wandering.normal()
+            for old, memory_s, sigma in (
+                (self._off_m, 0.3, self._wander_m),
+                (self._off_mps, 0.1, 2.5 * self._wander_m),
+            )
+        )
         sample = telemetry(
-            t_s, position_m=(self.x_m, 0.0, Z_M), pitch_rad=self.lean_rad,
-            velocity_mps=(self.speed_mps, 0.0, 0.0),
+            t_s, position_m=(self.x_m + self._off_m, 0.0, Z_M), pitch_rad=self.lean_rad,
+            velocity_mps=(self.speed_mps + self._off_mps, 0.0, 0.0),
         )  # fmt: skip
         self._samples.append(sample)
         oldest = self._samples[0]
         target = target_at(t_s, body_m=oldest.position_m)
+        if self._wander_m:
+            if len(self.path_m) % 2:
+                self._shown.append((t_s, self.x_m))
+            shown_s, shown_m = self._shown[0]
+            offset_m = np.array([-shown_m, 0.0, 0.0]) if self._pictures else None
+            target = replace(target, measured_s=shown_s, measured_offset_m=offset_m)
         return observation(t_s, telemetry=oldest, target=target)
 
     def obey(self, state: PlannerState, command: Command) -> None:
@@ -183,6 +213,19 @@ def test_fluctuating_thrust_moves_the_vehicle_less_than_its_own_controller_lets_
     end_s = len(fed.path_m) * TICK_S
     assert end_s > 15.0
     assert fed.spread_m(2.0, end_s) < 0.6 * left.spread_m(2.0, end_s)
+
+
+def test_pictures_and_lean_hold_the_vehicle_where_its_estimate_wanders() -> None:
+    """Late pictures that measure the offset leave less than half of the distance that the state
+    estimate leaves, which wanders by 2 mm."""
+    spreads_m = []
+    for pictures in (True, False):
+        vehicle = Hovering(0.0, 0.02, wander_m=0.002, pictures=pictures)
+        confirmed = remembering(ascending(), mounting=MountingMonitor(is_confirmed=True))
+        flight = fly(confirmed, vehicle, 20.0, one_phase=True)
+        assert flight.ticks[-1].t_s > BEGIN_S + 15.0
+        spreads_m.append(vehicle.spread_m(2.0, len(vehicle.path_m) * TICK_S))
+    assert spreads_m[0] < 0.5 * spreads_m[1]
 
 
 def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.lateral_offset import LateralOffset, LateralOffsetFilter
 from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
@@ -98,6 +99,8 @@ class Belief:
     target_position_scatter_m: float = 0.0  #: distance between the targets of successive frames
     #: vehicle's velocity from pictures alone
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
+    #: Kalman filter of the lateral offset from the target
+    lateral_offset_filter: LateralOffsetFilter = field(default_factory=LateralOffsetFilter)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     #: low-passed `lean_sine_world_xy`, with the time constant `LEAN_TIME_CONSTANT_S`
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
@@ -407,6 +410,15 @@ class Belief:
         return TargetBelief.from_estimate(
             self.obs.target, self.obs.t_s, self.camera_latency_s, self.profile
         )
+
+    @cached_property
+    def lateral_offset(self) -> LateralOffset | None:
+        """Lateral offset from the gear to the target and velocity, from pictures and lean. None if
+        the last pictures are too old or too few, or once they contradict the vehicle's motion: with
+        a rotated camera, this velocity would damp nothing."""
+        if self.mounting.is_wrong or self.obs.camera_imu_mismatch is not None:
+            return None
+        return self.lateral_offset_filter.predict(self.obs.t_s)
 
     @cached_property
     def camera_imu_mismatch(self) -> CameraImuMismatch:

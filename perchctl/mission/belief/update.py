@@ -38,6 +38,7 @@ from perchctl.mission.belief.evidence import (
     keep_persistent_start_times,
     update_start_times,
 )
+from perchctl.mission.belief.lateral_offset import MotionSample
 from perchctl.mission.belief.maneuver import SentOrders
 from perchctl.mission.belief.motion import ZERO, Vector
 from perchctl.mission.belief.mounting import MountingMonitor, make_mounting_sample, update_monitor
@@ -85,6 +86,8 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
     A wrong observation makes the belief wrong for up to some seconds, until the filters forget it.
     """
     b = replace(belief, obs=obs, profile=profile, sent=sent, world_frame_shift_m=ZERO)
+    sample = MotionSample(obs.telemetry.t_s, b.acceleration_from_lean_mps2, b.velocity_mps[:2])
+    b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
     if has_gap(belief, obs, profile):
         b = _reset_after_gap(b)
@@ -142,6 +145,12 @@ def _update_target(b: Belief) -> Belief:
     if not b.obs.has_new_frame or target is None or not target.measured:
         return b
     b = replace(b, visual_motion=b.visual_motion.with_detection(target))
+    if target.measured_offset_m is not None:
+        x_m, y_m, _ = target.measured_offset_m.tolist()
+        filtered = b.lateral_offset_filter.with_picture(
+            target.measured_s, (x_m, y_m), float(max(target.sigma_m[:2]))
+        )
+        b = replace(b, lateral_offset_filter=filtered)
     if target.world_m is None:
         return b
     spread_m = 0.0

@@ -61,12 +61,13 @@ def is_near_standoff(c: Context) -> bool:
 def _is_settled(c: Context) -> bool:
     """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
     the small marker recently."""
-    ascend, target = c.planner.ascend, c.belief.target
+    ascend, target, offset = c.planner.ascend, c.belief.target, c.belief.lateral_offset
+    error_xy_m = target.error_xy_m if offset is None else math.hypot(*offset.offset_m)
     return (
         target.is_fresh
         and target.is_small_marker_fresh
         and is_near_standoff(c)
-        and target.error_xy_m <= ascend.settle_xy_m
+        and error_xy_m <= ascend.settle_xy_m
         and abs(target.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.belief.speed_mps <= ascend.settle_speed_mps
     )

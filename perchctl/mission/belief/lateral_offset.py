@@ -1,0 +1,203 @@
+"""The vehicle's lateral offset from the target, by a Kalman filter of its own.
+
+Below the target, a picture measures the offset to a fraction of a millimetre, but a tenth of a
+second late, and the estimated position wanders by two millimetres meanwhile. Attitude and estimated
+velocity say better how the vehicle has moved since: a hovering vehicle accelerates to where it
+leans. For each of the axes x and y, with the offset e from the gear to the target, the vehicle's
+velocity v, and the acceleration a of the lean:
+
+    de/dt = -v        dv/dt = a + w        picture: e + n_e        state estimate: v + n_v
+
+w is white noise (gusts, thrust that fluctuates, an error of the mean lean), n_e the noise of a
+picture's pose, n_v that of the estimated velocity. Pictures come late, so the filter stays at the
+exposure of the newest picture and keeps the telemetry samples since then; a later time is predicted
+through these samples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from perchctl.values import replace
+
+LateralVector = tuple[float, float]
+
+ACCELERATION_NOISE_MPS2 = 0.15
+"""Standard deviation of the acceleration that the lean does not explain, m/s^2, which lasts for
+`ACCELERATION_NOISE_S`. Larger: the velocity follows the noise of single pictures. Smaller: after a
+gust, the offset lags behind."""
+ACCELERATION_NOISE_S = 0.1
+"""Duration of such an acceleration, s."""
+MIN_PICTURE_SIGMA_M = 0.0005
+"""Smallest standard deviation of a picture's offset, m: attitude and exposure time are not exact,
+either. Smaller: the velocity follows their errors."""
+START_VELOCITY_SIGMA_MPS = 0.3
+"""Standard deviation of the unknown velocity at the first picture, m/s."""
+ESTIMATED_VELOCITY_SIGMA_MPS = 0.04
+"""Standard deviation of the estimated velocity, m/s, as if each sample had an error of its own; the
+error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an acceleration that the
+lean does not explain is noticed a picture later. Smaller: the error of the estimate moves the
+vehicle."""
+MAX_GAP_S = 0.5
+"""Longest time from picture to picture, and from the newest picture to a prediction, s. Larger: a
+gust moves the vehicle unnoticed. Smaller: the last centimetres are flown by the state estimate."""
+RESTART_NIS = 20.0
+"""Normalized innovation squared, two degrees of freedom, with which a picture restarts the filter:
+exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
+wrong."""
+MAX_VELOCITY_SIGMA_MPS = 0.03
+"""Largest standard deviation of a velocity that is used, m/s. Larger: the vehicle is steered by the
+first pictures' noise."""
+
+
+@dataclass(frozen=True)
+class LateralOffset:
+    """Offset from the gear to the target and velocity of the vehicle, world axes, with the standard
+    deviations of each axis."""
+
+    offset_m: LateralVector
+    velocity_mps: LateralVector
+    sigma_m: float
+    velocity_sigma_mps: float
+
+
+class MotionSample(NamedTuple):
+    """Acceleration of the lean and estimated velocity of a telemetry sample, world axes (x, y)."""
+
+    t_s: float
+    acceleration_mps2: LateralVector
+    velocity_mps: LateralVector
+
+
+@dataclass(frozen=True)
+class LateralOffsetFilter:
+    """The filter at the exposure of the newest picture, `t_s`; -inf before the first one.
+
+    `covariance` holds the variance of the offset, its covariance with the velocity, and the
+    variance of the velocity, of either axis (m^2, m^2/s, m^2/s^2). `samples` holds the telemetry
+    since then, and some from before.
+    """
+
+    t_s: float = -math.inf
+    offset_m: LateralVector = (0.0, 0.0)
+    velocity_mps: LateralVector = (0.0, 0.0)
+    covariance: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    samples: tuple[MotionSample, ...] = ()
+
+    def with_sample(self, sample: MotionSample) -> LateralOffsetFilter:
+        """Return the filter with a telemetry sample. One that is not newer than the newest is
+        ignored; those that no picture can need are dropped."""
+        kept = self.samples
+        if kept and sample.t_s <= kept[-1].t_s:
+            return self
+        first = 0
+        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_GAP_S:
+            first += 1
+        return replace(self, samples=(*kept[first:], sample))
+
+    def with_picture(
+        self, t_s: float, offset_m: LateralVector, sigma_m: float
+    ) -> LateralOffsetFilter:
+        """Return the filter after a picture exposed at `t_s` that measured the offset."""
+        if t_s <= self.t_s:
+            return self
+        variance_m2 = max(sigma_m, MIN_PICTURE_SIGMA_M) ** 2
+        if t_s - self.t_s > MAX_GAP_S:
+            return self._restart(t_s, offset_m, variance_m2)
+        predicted = self._predict(t_s)
+        p_ee, p_ev, p_vv = predicted.covariance
+        innovation_m = (
+            offset_m[0] - predicted.offset_m[0],
+            offset_m[1] - predicted.offset_m[1],
+        )
+        innovation_variance_m2 = p_ee + variance_m2
+        if math.hypot(*innovation_m) ** 2 > RESTART_NIS * innovation_variance_m2:
+            return self._restart(t_s, offset_m, variance_m2)
+        gain_e, gain_v = p_ee / innovation_variance_m2, p_ev / innovation_variance_m2
+        return replace(
+            predicted,
+            offset_m=_add(predicted.offset_m, gain_e, innovation_m),
+            velocity_mps=_add(predicted.velocity_mps, gain_v, innovation_m),
+            covariance=((1.0 - gain_e) * p_ee, (1.0 - gain_e) * p_ev, p_vv - gain_v * p_ev),
+        )
+
+    def predict(self, t_s: float) -> LateralOffset | None:
+        """Return the estimate at `t_s`; None if the newest picture is older than `MAX_GAP_S`, or
+        while the velocity is less certain than `MAX_VELOCITY_SIGMA_MPS`."""
+        if not 0.0 <= t_s - self.t_s <= MAX_GAP_S:
+            return None
+        if math.sqrt(self.covariance[2]) > MAX_VELOCITY_SIGMA_MPS:
+            return None
+        predicted = self._predict(t_s)
+        p_ee, _, p_vv = predicted.covariance
+        return LateralOffset(
+            predicted.offset_m, predicted.velocity_mps, math.sqrt(p_ee), math.sqrt(p_vv)
+        )
+
+    def _restart(
+        self, t_s: float, offset_m: LateralVector, variance_m2: float
+    ) -> LateralOffsetFilter:
+        return replace(
+            self,
+            t_s=t_s,
+            offset_m=offset_m,
+            velocity_mps=(0.0, 0.0),
+            covariance=(variance_m2, 0.0, START_VELOCITY_SIGMA_MPS**2),
+        )
+
+    def _predict(self, t_s: float) -> LateralOffsetFilter:
+        """Return the filter at the later time `t_s`, through the samples until then. Between two
+        samples, the acceleration is their mean; after the newest, it stays."""
+        predicted, before = self, self.samples[0] if self.samples else None
+        for sample in self.samples:
+            if sample.t_s > predicted.t_s:
+                assert before is not None
+                mean_mps2 = _add(
+                    (0.5 * before.acceleration_mps2[0], 0.5 * before.acceleration_mps2[1]),
+                    0.5,
+                    sample.acceleration_mps2,
+                )
+                predicted = predicted._propagate(min(t_s, sample.t_s), mean_mps2)
+                if sample.t_s > t_s:
+                    return predicted
+                predicted = predicted._with_velocity(sample.velocity_mps)
+            before = sample
+        return predicted._propagate(t_s, (0.0, 0.0) if before is None else before.acceleration_mps2)
+
+    def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
+        """Return the filter at `t_s` after a constant acceleration."""
+        dt_s = t_s - self.t_s
+        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_S
+        p_ee, p_ev, p_vv = self.covariance
+        moved_m = _add(self.offset_m, -dt_s, self.velocity_mps)
+        return replace(
+            self,
+            t_s=t_s,
+            offset_m=_add(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
+            velocity_mps=_add(self.velocity_mps, dt_s, acceleration_mps2),
+            covariance=(
+                p_ee - 2.0 * dt_s * p_ev + dt_s**2 * p_vv + density * dt_s**3 / 3.0,
+                p_ev - dt_s * p_vv - density * dt_s**2 / 2.0,
+                p_vv + density * dt_s,
+            ),
+        )
+
+    def _with_velocity(self, velocity_mps: LateralVector) -> LateralOffsetFilter:
+        """Return the filter after a measurement of the velocity at its own time."""
+        p_ee, p_ev, p_vv = self.covariance
+        variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
+        gain_e, gain_v = p_ev / variance, p_vv / variance
+        innovation_mps = _add(velocity_mps, -1.0, self.velocity_mps)
+        return replace(
+            self,
+            offset_m=_add(self.offset_m, gain_e, innovation_mps),
+            velocity_mps=_add(self.velocity_mps, gain_v, innovation_mps),
+            covariance=(p_ee - gain_e * p_ev, (1.0 - gain_v) * p_ev, (1.0 - gain_v) * p_vv),
+        )
+
+
+def _add(a: LateralVector, factor: float, b: LateralVector) -> LateralVector:
+    """Return ``a + factor * b``."""
+    return a[0] + factor * b[0], a[1] + factor * b[1]
