@@ -251,9 +251,11 @@ def _lateral_error(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
     (x, y) in world axes: from pictures and lean while recent pictures show the target, otherwise
-    from the state estimate."""
-    offset, tel = c.belief.lateral_offset, c.telemetry
-    if offset is None or c.belief.target.world_m is None:
+    from the state estimate. A take-off and a landing go by the state estimate, too: they do not
+    follow the target."""
+    offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.sent.maneuver
+    follows_target = maneuver.is_camera_guided or maneuver.presses
+    if offset is None or not follows_target or c.belief.target.world_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
     # The reference may still be on its way to the target.
