@@ -12,11 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.mounting import MountingMonitor
+from perchctl.mission import CameraImuMismatch, Observation, OperatorRequest, Phase, PlannerState
+from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
 from perchctl.mission.setpoints import LEAN_ACCELERATION_DAMPING_S2
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
-from tests.helpers.mission import HANG_Z_M, observation, remembering, state_in, target_at, telemetry
+from tests.helpers.mission import (
+    HANG_Z_M,
+    PROFILE,
+    observation,
+    remembering,
+    state_in,
+    target_at,
+    telemetry,
+)
 from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, fly
 
 Z_M = HANG_Z_M - 0.3
@@ -245,3 +253,39 @@ def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:
         tick.command.z_m for tick in flight.ticks if isinstance(tick.command, PositionSetpoint)
     ]
     assert max(climbs_m) <= climbs_m[0]
+
+
+@pytest.mark.parametrize(
+    ("picture_m", "estimate_m", "settles"), [(0.001, 0.007, True), (0.007, 0.001, False)]
+)
+def test_the_pictures_tell_whether_the_vehicle_has_settled(
+    picture_m: float, estimate_m: float, settles: bool
+) -> None:
+    """Not the state estimate, which may have wandered since the newest picture."""
+    z_m = HANG_Z_M - PROFILE.planner.ascend.standoff_m
+
+    def look(t_s: float) -> Observation:
+        sample = telemetry(t_s, z_m)
+        target = target_at(
+            t_s,
+            body_m=(-estimate_m, 0.0, z_m),
+            measured_offset_m=np.array([picture_m, 0.0, PROFILE.planner.ascend.standoff_m]),
+        )
+        return observation(t_s, telemetry=sample, target=target)
+
+    flight = fly(state_in(Phase.ASCEND, z_m=z_m), look, 2.0, one_phase=True)
+    assert (flight.state.phase is Phase.PERCH) is settles
+
+
+def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
+    """Neither one whose mounting is wrong, nor one whose pictures disagree with the
+    accelerometer."""
+    turned = MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS)
+    late = CameraImuMismatch(0.2, 0.0)
+    for state, changes, known in (
+        (ascending(), {}, True),
+        (remembering(ascending(), mounting=turned), {}, False),
+        (ascending(), {"camera_imu_mismatch": late}, False),
+    ):
+        ticks = fly(state, lambda t_s, c=changes: observation(t_s, Z_M, **c), 0.5).ticks
+        assert (ticks[-1].state.belief.lateral_offset is not None) is known
