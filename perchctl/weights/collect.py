@@ -23,7 +23,7 @@ import numpy as np
 from perchctl.calibration import poll_frames
 from perchctl.camera import FrameSource, check_size
 from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
-from perchctl.files import write_error
+from perchctl.files import check_writable, write_error
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
 from perchctl.positioning import CaptureFrame, CaptureSource, VehiclePose
 from perchctl.profile import PositioningConfig, Profile
@@ -141,6 +141,7 @@ class SessionFile:
         if path.exists() and path.stat().st_size:
             self._continue(frames)
         else:
+            check_writable(path, force=True, makes_folder=False)
             self._write(HEADER + "\n", "w")
 
     def append(self, rows: str) -> None:
@@ -151,7 +152,6 @@ class SessionFile:
 
     def _write(self, text: str, mode: str) -> None:
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open(mode, encoding="utf-8", newline="") as stream:
                 stream.write(text)
                 stream.flush()

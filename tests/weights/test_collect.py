@@ -48,6 +48,13 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     assert np.unique(read_data(torn).position).tolist() == [1, 3, 4, 5], "one was taken out"
 
 
+def test_a_mistyped_folder_is_not_made(tmp_path: Path) -> None:
+    done = run("collect", tmp_path / "sesions/session.csv", "--truth", "sim")
+    assert done.exit_code == 30
+    assert "sesions does not exist; make it, or name another place" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_that_is_no_session_is_left_alone(tmp_path: Path) -> None:
     other = tmp_path / "other.csv"
     other.write_text("position,t_s\n1,0.1\n", encoding="utf-8")
