@@ -9,8 +9,9 @@ CflibLink -> Crazyflie -> HubDriver  <--- UDP on loopback --->  RadioDriver -> d
 One datagram carries one CRTP packet, as with cflib's `udp://`. The two reserved bits of a CRTP
 header are always set (`perchctl.link.crtp.Packet`); a datagram without them is a message:
 
-- `HELLO` and the vehicle: the flight asks for this vehicle's packets, first to connect and then
-  once a second. The answer is a `REPORT`.
+- `HELLO`, the vehicle and a key: the flight asks for this vehicle's packets, first to connect and
+  then once a second. The answer is a `REPORT`. The key is a random part of the flight's URI, so
+  that no other program of the computer can take the vehicle over.
 - `BYE`: the flight has closed its link.
 - `ROOM` and a byte: how many of the flight's packets wait in the hub for the radio.
 - `REPORT` and a `HubReport` as JSON.

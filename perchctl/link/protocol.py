@@ -126,7 +126,8 @@ FORMS = {
     "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
     "usb": r"\d+",
     "udp": r"[^/:\s]+:0*[1-9]\d{0,4}",
-    "hub": rf"127\.0\.0\.1:[1-9]\d{{0,4}}/{_CHANNEL}/{_RATE}/{_ADDRESS}",
+    "hub": rf"127\.0\.0\.1:[1-9]\d{{0,4}}/{_CHANNEL}/{_RATE}/{_ADDRESS}"
+    r"\?key=[0-9a-f]{16}",
 }
 """Regular expressions of the URIs, by scheme. `hub` is a radio's vehicle behind a `RadioHub`, which
 gives out these URIs; nobody types one."""

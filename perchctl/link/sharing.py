@@ -19,6 +19,7 @@ import contextlib
 import logging
 import math
 import os
+import secrets
 import select
 import signal
 import socket
@@ -102,7 +103,9 @@ class Carrier:
         self.vehicle = vehicle_uri(uri).removeprefix("radio/")
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
-        self.hub_uri = f"{SCHEME}127.0.0.1:{self.socket.getsockname()[1]}/{self.vehicle}"
+        # Any program of this computer can send to the port; the key is told to the flight alone.
+        self._greeting = f"{self.vehicle}?key={secrets.token_hex(8)}"
+        self.hub_uri = f"{SCHEME}127.0.0.1:{self.socket.getsockname()[1]}/{self._greeting}"
         self.driver: Any = None
         self.opened_s = 0.0  # when the driver was opened, or closed for want of safelink
         self.heard_s = time.monotonic()  # when the flight's last datagram came
@@ -227,8 +230,8 @@ class Carrier:
         except OSError:  # an earlier datagram could not be delivered
             return
         if datagram[:1] == HELLO:
-            # An old flight may still ask at a port that is another vehicle's by now.
-            if datagram[1:].decode("ascii", "replace") != self.vehicle:
+            # Another program may ask, or an old flight at a port that is another vehicle's by now.
+            if datagram[1:].decode("ascii", "replace") != self._greeting:
                 return
             if sender != self._flight:
                 self._drop_packets()  # what an earlier link wanted to send is out of date

@@ -425,11 +425,14 @@ def test_closing_a_link_or_the_hub_sends_nothing_to_any_vehicle(bench: Bench) ->
     assert bench.port.refused == 0
 
 
-def test_an_old_flight_does_not_reach_the_vehicle_that_has_its_port_now(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("known", "guessed"), [("E7E7E7E701", "E7E7E7E7AA"), ("?key=", "?key=0")])
+def test_an_old_flight_or_another_program_does_not_reach_the_vehicle(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, known: str, guessed: str
 ) -> None:
+    """The port may be another vehicle's by now; and its key is told to one flight alone."""
     monkeypatch.setattr(hub_driver, "HELLO_TIMEOUT_S", 0.3)
-    stranger = bench.hub.uris[FOUR[0]].replace("E7E7E7E701", "E7E7E7E7AA")
+    stranger = bench.hub.uris[FOUR[0]].replace(known, guessed)
+    assert stranger != bench.hub.uris[FOUR[0]]
     with pytest.raises(ConnectionFailed, match="does not answer"):
         HubDriver().connect(stranger, None, lambda message: None)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -570,8 +573,12 @@ def test_a_vehicle_in_use_by_another_program_is_refused_and_nothing_is_opened() 
 def test_the_flights_uris_are_taken_and_say_which_vehicle_it_is() -> None:
     carrier = Carrier(FOUR[0] + "?rate_limit=100")
     assert check_uri(carrier.hub_uri) == "hub"
-    assert carrier.hub_uri.endswith("/80/2M/E7E7E7E701")
-    carrier.socket.close()
+    assert carrier.hub_uri.partition("?")[0].endswith("/80/2M/E7E7E7E701")
+    again = Carrier(FOUR[0])
+    keys = {each.hub_uri.partition("?")[2] for each in (carrier, again)}
+    assert len(keys) == 2
+    for each in (carrier, again):
+        each.socket.close()
 
 
 # --- The hub as a process -------------------------------------------------------------------------
