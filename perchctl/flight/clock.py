@@ -1,4 +1,4 @@
-"""The one clock of a flight: of the wall, or of the simulated vehicle."""
+"""A flight's clock, which follows real time or the simulated vehicle's time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from typing import Protocol
 from perchctl.children import SharedTime
 
 SIM_PATIENCE_S = 5.0
-"""Wait for a stopped simulator, on the wall's clock: longer than it waits for the loop."""
+"""Time without progress of the simulator after which the flight's clock runs on by the wall clock.
+It is longer than the simulator waits for the loop."""
 _CLOCK_POLL_S = 0.001
 
 
 class Clock(Protocol):
-    """Time and waiting, in seconds: the one clock of a flight, real or simulated."""
+    """The time and the waits of one flight, in seconds, real or simulated."""
 
     def now(self) -> float:
         """Return the present time, s, monotonic."""
@@ -65,7 +66,8 @@ class SimulatedClock:
             wall_s, reached_s = self._wall(), self._shared.reached_s
             if reached_s != self._reached_s:
                 self._reached_s, self._moved_s = reached_s, wall_s
-                # What it went on without the simulator stays.
+                # Time that passed without the simulator is kept, so that the clock never runs
+                # backwards.
                 self.zero_s = max(self.zero_s, self._now_s - reached_s)
             alone_s = max(0.0, wall_s - self._moved_s - SIM_PATIENCE_S)
             self._now_s = max(self._now_s, self.zero_s + reached_s + alone_s)

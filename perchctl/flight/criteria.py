@@ -1,7 +1,7 @@
 """Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
-Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
-capture: where the ground is, and which way is up.
+Each criterion returns the problem, or None. Two things are known about a vehicle at rest, even
+without motion capture: where the ground is, and which way is up.
 """
 
 from __future__ import annotations
@@ -42,26 +42,29 @@ from perchctl.vehicle import (
 from perchctl.vision import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
-READING_AGE_S = 1.0  # battery and variances come ten times a second
-REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
-WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
-ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
-UP_AXIS_AGREE_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
-WANDERED_M = 0.1  # far beyond a capture's noise
+READING_AGE_S = 1.0  # battery and variances arrive ten times a second
+REST_ACC_G = 0.15  # tolerance on the 1 g that the accelerometer reads at rest
+WITHIN_REACH_M = 0.35  # from the gear: a take-off needs more height, so no target is that near
+ROOM_M = 50.0  # no capture volume is larger: a position farther off is in another unit
+# between attitude and capture: somebody has aligned the rigid body's axes by eye
+UP_AXIS_AGREE_DEG = 20.0
+WANDERED_M = 0.1  # far above the noise of a motion capture
 REST_S = 1.9
-"""For so long the state estimate must have stood still before a take-off: the loop keeps no more. A
-shorter time shows less of a slow drift."""
+"""Time for which the state estimate must have stood still before a take-off. The loop keeps no
+older samples. A shorter time shows less of a slow drift."""
 DRIFT_M = 0.07
-"""So far it may move in that time (0.037 m/s). Healthy ones move by up to 0.006 m with a Flow or
-Lighthouse deck, 0.03 m by pictures, 0.035 m by ranging anchors."""
+"""Largest distance by which the estimate may move in that time (0.037 m/s). A healthy estimate
+moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from pictures, and
+0.035 m with ranging anchors."""
 STANDING_MPS = 0.1
-"""The mean of its velocity in that time, at most. By the target alone it is 0.076 m/s on a slope of
-9 deg, since the accelerometer leads it."""
+"""Largest mean velocity of the estimate in that time. With the target as the only source of
+positions, it reaches 0.076 m/s on a slope of 9 deg, because the tilted accelerometer misleads the
+estimate."""
 ESTIMATE_AGREE_M = 0.1
-"""Most that estimate and capture may be apart, once positions are fused. Larger: positions that
-another vehicle gets are taken for this one's."""
+"""Largest distance between estimate and capture once positions are fused. Larger: positions meant
+for another vehicle are taken for this vehicle's."""
 ESTIMATE_AGREE_DEG = 15.0
-"""The same for the heading. Larger: another rigid body is taken for the vehicle's."""
+"""Largest difference in heading. Larger: another rigid body is taken for the vehicle's."""
 
 _FORBIDDEN = (
     (LOCKED, "is locked", "inspect it and restart it"),
@@ -97,8 +100,8 @@ class Variance:
 
 @dataclass(frozen=True)
 class GroundCriteria:
-    """Criteria for a vehicle at rest; each returns the problem that it finds, or None. `decks`: the
-    vehicle's, by the firmware's names."""
+    """Criteria for a vehicle at rest. Each method returns the problem that it finds, or None.
+    `decks` are the vehicle's decks, by the firmware's names."""
 
     telemetry: Telemetry
     profile: Profile
@@ -106,7 +109,8 @@ class GroundCriteria:
 
     @property
     def supervisor_fault(self) -> Problem | None:
-        """Problem: the supervisor reports a fault that waiting does not cure, such as a crash."""
+        """Problem: the supervisor reports a fault, such as a crash, that does not go away by
+        waiting."""
         raw = f"0x{self.telemetry.supervisor:04X}"
         for bit, what, advice in _FORBIDDEN:
             if self.telemetry.has_bit(bit):
@@ -120,8 +124,8 @@ class GroundCriteria:
 
     @property
     def waits_for_arming(self) -> bool:
-        """True if the vehicle does not arm itself, and needs nothing but to be armed: `fly` does
-        that last, just before take-off. True as well while its motors start."""
+        """True if the vehicle does not arm itself and is ready except for arming. `fly` arms it
+        last, just before take-off. Also true while its motors start."""
         telemetry = self.telemetry
         if telemetry.has_bit(CAN_FLY):
             return False
@@ -182,8 +186,9 @@ class GroundCriteria:
     def variances(self) -> tuple[Variance, ...]:
         """The variances by which the state estimate is judged (docs/firmware.md, "Variances").
 
-        The velocity's shows whether anything corrects the estimate, the position's whether anything
-        has placed it since the estimator last started. A Flow deck measures the height alone.
+        The velocity's variance shows whether anything corrects the estimate. The position's
+        variance shows whether the estimate has received a position since the estimator last
+        started. A Flow deck measures the height alone.
         """
         telemetry, safety = self.telemetry, self.profile.safety
         is_placed = not self.profile.positioning.source.is_deck or {*self.decks} & {*ABSOLUTE_DECKS}
@@ -312,13 +317,13 @@ class GroundCriteria:
 
     @staticmethod
     def moving_estimate(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-        """Problem: within `rest_window` of `samples`, oldest first, the state estimate has moved
-        or had a speed.
+        """Problem: within `rest_window` of `samples`, oldest first, the state estimate has moved,
+        or its mean velocity was too high.
 
-        A vehicle that stands still keeps its place, so something leads its estimate away: flow over
-        a dark floor, a base station that was moved, positions of another body. Or the vehicle is
-        carried, too smoothly for its accelerometer to tell. Fewer samples are judged by what they
-        show.
+        The vehicle stands still, so something misleads its estimate: optical flow over a dark
+        floor, a base station that was moved, or the positions of another body. Or somebody carries
+        the vehicle too smoothly for its accelerometer to notice. If there are fewer samples, only
+        those are judged.
         """
         if not samples:
             return None
@@ -347,8 +352,8 @@ class GroundCriteria:
 
     @staticmethod
     def moved_body(moved_m: float, profile: Profile) -> Problem | None:
-        """Problem: by the positions from outside the vehicle has moved by `moved_m` while it stood
-        still: they are another body's, or the target hangs loose."""
+        """Problem: the external positions have moved by `moved_m` while the vehicle stood still.
+        They belong to another body, or the target swings."""
         if moved_m <= WANDERED_M:
             return None
         return Problem(
@@ -378,7 +383,8 @@ class GroundCriteria:
         return up_axis_problem(place, self.telemetry) or standing or self._unreachable(place)
 
     def _unreachable(self, place: ExternalPosition) -> Problem | None:
-        """A place from which no flight reaches the expected target: perhaps another vehicle's."""
+        """Problem: no flight from this position reaches the expected target. It may be another
+        vehicle's."""
         target, (x, y, _) = self.profile.target, place.position_m
         if target.expected_xy_m is None:
             return None
@@ -394,19 +400,21 @@ class GroundCriteria:
 
 
 def rest_window(samples: Sequence[Telemetry]) -> list[Telemetry]:
-    """The samples, oldest first, that show whether a vehicle has stood still for `REST_S`: those
-    of that time and the one before, without which a pause would show nothing. Only those of the
-    newest sample's start of the vehicle; all of them if they span less."""
+    """Return the samples, oldest first, that show whether a vehicle has stood still for `REST_S`:
+    those of that time and the one before it, which reveals a pause at its beginning. Samples from
+    before the vehicle last restarted are left out. If the samples span less time, all are
+    returned."""
     same = [s for s in samples if s.start == samples[-1].start]
     first = max((i for i, s in enumerate(same) if same[-1].t_s - s.t_s >= REST_S), default=0)
     return same[first:]
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Problem: the capture's vertical is not that of the vehicle's own attitude."""
+    """Problem: the capture and the vehicle's attitude disagree about the vertical."""
     if place.quaternion is None:
         return None
-    # The world's vertical in the capture's axes, if its body's axes are the vehicle's.
+    # The world's vertical in the capture's axes, assuming that its rigid body has the vehicle's
+    # axes.
     R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
     up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
@@ -426,7 +434,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 
 
 def feed_name(profile: Profile) -> str:
-    """Name of the source of external positions in messages."""
+    """Name of the source of external positions, as used in messages."""
     by_target = profile.positioning.source.is_target
     return "the view of the target" if by_target else "the motion capture"
 
@@ -442,7 +450,7 @@ class RestCheck:
     ) -> Problem | None:
         """The problem of a body that has moved since the vehicle came to rest.
 
-        To be called in each turn with fresh telemetry and a fresh position; `place` is None while
+        Must be called in each turn with fresh telemetry and a fresh position; `place` is None while
         the vehicle does not stand still, which restarts the check."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:

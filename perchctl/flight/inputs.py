@@ -1,4 +1,4 @@
-"""What a tick of the loop takes in: telemetry, at most one frame, and what follows from them."""
+"""The inputs of one tick of the loop: telemetry, at most one frame, and what follows from them."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from perchctl.vision import (
 )
 
 DOUBTFUL_KINDS = ("dark", "uniform")
-"""Kinds of pictures that are searched all the same: a dark target may still be seen, and a bare
-ceiling looks like an empty screen."""
-HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
+"""Kinds of doubtful pictures that are searched anyway. A target may still be visible in a dark one,
+and a bare ceiling looks like an empty screen."""
+HEARD_S = 0.15  # extrapolating a detection with an older estimate would make the vehicle oscillate
 
 
 class TelemetrySource(Protocol):
@@ -52,7 +52,7 @@ class TelemetrySource(Protocol):
 
 @dataclass(eq=False)
 class FlightInputs:
-    """Makes the planner's observation of telemetry and at most one frame a tick."""
+    """Builds the planner's observation from telemetry and at most one frame per tick."""
 
     SENSED_FIELDS: ClassVar = (
         "telemetry",
@@ -71,7 +71,7 @@ class FlightInputs:
         "visual_inertial_motion",
         "camera_imu_mismatch",
     )
-    """The fields of an `Observation` that come from here; the others are the loop's."""
+    """The fields of an `Observation` that this module fills in. The loop fills in the others."""
 
     link: TelemetrySource
     source: FrameSource
@@ -79,19 +79,20 @@ class FlightInputs:
     profile: Profile
     send: SendPosition = lambda place: True
     is_logged: bool = False  # then with the pictures' checksums and the present's spread
-    # Gets each frame as its source gave it.
+    # Called with each frame as the source delivered it.
     on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
-    # Hands the vehicle's places to `send`, where the target is its positioning system.
+    # Passes the vehicle's positions to `send` if the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
     sends_sights: bool = True
     output: PipelineOutput | None = None  # of this tick's frame, if it was searched
     taken: TickInputs = field(default_factory=TickInputs)  # in this tick
     is_blind: bool = False
-    repeated: bool = False  # this tick's frame is the one before
+    repeated: bool = False  # this tick's frame is identical to the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
-    # What `FrameHealth` calls the picture that is the camera's problem, or mirrored; None: another.
+    # The kind, by `FrameHealth`, of the picture that is the camera's problem; None for another kind
+    # of problem.
     problem_kind: str | None = None
     frames: int = 0
     _frame_kind: str = "ok"  # of the newest frame
@@ -118,9 +119,9 @@ class FlightInputs:
 
         Args:
             search: look for the target; otherwise the frame only shows that the camera works.
-            sends_sights: send the positions that the target gives, where it is the positioning
-                system; False once the way down goes on without them.
-            drops_sightings: forget the sights from which the vehicle's motion is estimated.
+            sends_sights: send the positions measured from the target, if it is the positioning
+                system; False once the descent continues without them.
+            drops_sightings: discard the detections from which the vehicle's motion is estimated.
         """
         self.sends_sights = sends_sights
         perception, positioning = self.perception, self._positioning
@@ -154,14 +155,15 @@ class FlightInputs:
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
-        if self.frames == 0:  # a source of another size; a single such picture is only torn
+        # a source of another size; a single picture of another size is only torn
+        if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         self._frame_kind = "ok"
         rejection = problem or self._rejection(frame, now_s)
         self.repeated = self._frame_kind == "repeated"
         is_doubtful = self._frame_kind in DOUBTFUL_KINDS
         if rejection is not None:
-            if not self.repeated:  # else nothing is new, the camera's problem neither
+            if not self.repeated:  # otherwise nothing is new, including the camera's problem
                 self.camera_problem = rejection
                 is_unusable = self._frame_kind != "ok" and not is_doubtful
                 self.problem_kind = self._frame_kind if is_unusable else None
@@ -182,7 +184,7 @@ class FlightInputs:
 
     @staticmethod
     def ended_text(name: str) -> str:
-        """Return the camera's problem once the recording `name` is over."""
+        """Return the camera's problem for the time after the recording `name` has ended."""
         return f"{name} has ended"
 
     @property
@@ -194,9 +196,9 @@ class FlightInputs:
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def picture_problem(self, now_s: float) -> str | None:
-        """Return why there is no good picture now: none has come, the newest was no measurement, or
-        the last good one is older than `safety.camera_hold_s`; None if there is one. A picture that
-        is only dark or empty is good."""
+        """Return why there is no good picture now; None if there is one. Either none has arrived,
+        the newest could not be used as a measurement, or the last good one is older than
+        `safety.camera_hold_s`. A picture that is only dark or empty counts as good."""
         age_s = now_s - self.last_good_frame_s
         if self.frames == 0:
             return self.camera_problem or "none has arrived"
@@ -205,8 +207,8 @@ class FlightInputs:
         return None if self.camera_problem == self._note else self.camera_problem
 
     def telemetry_age_s(self, now_s: float) -> float:
-        """The age of the oldest part of the newest telemetry: a reading that has stood still while
-        others changed is as old as its first sample; infinite before there is any."""
+        """The age of the oldest value in the newest telemetry. A reading that stays the same while
+        others change is as old as its first sample. Infinite before the first telemetry."""
         newest, imu = self.history.newest, self.history.imu
         if newest is None:
             return math.inf
@@ -217,12 +219,14 @@ class FlightInputs:
         )
 
     def catch_up(self, began_s: float, now_s: float) -> None:
-        """Take in the telemetry that came while camera or vision hung in the tick of `began_s`."""
+        """Process the telemetry that arrived while the camera or the vision code hung, in the tick
+        that began at `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late_samples=tuple(late))
         if self.last_good_frame_s == began_s:
-            self.last_good_frame_s = now_s  # the picture came: the camera is not gone
+            # this tick did get a picture, so the camera has not failed
+            self.last_good_frame_s = now_s
 
     def observation(self, now_s: float) -> Observation:
         """The observation with the fields of `SENSED_FIELDS`; the loop adds the others."""
@@ -249,15 +253,17 @@ class FlightInputs:
 
     @property
     def poses(self) -> dict[str, UnfilteredPose]:
-        """The unfiltered poses by this tick's picture: of `large`, `small` and `joint` markers."""
+        """The unfiltered poses from this tick's picture, of the `large`, `small` and `joint`
+        markers."""
         poses = {} if self.output is None else self.output.poses
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """The target's estimate at `now_s`; None before the target was first seen. `tracked` is
-        False while no good frames come or are searched, since the filter coasts by frames."""
+        False while no good frames arrive or the frames are not searched, because the filter counts
+        its coasting in frames."""
         target = self.perception.target(now_s, spread=self.is_logged)
-        if self._positioning is not None:  # else the estimate runs away
+        if self._positioning is not None:  # otherwise the estimate would run away
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.is_blind or stale):
@@ -265,8 +271,8 @@ class FlightInputs:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Return why this frame is no measurement: of another size, frozen, no picture at all, or
-        too old."""
+        """Return why this frame cannot be used as a measurement: it has another size, is frozen, is
+        not a picture at all, or is too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
@@ -293,27 +299,33 @@ class FlightInputs:
 
 
 # --- The target as positioning system, tick by tick ---
-# Standing, pressed or hanging, the place is known better than by any picture, and is sent instead;
-# only while the accelerometer shows that something carries the vehicle, up to the first sample that
-# does not: what falls while it gets the position of a hanging vehicle would look as if it hung.
+# While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
+# better than from any picture, so the known position is sent instead. This ends with the first
+# sample in which the accelerometer no longer shows that something carries the vehicle. Otherwise a
+# vehicle that falls would be told that it still hangs, and would look as if it did.
 
 
 SUPPORTED_FOR_S = 0.1
 SUPPORTED_SAMPLE_G = 0.25
-"""Most that a sample of a supported vehicle differs from 1 g. Turning motors scatter it by 0.04 g.
-Smaller: their vibration counts as a fall. Larger: the beginning of a fall counts as support."""
+"""Largest deviation from 1 g of a single accelerometer sample of a supported vehicle, g. Running
+motors cause a spread of 0.04 g. Smaller: their vibration counts as a fall. Larger: the beginning of
+a fall counts as support."""
 SUPPORTED_MEAN_G = 0.06
-"""The same for the mean of `SUPPORTED_FOR_S`, which turning motors scatter by 0.013 g."""
-SUPPORTED_SINK_MPS = -0.15  # more than a bias makes while the place is sent
+"""Largest deviation from 1 g of the mean over `SUPPORTED_FOR_S`, g. Running motors cause a spread
+of 0.013 g."""
+# faster than a bias makes the estimate sink while the known position is sent
+SUPPORTED_SINK_MPS = -0.15
 FROZEN_ATTITUDE_S = 0.06
-"""An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
-the target by 12 cm."""
+"""Age above which an unchanged attitude no longer counts as the attitude at the exposure, s. An
+error of 0.1 rad displaces a vehicle 1.2 m below the target by 12 cm."""
 PICTURE_AHEAD_S = 0.1
-"""A picture may be so much ahead of the loop's clock; else its time is of another clock."""
+"""Largest time by which a picture may be ahead of the loop's clock, s. Beyond it, its time stamp
+comes from another clock."""
 
 
 class TargetPositioning:
-    """Sends positions measured from the target, the positioning system of one flight."""
+    """Measures positions from the target, if it is one flight's positioning system, and sends
+    them."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = TargetFeed(send, profile, pipeline.pose)
@@ -332,7 +344,7 @@ class TargetPositioning:
             self.feed.send_known(touching_m, now_s)
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
-        """Send the position that `pose` gives, if any, unless the vehicle is in contact."""
+        """Send the position that follows from `pose`, if any, unless the vehicle is in contact."""
         if (
             pose is None
             or self._touches
@@ -366,15 +378,15 @@ def is_supported(history: History, now_s: float) -> bool:
 
 
 def _newest_samples(history: History, within_s: float) -> list[Telemetry]:
-    """The samples at most `within_s` older than the newest one, oldest first; looked for from the
-    newest on, as the history is much longer."""
+    """The samples at most `within_s` older than the newest one, oldest first. The search starts at
+    the newest sample, because the history is much longer."""
     newest_s = history.samples[-1].t_s
     found: list[Telemetry] = []
     for sample in reversed(history.samples):
         if newest_s - sample.t_s > within_s:
             break
         found.append(sample)
-    found.reverse()  # sums of floats depend on the order
+    found.reverse()  # the sum of floats depends on their order
     return found
 
 
@@ -416,18 +428,18 @@ class TurnReporter:
     def note_decision(
         self, obs: Observation, state: PlannerState, command: Command, feed: FeedStatus | None
     ) -> None:
-        """Note that the planner has decided: a later failure is not the planner's."""
+        """Record the planner's decision: an error after it is not the planner's."""
         self._open = obs, (state, command, feed)
 
     def report_discarded_turn(
         self, inputs: FlightInputs, obs: Observation, state: PlannerState, command: Command
     ) -> None:
-        """Report a turn whose command is not sent, since the next turn decides again."""
+        """Report a turn whose command is not sent because the next turn decides again."""
         self._report(replace(self.flown_turn(inputs, obs, state, command, None), role="redone"))
 
     def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
-        """Report the turn in which the flight broke off, with what was observed and decided: the
-        command may have been sent."""
+        """Report the turn in which an error ended the flight, with its observation and its
+        decision: its command may already have been sent."""
         if self._open is None:
             return
         obs, decision = self._open
@@ -455,7 +467,7 @@ class TurnReporter:
         command: Command,
         feed: FeedStatus | None,
     ) -> TickRecord:
-        """The turn as it is logged, once its command was sent."""
+        """The turn as it is logged after its command was sent."""
         self._open = None
         return TickRecord(
             number=self._counted(),
@@ -481,7 +493,7 @@ class TurnReporter:
 
 
 def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
-    """Convert a feed's status to the form that is logged; None to None."""
+    """Convert a feed's status to its form in the log; None stays None."""
     if status is None:
         return None
     return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

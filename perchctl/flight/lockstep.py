@@ -39,8 +39,8 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import Frame, Step, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
-_QUEUED = 2  # pictures that wait; a newer one replaces the oldest
-HARD_LANDING_MPS = 1.0  # sinking faster into the floor is a fall, whatever the log calls it
+_QUEUED = 2  # number of pictures that may wait; a newer one replaces the oldest
+HARD_LANDING_MPS = 1.0  # hitting the floor faster than this is a fall, whatever the log says
 FIRST_FRAME_S = 1.0
 
 
@@ -95,13 +95,13 @@ class LockstepSource:
 
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
-    """The frame source of the simulated camera; mirrored frames are put right."""
+    """The frame source for the simulated camera; mirrored frames are flipped back."""
     source = LockstepSource(vehicle, profile.camera.start_latency_s)
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
 class TruthWatcher(Watcher):
-    """Watches the simulator's true vehicle, which the flight cannot see, for falls."""
+    """Watches the simulator's true state, which the flight cannot see, for falls."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -173,7 +173,7 @@ def fly_lockstep(
     """Fly one seed of the profile's scenario to its end, faster than real time.
 
     Args:
-        log: a file to log to, or a watcher that is left open unless the flight raises.
+        log: the log file, or a watcher, which is closed only if the flight raises.
         scenario, capture: used in place of the seed's own.
         operator: the operator's command.
         watchers: further watchers of the flight. One that raises is detached, with a `Note` as

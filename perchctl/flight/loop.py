@@ -53,16 +53,17 @@ from perchctl.vehicle import Idle, Telemetry
 from perchctl.vision import Pipeline
 
 TURN_HANG_S = 0.25
-"""A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
+"""Duration of a turn above which something hung, so that its data about the vehicle is out of date,
+s."""
 PERMISSION = "permission to take off"
-"""What a vehicle waits for whose own checks have passed, when others fly in the same room."""
+"""What a vehicle waits for when its own checks have passed and others fly in the same room."""
 PERMISSION_PERIOD_S = 0.1
-"""Between two turns of such a wait. Longer, and take-off follows its permission later; shorter, and
-vehicles on the floor take the computing time of those in the air."""
+"""Period of the turns during that wait, s. Longer: take-off follows the permission later. Shorter:
+vehicles on the floor take computing time from those in the air."""
 
 
 class PositionStatus(Protocol):
-    """What the loop needs of a `perchctl.positioning.PositionFeed`."""
+    """The part of a `perchctl.positioning.PositionFeed` that the loop uses."""
 
     def status(self, now_s: float) -> FeedStatus: ...
 
@@ -105,7 +106,7 @@ class FlightParts:
 def fly(parts: FlightParts) -> FlightReport:
     """Wait until ready, fly the mission, and return how it ended; the link is connected.
 
-    Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
+    If anything raises an exception, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
     `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue. Watchers
     that were detached are in the report, or in the error's `__notes__`, a sentence each.
     """
@@ -149,7 +150,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
             watchers.sent,
             inputs.perception.motion.motion,
         )
-        with contextlib.suppress(Exception):  # what failed may fail again
+        with contextlib.suppress(Exception):  # whatever has failed may fail again
             turns.report_failure(inputs, error)
         with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
             watchers.event(Event.note_from_rescue(parts.clock.now(), error, rest.state, rest.text))
@@ -199,12 +200,14 @@ def _wait_until_ready(
                 f"{parts.source.describe()} ended before take-off: use a camera, or a longer "
                 "recording"
             )
-        _end_on_word(parts.operator(), arming)  # given in this turn, it counts before the request
+        # the operator's command given in this turn takes precedence over arming
+        _end_on_word(parts.operator(), arming)
         if not waiting and newest is not None:
             _refuse_lost_view(parts, inputs, newest)
         is_held = not parts.may_take_off(waiting) and not waiting
         if is_held:
-            # Whoever may wait for minutes is later given the usual time again for each check.
+            # A vehicle may wait for permission for minutes; afterwards, each check has its usual
+            # time again.
             waiting, started_s = PERMISSION, now_s
         arming.note_waiting(waiting, now_s, parts.clock.now())
         if not waiting and newest is not None:
@@ -214,15 +217,15 @@ def _wait_until_ready(
             if request is not None:
                 parts.link.send(request)
                 watchers.sent(SentCommand(now_s, "preflight", request))
-        # A target that is the positioning system must go on being sent as the position.
+        # If the target is the positioning system, its positions must be sent without a pause.
         slow = is_held and inputs.target_positioning is None
         period_s = PERMISSION_PERIOD_S if slow else 1.0 / parts.profile.link.loop_hz
         parts.clock.wait_until(now_s + period_s)
 
 
 def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetry) -> None:
-    """Raises SafetyAbort where the target is the positioning system and would leave the picture on
-    the way up."""
+    """Raises SafetyAbort if the target is the positioning system and would leave the camera's view
+    on the way up."""
     positioning = inputs.target_positioning
     if positioning is not None and positioning.feed.target:
         camera, place = parts.pipeline.camera, positioning.feed.target
@@ -230,7 +233,7 @@ def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetr
 
 
 def _end_on_word(word: OperatorRequest, arming: Arming) -> None:
-    """Raises Interrupted on the operator's word; the link then disarms as it is closed."""
+    """Raises Interrupted on the operator's command; the link then disarms as it is closed."""
     if word is not OperatorRequest.NONE:
         ending = "disarming" if arming.has_begun else "nothing was started"
         raise Interrupted(f"interrupted before take-off: {ending}")
@@ -257,13 +260,13 @@ def _mission(
         parts.begin_turn()
         inputs.poll_inputs(
             began_s,
-            # Against the ceiling the picture shows no target and steers nothing.
+            # Close to the ceiling, the picture shows no target and cannot be used for steering.
             search=state is None or state.phase is not Phase.COMPLETE,
             sends_sights=state is None or state.belief.dead_reckoning_since_s is None,
             drops_sightings=drops_sightings,
         )
         drops_sightings = False
-        if clock.now() - began_s > TURN_HANG_S:  # a setpoint for the time before the hang is stale
+        if clock.now() - began_s > TURN_HANG_S:  # a setpoint from before the hang is out of date
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
@@ -275,7 +278,7 @@ def _mission(
         turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_before_landing and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > TURN_HANG_S):
-            redone = True  # nothing that was decided before a hang is sent after it
+            redone = True  # a decision from before a hang is not sent after it
             turns.report_discarded_turn(inputs, obs, new, command)
             continue
         state, redone = new, False
@@ -324,7 +327,7 @@ def _mission(
             )
         due_s += period_s
         if due_s < now_s:
-            due_s = now_s + period_s  # never try to catch up with a burst of old ticks
+            due_s = now_s + period_s  # never make up for missed ticks with a burst
         clock.wait_until(due_s)
 
 
@@ -334,7 +337,7 @@ def _latency_text(profile: Profile, changed_s: tuple[float, float]) -> str:
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
-    """The status of the external positions, or of those by the target; None with decks."""
+    """The status of the external positions, from motion capture or the target; None with decks."""
     if inputs.target_positioning is not None:
         return inputs.target_positioning.feed.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)

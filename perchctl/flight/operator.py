@@ -45,31 +45,38 @@ from perchctl.mission import OperatorRequest
 
 STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
 KEY_HELP = "The space bar cuts the motors at once."
-"""Every help, panel, page and document describes the operator's stop in these words."""
+"""The operator's stop in one sentence, used in every help text, panel, page and document."""
 
 SAME_PRESS_S = 0.3
-"""Two presses less than this apart are one: larger misses a hurried second press."""
+"""Two presses closer together than this count as one, s. Larger: a hurried second press is
+missed."""
 LONGEST_DELAY_S = 1.0
-"""No keyboard waits longer before it repeats a key. Until then the second press may be its first
-repeat; larger lets a held key land for longer, and delays the stop of whoever hammers as evenly."""
+"""Longest time for which a keyboard waits before it repeats a key, s. Until then, a second press
+may be the first repeat of a held key. Larger: a held key only lands for longer, and evenly repeated
+presses stop the motors later."""
 SHORTEST_DELAY_S = 0.25
-"""A keyboard waits at least this long before it repeats; smaller takes more hands for keys."""
+"""Shortest time for which a keyboard waits before it repeats a key, s. Smaller: more presses by
+hand are taken for a held key."""
 SLOWEST_REPEAT_S = 0.2
 """The longest time between two repeats of a key; larger delays the stop by a second press."""
 KEY_JITTER_S = 0.02
-"""A repeat may be read so much late on a busy computer; larger takes more hands for keys."""
+"""Longest delay with which a busy computer reads a repeat, s. Larger: more presses by hand are
+taken for a held key."""
 KEY_REPEAT_WAIT_S = SLOWEST_REPEAT_S + KEY_JITTER_S + 0.01
-"""A key that is still held has repeated again by then."""
+"""Time after which a key that is still held must have repeated."""
 FASTER_THAN_A_HAND_S = 0.08
-"""Repeats faster than this, on average, are a key's; larger takes more hands for keys."""
+"""Mean interval below which repeats must come from a held key, s. Larger: more presses by hand are
+taken for a held key."""
 SHORTEST_FAST_DELAY_S = 0.15
-"""The delay of a key that repeats so fast may be shorter (``xset r rate 200 50``)."""
+"""Shortest initial delay of a key that repeats that fast (``xset r rate 200 50``), s."""
 LONGER_THAN_REPEATS = 1.2
-"""The least ratio of a key's delay to the mean of its repeats; a hand's gaps are alike."""
+"""Lowest ratio of a key's initial delay to the mean interval of its repeats. Presses by hand have
+similar intervals throughout."""
 SURE_REPEATS, SURELY_LONGER = 4, 2.0
-"""So many even repeats after a gap so much longer are a key's, also if a hand could be as fast."""
+"""Number of even repeats, and the ratio of the first interval to theirs, from which the presses
+must come from a held key, even at a rate that a hand can reach."""
 STOP_HANG_S = 10.0
-"""A stopped flight that has not ended by then hangs."""
+"""Time within which a stopped flight must end, s. After it, the flight counts as hanging."""
 _EPS_S = 1e-9
 
 
@@ -90,7 +97,7 @@ class OperatorSwitch:
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _presses_s: list[float] = field(default_factory=list)  # until they are a stop
+    _presses_s: list[float] = field(default_factory=list)  # recorded until they are a stop
     _stopped_s: float = math.inf
 
     def read(self) -> OperatorRequest:
@@ -109,8 +116,8 @@ class OperatorSwitch:
             self._stopped_s = min(self._stopped_s, self.clock())
 
     def press(self, count: int = 1) -> None:
-        """Note that Ctrl-C was pressed. With `count` it was pressed so often since the last call,
-        at times that are not known: they are taken as even, which is how a hand would press."""
+        """Note that Ctrl-C was pressed. `count` is the number of presses since the last call. Their
+        times are not known and are assumed to be evenly spaced, as presses by hand would be."""
         with self._lock:
             now_s = self.clock()
             self._decide(now_s)
@@ -121,7 +128,7 @@ class OperatorSwitch:
                     self._decide(now_s)
 
     def interrupt(self) -> None:
-        """Raises `Interrupted` on a signal where the loop does not listen; called in the main
+        """Raises `Interrupted` on a signal while the loop is not listening; called in the main
         thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
@@ -134,7 +141,8 @@ class OperatorSwitch:
 
 
 def _is_stop(presses_s: Sequence[float], now_s: float) -> bool:
-    """True if these presses, and none until `now_s`, stop the motors; once true it stays so."""
+    """True if these presses, with no further one until `now_s`, stop the motors. Once true, it
+    stays true."""
     if len(presses_s) < 2:
         return False
     first_s, last_s = presses_s[0], presses_s[-1]
@@ -148,7 +156,7 @@ def _is_stop(presses_s: Sequence[float], now_s: float) -> bool:
 
 
 def _may_be_key(presses_s: Sequence[float]) -> bool:
-    """True if a single key, held down, may have made these presses (two or more)."""
+    """True if a single held key can have caused these presses (two or more)."""
     delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
     mean_s = _mean_gap_s(repeats_s)
     if len(repeats_s) > 1 and mean_s <= FASTER_THAN_A_HAND_S:
@@ -162,7 +170,7 @@ def _may_be_key(presses_s: Sequence[float]) -> bool:
 
 
 def _is_surely_key(presses_s: Sequence[float]) -> bool:
-    """True if no hand makes these presses, which a key may have made."""
+    """True if these presses, which a held key may have caused, cannot have been made by hand."""
     delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
     mean_s = _mean_gap_s(repeats_s)
     if len(repeats_s) < 2:
@@ -176,9 +184,9 @@ def _mean_gap_s(times_s: Sequence[float]) -> float:
 
 
 def _are_even(times_s: Sequence[float]) -> bool:
-    """True if a period exists whose multiples these times follow, each up to `KEY_JITTER_S` late:
-    for each pair of them, ``k`` periods apart, it is their distance ``+- KEY_JITTER_S`` over
-    ``k``."""
+    """True if these times fit multiples of one period, each up to `KEY_JITTER_S` late. Two times
+    that are ``k`` periods and ``d`` seconds apart limit the period to ``(d +- KEY_JITTER_S) /
+    k``."""
     pairs = [
         (later_s - earlier_s, k)
         for i, earlier_s in enumerate(times_s)
@@ -193,7 +201,7 @@ def _are_even(times_s: Sequence[float]) -> bool:
 
 
 LANDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-"""End or suspend a program elsewhere; a flight they land."""
+"""Signals that end or suspend other programs; on one of them, a flight lands."""
 _MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight in a shell's background
 _NO_SUSPENDING = "Ctrl-Z cannot suspend a flight: landing"
 
@@ -241,7 +249,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if any(number in LANDING_SIGNALS for number in numbers):
             switch.land()
         if switch.listening and signal.SIGTSTP in numbers:
-            # Not from this thread: a terminal that stands still would hold up the signals.
+            # Not from this thread, which a terminal stopped by Ctrl-S would block.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 
@@ -260,10 +268,11 @@ def cut_key(
 
     `on_keys` is then called with all keys, in another thread; it must return at once.
 
-    It needs the file descriptor of a terminal in whose foreground this process runs; otherwise
-    nothing is changed. Keys come without Enter and are not echoed; Ctrl-C and Ctrl-Z go on making
-    signals. Keys pressed before or during the block are discarded, so that a stale one neither
-    cuts the motors nor reaches the shell. However the block ends, the terminal is as it was before.
+    It needs the file descriptor of a terminal, and this process must run in its foreground;
+    otherwise nothing is changed. Keys take effect without Enter and are not echoed; Ctrl-C and
+    Ctrl-Z still cause signals. Keys pressed before or during the block are discarded, so that a
+    stale one neither cuts the motors nor reaches the shell. The terminal is restored however the
+    block ends.
     """
     before = _terminal_mode(terminal)
     if before is None:
@@ -289,7 +298,7 @@ def cut_key(
 
 
 def _terminal_mode(terminal: int) -> list[Any] | None:
-    """The mode of a terminal that this process may read keys from; None of any other file."""
+    """Return the terminal's mode if this process may read keys from it; otherwise None."""
     with contextlib.suppress(OSError, ValueError, termios.error):
         if os.tcgetpgrp(terminal) == os.getpgrp():
             return termios.tcgetattr(terminal)
@@ -304,8 +313,8 @@ def _keys_mode(mode: list[Any]) -> list[Any]:
 
 
 def _set_mode(terminal: int, mode: list[Any]) -> None:
-    """Set a terminal's mode and discard the keys that wait. It does not wait for the output, which
-    stands still after Ctrl-S; a terminal that is gone has no mode."""
+    """Set a terminal's mode and discard pending keys. Does not wait for the output, which Ctrl-S
+    may have stopped. Does nothing if the terminal is gone."""
     with contextlib.suppress(OSError, termios.error):
         termios.tcsetattr(terminal, termios.TCSANOW, mode)
         termios.tcflush(terminal, termios.TCIFLUSH)

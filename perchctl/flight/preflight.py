@@ -1,4 +1,4 @@
-"""What must be true on the ground before anything spins."""
+"""Checks that must pass on the ground before any motor turns."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ from perchctl.vision import CameraModel, TargetEstimate
 
 
 def abort_on(problem: Problem | None) -> None:
-    """Raises SafetyAbort with the problem's sentence; None passes."""
+    """Raise SafetyAbort with the problem's sentence; do nothing if it is None."""
     if problem is not None:
         raise SafetyAbort(problem.sentence)
 
 
 def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
-    """Raises SafetyAbort for a supervisor fault or an unfit battery: waiting does not cure them."""
+    """Raises SafetyAbort for a supervisor fault or an unfit battery, which waiting does not
+    cure."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
         battery = criteria.battery_too_low or criteria.battery_too_high
@@ -46,7 +47,7 @@ def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
 
 def refuse_armed(telemetry: Telemetry | None) -> None:
     """Raises SafetyAbort if a vehicle that does not arm itself is armed before perchctl has armed
-    it: whoever has, also commands it."""
+    it: another program may be commanding it."""
     if telemetry is not None and is_armed_by_request(telemetry.supervisor):
         raise SafetyAbort(
             "the vehicle is armed, but not by perchctl: keep away from its propellers, and "
@@ -80,10 +81,10 @@ def refuse_wrong_positions(
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
-        return  # unknown: not judged, and nothing is forgotten
+        return  # unknown: neither judged nor reset
     criteria = GroundCriteria(telemetry, profile)
     stands = criteria.stands
-    # The last position before a problem may have been elsewhere.
+    # The last position before a problem may have been somewhere else.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
         return
@@ -118,8 +119,8 @@ class GroundTurn:
 
 
 def still_waiting_for(turn: GroundTurn) -> str:
-    """Return in words what take-off still waits for; empty when ready, by this turn alone: what was
-    good before and is not now is waited for again. Errors: TimedOut after too long a wait,
+    """Return in words what take-off still waits for; empty if ready. Only this turn counts: a check
+    that passed earlier and fails now is waited for again. Errors: TimedOut after too long a wait,
     SafetyAbort off the ground or too near to the target."""
     profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_target = profile.safety.estimator_wait_s, profile.positioning.source.is_target
@@ -159,7 +160,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     if not waiting and turn.picture_problem:
         waiting = f"a good picture ({turn.picture_problem})"
         others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
-        if waited_s <= others_s + limit_s:  # it may have failed while others were waited for
+        if waited_s <= others_s + limit_s:  # it may have failed during the wait for the others
             waited_s = min(waited_s, turn.unseen_s)
     waiting = waiting or _first({"a view of the target, which measures the position": unsent})
     if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
@@ -171,8 +172,8 @@ def still_waiting_for(turn: GroundTurn) -> str:
 
 
 def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-    """The problem of an estimate that moves, or was not yet seen to stand still for long enough:
-    what happened in a pause of the telemetry was not seen."""
+    """Problem: the estimate moves, or has not been seen to stand still for long enough. Nothing is
+    known about a pause in the telemetry."""
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
@@ -199,21 +200,22 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
 
 
 ARMS_WITHIN_S = 5.0
-"""From the first request until the supervisor allows flight: the firmware gives up on motors that
-do not start after 2 s. A longer time keeps propellers turning on a vehicle that does not fly."""
+"""Longest time from the first request until the supervisor allows flight, s: the firmware gives up
+on motors that do not start after 2 s. Longer: the propellers of a vehicle that does not fly keep
+turning."""
 REQUEST_PERIOD_S = 0.25
 ARMING_PAUSE_S = 0.5
-"""So long something else may be waited for once the vehicle is to be armed, such as a late packet.
-A longer time keeps propellers turning on a vehicle that is picked up, or of which nothing is known;
-a shorter one ends a flight for a moment's disturbance."""
+"""Longest time for which another check may fail once arming has begun, s, for example because of a
+late packet. Longer: the propellers keep turning while somebody picks the vehicle up, or while its
+state is unknown. Shorter: a brief disturbance ends the flight."""
 
 
 class Arming:
     """Arms a vehicle that does not arm itself, once nothing else is waited for.
 
-    Its propellers turn from then on, so it comes last: after the operator's word, and whatever the
-    wait for it took. From the first request on nothing else is waited for beyond a moment, and a
-    vehicle that disarms itself is not armed again: someone may have reached for it.
+    Arming comes last, after the operator's confirmation, because the propellers turn from then on.
+    After the first request, other checks may fail for no longer than `ARMING_PAUSE_S`. A vehicle
+    that disarms itself is not armed again, since somebody may have reached for it.
     """
 
     def __init__(self) -> None:
@@ -223,14 +225,15 @@ class Arming:
 
     @property
     def has_begun(self) -> bool:
-        """True once the vehicle was to be armed."""
+        """True after the first request to arm."""
         return self._requested_s > -math.inf
 
     def note_waiting(self, waiting: str, began_s: float, now_s: float) -> None:
-        """Note what else a turn, begun at `began_s` and now over, has waited for; empty if nothing.
+        """Note the checks that failed in a turn that began at `began_s` and is now over; `waiting`
+        is empty if none did.
 
-        Raises SafetyAbort if that has lasted for longer than `ARMING_PAUSE_S` since the vehicle was
-        to be armed. A turn that hangs counts: nothing was seen in it.
+        Raises SafetyAbort if any has failed for longer than `ARMING_PAUSE_S` since the first
+        request to arm. A turn that hangs counts, because nothing was observed during it.
         """
         if not waiting:
             self._ready_s = began_s
@@ -241,7 +244,7 @@ class Arming:
             )
 
     def next_request(self, telemetry: Telemetry, now_s: float) -> Arm | None:
-        """The request to send now, if any. To be called in each turn in which the vehicle
+        """Return the request to send now, if any. Must be called in each turn in which the vehicle
         `waits_for_arming`, with fresh telemetry.
 
         Raises TimedOut if it does not arm within `ARMS_WITHIN_S`, SafetyAbort if it disarms itself
@@ -268,8 +271,8 @@ class Arming:
 
 
 def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm | None]:
-    """Return the link's guard for the wait before take-off: it disarms on the operator's word, also
-    while the loop hangs."""
+    """Return the link's guard for the wait before take-off: it disarms the vehicle on the
+    operator's command, even while the loop hangs."""
 
     def poll(
         now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
@@ -285,16 +288,16 @@ def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---
 
 
-LEAN_DEG = 5.0  # on its way up, and against a draught
+LEAN_DEG = 5.0  # allows for the lean on the way up, including against a draught
 Start = tuple[float, float, float]  # where it stands, in the world of the target's place
 
 
 def view_problem(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
-    """The problem of a way up that loses the target: no marker would be wholly in the
-    picture of a vehicle that leans a little, at take-off height over the start or over
-    `planner.approach_xy_m`. `yaw_rad`: the vehicle's heading."""
+    """Problem: the target would be lost on the way up. With the vehicle leaning a little at
+    take-off height, over the start or over `planner.approach_xy_m`, no marker would be completely
+    in the picture. `yaw_rad` is the vehicle's heading."""
     planner, (x, y, z) = profile.planner, start_m
     advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
     for over in ((x, y), planner.approach_xy_m):

@@ -44,21 +44,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """The options of one flight: those of the command line, else the profile's."""
+    """The options of one flight, from the command line or else from the profile."""
 
     profile: Profile
     profile_path: Path
     uri: str
     source: str
-    seed: int = 11  # a newcomer's first flight: nothing in it goes wrong that would need words
+    # for a newcomer's first flight, in which nothing goes wrong that needs explaining
+    seed: int = 11
     log_dir: Path = Path("perchctl-logs")
     record: bool = False
     sim_target_xy_m: tuple[float, float] | None = None
-    """Where a simulated target hangs, from where the vehicle stands; None: drawn from the seed."""
+    """Position of a simulated target relative to the vehicle; None: drawn from the seed."""
     link_uri: str | None = None
     """What the link opens instead of `uri`: the vehicle behind a radio hub."""
     serve_pictures: bool = False
-    """A vehicle's process in a fleet serves its pictures to the fleet's page."""
+    """The process of a vehicle in a fleet provides its pictures for the fleet's page."""
 
     @property
     def simulated(self) -> bool:
@@ -217,9 +218,8 @@ def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProc
 
 
 def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
-    """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
-    by hand (`perchctl check --lift`): swapped axes do not show at rest. A simulated
-    vehicle passes."""
+    """Raises SafetyAbort unless this vehicle was recently compared with the motion capture by hand
+    (`perchctl check --lift`): swapped axes do not show at rest. A simulated vehicle passes."""
     if not config.source.is_mocap or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection_and_advice(

@@ -1,13 +1,14 @@
-"""Who lands in the loop's place: the watchdog of a silent loop, and the rescue after an error.
+"""Landing in the loop's place: the watchdog for a silent loop, and the rescue after an error.
 
-The watchdog decides what the link sends (`Link.set_guard`) where the loop's hanging does not reach.
-Before the loop's first tick nothing flies, and it only obeys the operator: it cuts or disarms.
-From `REPEAT_AFTER_S` of silence on the last position is held: never above the vehicle,
-so that it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
-`safety.loop_late_land_s` on, or on the operator's order, or where the loop was already on its way
-down or had put the weight on the magnet, the lander of `perchctl.mission` goes on in its place.
-With decks or motion capture it orders the vehicle's own landing at once, three to six times, since
-a late loop can steer nothing; by the target alone it comes down level.
+The watchdog decides what the link sends (`Link.set_guard`) in a thread that a hang of the loop
+cannot block. Before the loop's first tick nothing flies, and the watchdog only obeys the operator:
+it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the last position, but
+never one above the vehicle, so that the vehicle neither climbs nor presses against the ceiling. The
+exception is a vehicle that sinks: it keeps a setpoint above itself, which brakes it. The lander of
+`perchctl.mission` takes over after `safety.loop_late_land_s`, on the operator's order, or if the
+loop was already descending or had put the weight on the magnet. With decks or motion capture it
+orders the vehicle's own landing at once, three to six times, since a late loop can steer nothing;
+by the target alone it comes down level.
 """
 
 from __future__ import annotations
@@ -47,11 +48,12 @@ from perchctl.vehicle import (
 )
 
 REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
-STOP_AFTER_S = 0.1  # for so long the operator's stop is left to the loop, which records it
+# the loop has this long to obey the operator's stop itself, so that it is recorded
+STOP_AFTER_S = 0.1
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 RESCUE_SINK_MPS = -0.1
 RESCUE_STILL_MPS = 0.06
-LOOK_S = 0.5  # a rescue leaves a vehicle whose motors have been seen off for so long
+LOOK_S = 0.5  # a rescue ends once the motors have been seen off for this long
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class LastTick:
 
     next_due_s: float  # when the next tick is due, from which the loop measures its lateness
     state: PlannerState
-    command: Command  # the last that was streamed
+    command: Command  # the last one that was streamed
     obs: Observation
 
 
@@ -68,7 +70,7 @@ class Watchdog:
     """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
     `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's. Each
-    thread writes fields of its own, and reads the other's: no value is lost without a lock.
+    field is written by only one of the two threads, so no lock is needed.
 
     `position_age_s` returns the age of the newest external position at a time. `overruled_s` is how
     late the loop was when the watchdog began a landing in its place, else 0.
@@ -115,7 +117,7 @@ class Watchdog:
         self._closing = True
 
     def end(self, *, motors_off: bool) -> None:
-        """Note that the flight is over; `motors_off` where that is proven."""
+        """Note that the flight is over; `motors_off` if that is proven."""
         self._closing, self._motors_off = True, motors_off
 
     @property
@@ -160,8 +162,9 @@ class Watchdog:
     def _before_first_tick(
         self, operator: OperatorRequest, now_s: float, newest: Telemetry | None
     ) -> Command | None:
-        """The operator's word, which a first turn that hangs or fails does not read. Its command
-        may have gone out even so: a stop cuts, and only on the ground a landing disarms."""
+        """Obey the operator's command in the loop's place, because a first turn that hangs or fails
+        does not read it. That turn's command may have been sent anyway, so a stop cuts the motors,
+        and a landing disarms only on the ground."""
         if operator is OperatorRequest.STOP:
             self._cut_ordered = True
             return self._cut(now_s, newest)
@@ -187,7 +190,7 @@ class Watchdog:
         new = [*waiting, *([] if newest is None else [newest])]
         self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
-        if self._profile.positioning.source.is_target:  # no sight is sent without the loop
+        if self._profile.positioning.source.is_target:  # detections are not sent without the loop
             age_s = last.obs.position_age_s + now_s - last.obs.t_s
         return Observation(
             t_s=now_s,
@@ -211,7 +214,7 @@ class Watchdog:
         if self._held is None and known is not None:
             match last.command:
                 case RawThrust(thrust) if abs(known.velocity_mps[2]) < RESCUE_STILL_MPS:
-                    return RawThrust(thrust)  # the press, which a change of mode would end
+                    return RawThrust(thrust)  # keep pressing: a change of mode would end it
                 case PositionSetpoint(z_m=z_m):
                     if z_m > known.position_m[2] and known.velocity_mps[2] < RESCUE_SINK_MPS:
                         return last.command
@@ -223,7 +226,7 @@ class Watchdog:
 
 
 def _is_on_its_way_down(state: PlannerState) -> bool:
-    """True also while the weight is on the magnet: its release goes on, monitored."""
+    """True also while the weight is on the magnet: its monitored release continues."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
         and (state.release_began_s is not None or state.motor_stop_ordered_s is not None)
@@ -231,7 +234,8 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
 
 
 def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
-    """The last setpoint's place, or the vehicle's, and not above where the vehicle is."""
+    """Return the last setpoint or, failing that, the vehicle's position, never higher than the
+    vehicle."""
     sample = known or last.obs.telemetry
     x, y, z = sample.position_m
     match last.command:
@@ -255,8 +259,8 @@ def rescue(
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
 ) -> RestReport:
-    """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest.
+    """Land a vehicle that still flies, without planner, camera and log, in at most a landing's
+    time. Returns where the vehicle came to rest.
 
     Args:
         state: the planner's last state; None before its first tick.
@@ -268,7 +272,7 @@ def rescue(
     """
 
     def send(command: Command) -> None:
-        with suppress(Exception):  # the link may be what failed: the next one goes out all the same
+        with suppress(Exception):  # the link itself may have failed: send the next one anyway
             link.send(command)
             on_sent(SentCommand(clock.now(), "rescue", command))
 

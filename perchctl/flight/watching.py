@@ -20,7 +20,7 @@ from perchctl.vision import Frame
 T = TypeVar("T")
 
 SLOW_WATCHER_S = 0.25
-"""A call that takes longer is reported: meanwhile the watchdog steers."""
+"""Duration above which a call is reported, s: the watchdog steers meanwhile."""
 
 
 class FrameWatcher(Watcher, Protocol):
@@ -40,7 +40,8 @@ class TurnWatcher(Watcher, Protocol):
         """Take a command sent in the loop's place; in another thread, so never wait."""
 
     def note_detached(self, reason: str) -> None:
-        """Remember, as the `problem`, why nothing more comes: it raised, as `reason` says."""
+        """Record as the `problem` that nothing more will be written, since writing raised for
+        `reason`."""
 
 
 class Watchers:
@@ -115,8 +116,8 @@ class Watchers:
                     self._detach(watcher, error)
 
     def take_notes(self) -> list[str]:
-        """What is worth a line of the flight's events since the last call: remarks on the
-        recording, watchers that were detached, and slow ones."""
+        """Return what deserves a line in the flight's events since the last call: remarks on the
+        recording, and watchers that were slow or detached."""
         try:
             remarks = [*self._remarks()]
         except Exception as error:
@@ -146,7 +147,7 @@ class Watchers:
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
             self.detached.append(f"{sentence}: it was detached, and perchctl continued without it")
-            if takes_turns(watcher):  # the loop reports it, as any problem of a log
+            if takes_turns(watcher):  # the loop reports it, like any problem of a log
                 self._log_problem = self._log_problem or sentence
                 with suppress(Exception):  # it has raised before
                     watcher.note_detached(sentence)
