@@ -1,6 +1,7 @@
-"""The faults that can be laid into a simulated flight.
+"""The catalogue of faults that can be injected into a simulated flight.
 
-A seed gives the same flight for ever: draws stay in their order.
+A seed must give the same flight in every version, so new draws are only added after the existing
+ones.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from perchctl.sim import Neighbour, Scenario
 P = Phase
 FAULT_STREAM = 510
 LONGEST_LOSS_S = 30.0
-"""A loss lasts for 0.1 s to this. Larger: fewer are short enough to be waited out."""
+"""Upper end of the duration of a temporary loss, s; the lower end is 0.1 s. Larger: fewer losses
+are short enough to be waited out."""
 EVER_SHARE = 0.25
-"""Share of the losses that last for ever. Larger: fewer end in flight."""
+"""Share of the losses that are permanent. Larger: fewer end in flight."""
 
 
 # --- Draws ---
@@ -58,7 +60,7 @@ def draw_bool(source: DrawInputs, probability: float) -> bool:
 
 
 def duration_s(low: float = 0.1) -> Draw:
-    """Draw a duration log-uniformly from `low` to `LONGEST_LOSS_S`; one in four lasts for ever."""
+    """Draw a duration log-uniformly from `low` to `LONGEST_LOSS_S`; one in four is permanent."""
 
     def draw(source: DrawInputs) -> float:
         for_s: float = log_uniform(low, LONGEST_LOSS_S)(source)
@@ -89,7 +91,7 @@ def draw_direction(source: DrawInputs) -> tuple[float, float]:
 
 
 def key_press_times(period: float | Draw, duration: Draw) -> Draw:
-    """Draw the times, s, at which a key is pressed every `period` s for `duration` s."""
+    """Draw the times, s, of key presses every `period` s for `duration` s."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
         period_s, for_s = _value(period, source), duration(source)
@@ -99,8 +101,8 @@ def key_press_times(period: float | Draw, duration: Draw) -> Draw:
 
 
 def held_key_times(delay: Draw, period_s: float, held: Draw) -> Draw:
-    """Draw the times, s, at which a key presses that is held down: at once, and from `delay` until
-    `held` every `period_s`, three times at least."""
+    """Draw the times, s, at which a key that is held down causes a press: at once, then every
+    `period_s` from `delay` until `held`, at least three times in all."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
         delay_s, for_s = delay(source), held(source)
@@ -224,8 +226,9 @@ STATE = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "v
 # --- The faults ---
 
 
-# The phases in which a campaign's faults begin. A campaign flies perches, and its seeds have to
-# draw the same faults as ever, so HOVER is in none of these sets. Tests fly faults in it.
+# The phases in which a campaign's faults begin. HOVER is in none of these sets: a campaign flies
+# perches, and its seeds must keep drawing the same faults. Tests inject faults into a hover
+# themselves.
 AIR = (
     P.APPROACH,
     P.SEARCH,
@@ -401,7 +404,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "no-magnet", "the magnet does not hold", effect(e.magnet_holds, of_weight=0.0), AT_CONTACT
     ),
-    Fault("weak-magnet", "the magnet carries 0.2 to 1.1 of the weight", WEAK_MAGNET, AT_CONTACT),
+    Fault("weak-magnet", "the magnet carries 0.2 to 1.1 times the weight", WEAK_MAGNET, AT_CONTACT),
     Fault(
         "magnet-lets-go",
         "the magnet lets go 1 to 25 s after contact",
@@ -511,7 +514,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "weak-magnet-uplink",
-        "the magnet carries 0.2 to 1.1 of the weight; no command reaches the vehicle",
+        "the magnet carries 0.2 to 1.1 times the weight; no command reaches the vehicle",
         (WEAK_MAGNET, NO_UPLINK),
         (P.PERCH, P.COMPLETE),
     ),
@@ -535,7 +538,7 @@ FAULTS: tuple[Fault, ...] = (
 )
 
 NO_FAULT = Fault("none", "no fault", (), ())
-"""What a flight without a fault has, in a campaign in which others have one."""
+"""The effects of a flight without a fault, in a campaign in which other flights have one."""
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 
@@ -557,7 +560,7 @@ class Case:
 
     @property
     def lasts_s(self) -> float:
-        """For how long a common cause lasts."""
+        """Duration of a common cause, s."""
         return max(float(effect.keywords["for_s"]) for effect in self.effects)
 
 
@@ -566,7 +569,8 @@ HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """The faults whose names stand in `names` between commas, or `all`. Errors: InvalidValue."""
+    """The faults whose names are listed in `names`, separated by commas; `all` selects every fault.
+    Errors: InvalidValue."""
     if names == "all":
         return FAULTS
     found = []
@@ -590,7 +594,7 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 def draw_fault_case(
     fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario
 ) -> Case:
-    """A case of the given fault and phase; its moment and its effects are drawn."""
+    """Return a case of the given fault and phase, with its moment and effects drawn."""
     source = DrawInputs(rng, scenario)
     moment_s = uniform(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)

@@ -1,4 +1,4 @@
-"""Common causes: one fault that several vehicles of a fleet meet at the same moment."""
+"""Common causes: one fault that hits several vehicles of a fleet at the same moment."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from perchctl.mission import Phase
 from perchctl.sim import Scenario
 
 STALL_S = 2.0
-"""How long the computer stalls. Larger: the firmware cuts the motors, which no program avoids."""
+"""Duration for which the computer stalls, s. Larger: the firmware cuts the motors, which no program
+can prevent."""
 
 
 @dataclass(frozen=True)
 class CommonCause:
-    """What befalls several vehicles at once.
+    """A fault that hits several vehicles at once.
 
     Attributes:
-        fault: name, description and effects, as of a fault of one vehicle.
+        fault: name, description and effects, as for a fault of one vehicle.
         whom: all vehicles, those of one dongle (all where no dongle is known), or two.
     """
 
@@ -35,11 +36,11 @@ class CommonCause:
         return self.fault.name
 
     def draw(self, rng: np.random.Generator, scenario: Scenario) -> Case:
-        """The case of each vehicle that meets it. Its effects begin when the fleet says so
+        """The case of each affected vehicle. Its effects begin when the fleet triggers them
         (`FaultyFlight.begin_fault`), in whatever phase a vehicle is."""
         effects = self.fault.draw
         assert callable(effects)
-        # No flight leaves its last phase, so that nothing begins by itself.
+        # No flight leaves its last phase, so these effects never begin on their own.
         return Case(self.fault, Phase.PERCHED, math.inf, (effects(DrawInputs(rng, scenario)),))
 
 

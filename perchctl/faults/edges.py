@@ -1,6 +1,6 @@
-"""The edges of a flight at which faults come in: its radio, its camera, and the program itself.
+"""The points at which faults enter a flight: its radio, its camera and the program itself.
 
-What `perchctl.faults.effects` does acts on `FaultRig`.
+The functions of `perchctl.faults.effects` act on `FaultRig`.
 """
 
 from __future__ import annotations
@@ -43,14 +43,8 @@ def packet_kind(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that the radio `air` loses, and a fault's packets.
-
-    Attributes:
-        cut: True once the uplink has ended for good.
-        lost: number of packets still to lose, by `packet_kind`; `twice`: the kinds whose next
-            packet arrives twice.
-        receive: called with the second copy of a packet.
-    """
+    """A radio that loses the packets that the radio `air` loses, and also those that a fault
+    selects."""
 
     def __init__(self, air: Radio | None = None) -> None:
         self._air = air or Radio()
@@ -111,7 +105,8 @@ class CameraFault:
 
 
 class FaultyCamera(WrappedSource):
-    """A frame source that passes on the simulated camera's frames, spoilt while a fault lasts."""
+    """A frame source that passes on the simulated camera's frames and corrupts them during a
+    fault."""
 
     def __init__(self, inner: FrameSource, seed: int) -> None:
         super().__init__(inner)
@@ -121,7 +116,7 @@ class FaultyCamera(WrappedSource):
         self._last: Frame | None = None
         self._queue: deque[Frame] = deque()
         self._overtaken: Frame | None = None
-        self.late_s = 0.0  # until a fault begins, and known to the profile
+        self.late_s = 0.0  # delay until a fault begins, which the profile knows
 
     def begin_fault(self, fault: CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
@@ -152,7 +147,7 @@ class FaultyCamera(WrappedSource):
                 image = (self._last or frame).image
             case "snow":
                 image = self._noise(frame.image, 120.0, INJECTED_SNOW_SIGMA)
-            case "covered":  # by a sheet of the ceiling's grey, under the target
+            case "covered":  # by a sheet in the ceiling's grey that hides the target
                 image = self._noise(frame.image, float(frame.image.mean()), SHEET_SIGMA)
             case "dark":
                 image = np.asarray(cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN), np.uint8)
@@ -176,7 +171,7 @@ class FaultyCamera(WrappedSource):
         return replace(old, t_s=old.t_s + late_s, t_arrival_s=old.t_arrival_s + late_s)
 
     def _swapped(self, frame: Frame | None) -> Frame | None:
-        """The frames in pairs, of each pair the newer first."""
+        """Return the frames in pairs, with the newer frame of each pair first."""
         if self._overtaken is not None:
             older, self._overtaken = self._overtaken, None
             if frame is not None:
@@ -195,7 +190,7 @@ class FaultyCamera(WrappedSource):
 
 
 USER_PATIENCE_S = 60.0
-"""The user kills a hung program after this time."""
+"""Time after which the user kills a program that hangs, s."""
 
 
 class ProgramKilled(BaseException):
@@ -203,7 +198,7 @@ class ProgramKilled(BaseException):
 
 
 class PlantedError(Exception):
-    """The exception that a fault raises in the loop, unforeseen by the program."""
+    """The exception that a fault raises in the loop, which the program does not expect."""
 
 
 class FaultyClock:
@@ -225,7 +220,7 @@ class FaultyClock:
 
     def now(self) -> float:
         if self.killed_s is not None:
-            raise ProgramKilled  # it rescues nothing any more, and says nothing
+            raise ProgramKilled  # it can neither rescue nor report anything any more
         return self._link.now_s
 
     def wait_until(self, t_s: float) -> None:
@@ -249,11 +244,11 @@ class FaultyClock:
             self._radio.cut = True
 
     def suspend(self, for_s: float) -> None:
-        """Let `for_s` pass while none of the program's threads runs."""
+        """Let `for_s` pass while all of the program's threads stand still."""
         self._link.vehicle.advance_to(self._link.now_s + for_s)
 
     def hang(self, for_s: float) -> None:
-        """Let `for_s` pass while the loop's thread is stuck; the link's threads run on."""
+        """Let `for_s` pass while the loop's thread is stuck; the link's threads keep running."""
         self._link.advance_to(self._link.now_s + min(for_s, USER_PATIENCE_S))
         if for_s > USER_PATIENCE_S:
             self.kill()
@@ -264,9 +259,10 @@ class FaultyClock:
 
 @dataclass
 class FaultRig:
-    """The parts of a flight that faults act on: `press` is the operator's Ctrl-C, `hang_up` closes
-    the terminal, `disk.problem` is the error of the log's disk, and while `deck_silent` the deck
-    gives no positions. Each of `on_sample` is called every `SAMPLE_S` with the time."""
+    """The parts of a flight that faults act on. `press` is the operator's Ctrl-C, and `hang_up`
+    closes the terminal. `disk.problem` is the error of the log's disk. The deck provides no
+    positions while `deck_silent` is set. Each of `on_sample` is called every `SAMPLE_S` with the
+    time."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio

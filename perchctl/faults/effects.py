@@ -1,6 +1,7 @@
-"""What a fault does, as functions that act on a flight's edges when the fault begins, at `t_s`.
+"""The effects of a fault: functions that act on the edges of a flight when the fault begins, at
+`t_s`.
 
-Durations are counted from the fault's beginning.
+Durations count from the beginning of the fault.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Axes = tuple[float, float, float]
 """World axes."""
 FOR_EVER = 1e6
 SAMPLE_S = 0.01
-"""Between two calls of `Injector.begin_due` and `FaultRig.call_due`."""
+"""Time between two calls of `Injector.begin_due` and of `FaultRig.call_due`, s."""
 LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
     "frozen": CaptureFault(frozen=True),
@@ -47,8 +48,8 @@ def radio_loss(
     down: str = "",
     delay_s: float = math.inf,
 ) -> None:
-    """For `for_s` lose all commands if `up`, and the packets of the log block `down` ("all": of
-    every block); a finite `delay_s` delays the log packets instead."""
+    """Lose all commands for `for_s` if `up`, and the packets of the log block `down` ("all": of
+    every block). A finite `delay_s` delays the log packets instead."""
     rig.radio.lose(t_s + for_s, up, down, delay_s)
 
 
@@ -58,7 +59,7 @@ def packet_lost(rig: FaultRig, t_s: float, order: str, count: int) -> None:
 
 
 def packet_twice(rig: FaultRig, t_s: float, order: str) -> None:
-    """Let the next packet of the kind `order` arrive twice."""
+    """Deliver the next packet of the kind `order` twice."""
     rig.radio.twice.add(order)
 
 
@@ -74,7 +75,7 @@ def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
 
 
 def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
-    """Begin the `CameraFault` of these values: spoil the pictures for `for_s`."""
+    """Begin the `CameraFault` with these values, which corrupts the pictures for `for_s`."""
     rig.camera.begin_fault(CameraFault(kind, for_s, late_s), t_s)
 
 
@@ -95,8 +96,8 @@ def external_positions(
 
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the deck's absolute positions for `for_s`. They corrected the accelerometer, which the
-    motors' shaking makes read `acc_z_mps2` too much along z in the whole flight."""
+    """Stop the deck's absolute positions for `for_s`. Until then they corrected the accelerometer,
+    which reads `acc_z_mps2` too much along z throughout the flight because the motors shake it."""
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 
@@ -139,7 +140,7 @@ def log_reads(
 
 
 def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> None:
-    """Let the battery's resting voltage fall by `by_v` at `rate_vps`."""
+    """Let the battery's resting voltage drop by `by_v` at the rate `rate_vps`."""
     world, left_v = rig.vehicle.world, by_v
 
     def sag(_now_s: float) -> None:
@@ -152,7 +153,7 @@ def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> Non
 
 
 def thrust_changed(rig: FaultRig, t_s: float, to: tuple[float, float, float, float]) -> None:
-    """Multiply each motor's thrust by its factor in `to`, as with other propellers."""
+    """Multiply each motor's thrust by its factor in `to`, as if it had another propeller."""
     powertrain = rig.vehicle.world.powertrain
     s1, s2, s3, s4 = (s * part for s, part in zip(powertrain.strength, to, strict=True))
     powertrain.strength = (s1, s2, s3, s4)
@@ -165,7 +166,7 @@ def push(rig: FaultRig, t_s: float, force_n: Axes, for_s: float) -> None:
 
 
 def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
-    """Release the magnet for good `after_s` after the gear has touched it."""
+    """Release the magnet permanently, `after_s` after the gear has touched it."""
     world, contact_s = rig.vehicle.world, math.inf
 
     def watch(now_s: float) -> None:
@@ -190,7 +191,7 @@ def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
 def operator(
     rig: FaultRig, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False
 ) -> None:
-    """At each of `presses_s` after `t_s` press Ctrl-C, or if `hang_up` close the terminal."""
+    """Press Ctrl-C at each of `presses_s` after `t_s`, or close the terminal if `hang_up`."""
     for press_s in presses_s:
         rig.call_at(t_s + press_s, rig.hang_up if hang_up else rig.press)
 
@@ -206,12 +207,12 @@ def suspended(rig: FaultRig, t_s: float, for_s: float) -> None:
 
 
 def hung(rig: FaultRig, t_s: float, for_s: float) -> None:
-    """Block the loop's thread for `for_s`; the program's other threads run on."""
+    """Block the loop's thread for `for_s`; the program's other threads keep running."""
     rig.clock.pending = partial(rig.clock.hang, for_s)
 
 
 def slow(rig: FaultRig, t_s: float, tick_s: float, for_s: float) -> None:
-    """Let each tick of the loop take at least `tick_s`, for `for_s`."""
+    """Make each tick of the loop take at least `tick_s`, for `for_s`."""
     rig.clock.tick_s, rig.clock.slow_until_s = tick_s, t_s + for_s
 
 
@@ -247,7 +248,7 @@ OF_THE_SCENARIO = (magnet_holds, room)
 
 
 def apply_to_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """The scenario with those of `effects` applied that hold from the flight's start."""
+    """Return the scenario with those `effects` applied that hold from the start of the flight."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
@@ -273,7 +274,7 @@ def apply_to_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
 
 
 def latency_drop_s(effect: Effect) -> float:
-    """The seconds by which an effect shortens the latency that the profile expects."""
+    """Time by which an effect shortens the latency that the profile expects, s."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
@@ -306,14 +307,14 @@ class Injector:
                 )
 
     def tick(self, tick: Tick) -> None:
-        """Note the phase, and when the effects are due."""
+        """Note the phase and, from it, when the effects are due."""
         if self.flown is None and self._shakes_mps2:
             self._edges.vehicle.firmware.estimator.add_accelerometer_bias(self._shakes_mps2)
         self.flown = tick.state.phase
         if self.begin_s is not None:
             return
         if self.flown is not self._phase:
-            if self._due_s is not None:  # left before its time
+            if self._due_s is not None:  # the phase was left before the moment came
                 self.begin(self._edges.vehicle.t_s)
         elif self._due_s is None:
             self._due_s = tick.t_s + self._moment_s
@@ -329,7 +330,7 @@ class Injector:
 
 
 def _measure(rig: FaultRig, noise: random.Random, _now_s: float) -> None:
-    """Give the estimator a position of the deck."""
+    """Give a position from the deck to the estimator."""
     if rig.deck_silent:
         return
     world, firmware = rig.vehicle.world, rig.vehicle.firmware

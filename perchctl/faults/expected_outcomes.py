@@ -1,7 +1,7 @@
-"""Where physics or the firmware leave no better end, and what is then expected.
+"""Outcomes that physics or the firmware make unavoidable.
 
-Its cause is what was true in the flight (`Facts`), not what was drawn, and not what the program
-reported.
+Their causes are read from what was true in the flight (`Facts`), not from the fault that was drawn
+and not from what the program reported.
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ from perchctl.faults.effects import battery_sags, killed, push, thrust_changed
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 
-CATCHABLE_M = 1.0  # lower, a slip reaches the floor (docs/firmware.md, "Catching a slip")
+# from a lower height, a slip ends on the floor (docs/firmware.md, "Catching a slip")
+CATCHABLE_M = 1.0
 NOTICED_S = 1.5
-"""Time that a low battery takes to be believed. Larger: a landing that begins late is excused."""
+"""Time until a low battery reading is believed, s. Larger: a landing that begins late is
+excused."""
 FASTEST_LANDING_MPS = 0.4
-"""Speed of a landing at best. Smaller: a landing that takes long is excused."""
+"""Highest speed of a landing, m/s. Smaller: a landing that takes long is excused."""
 PUSHED_OFF_S = 0.2
-"""A blow of 0.04 s has torn it off by then, or not at all."""
+"""Time after which a blow of 0.04 s has torn the vehicle off the magnet, if at all, s."""
 
 
 FALL: tuple[Flag, ...] = ("fell", "slid")
@@ -131,7 +133,7 @@ EXPECTED_OUTCOMES = (
 
 
 def unexpected_flags(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
-    """The flags that no expected outcome covers: those that count."""
+    """Return the flags that count: those that no expected outcome covers."""
     return tuple(
         flag
         for flag, t_s in flags.items()

@@ -1,4 +1,4 @@
-"""One lockstep flight with a fault, judged by the truth."""
+"""One flight in lockstep with a fault, judged by the simulator's ground truth."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ from perchctl.sim import Scenario, SimulatedVehicle, draw_capture
 from perchctl.vision import make_pipeline
 
 AFTER_PROGRAM_END_S = 6.0
-"""Time that the vehicle is watched after the program's end. Smaller: what falls later is missed."""
+"""Time for which the vehicle is watched after the program has ended, s. Smaller: a later fall is
+missed."""
 AFTER_IN_THE_AIR_S = 10.0
-"""The same for a vehicle that is still in the air then, from the program's end."""
+"""The same for a vehicle that is still in the air when the program ends, s."""
 LONGEST_FLIGHT_S = 240.0
 END_OF = {
     Phase.PERCHED: "perched",
@@ -139,8 +140,8 @@ class FaultyFlight:
         self._drift = UndetectedDrift(case.effects, scenario, by_target=by_target)
         self._descent_bound = DescentBound(case.effects, profile)
         self._facts = FactsRecorder(vehicle, profile, case.effects)
-        self._touched = False  # the ceiling, since the fault began
-        self._crashed = False  # by an exception that no fault planted
+        self._touched = False  # contact with the ceiling since the fault began
+        self._crashed = False  # the program ended by an exception that no fault raised
 
     def fly(self) -> FaultResult:
         """Fly to the end, wait until the vehicle is at rest, and return the judgement."""
@@ -169,11 +170,11 @@ class FaultyFlight:
 
     @property
     def end(self) -> str | None:
-        """One of `ENDS` once the program has ended, though its vehicle is still watched."""
+        """One of `ENDS` once the program has ended, even if its vehicle is still being watched."""
         return self._end
 
     def land(self) -> None:
-        """Order the landing, as the operator does."""
+        """Order a landing, as the operator would."""
         self._switch.land()
 
     def begin_fault(self) -> None:
@@ -200,7 +201,7 @@ class FaultyFlight:
                 return "refused", str(error), None
             self._crashed = True
             return "failed", f"{type(error).__name__}: {error}", None
-        self._vehicle.camera = None  # nobody looks any more
+        self._vehicle.camera = None  # the program no longer reads it
         self._oracle.add_claims(report_claims(report), self._link.now_s)
         return END_OF[report.phase], report.reason, report
 
@@ -218,7 +219,8 @@ class FaultyFlight:
         self._facts.update(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.on_floor and not sample.motors_on:
-            self._vehicle.camera = None  # most of the time would go into pictures of the wait
+            # otherwise most of the time would be spent rendering pictures of the wait
+            self._vehicle.camera = None
         self._on_sample(t_s)
 
     def _sample(self, t_s: float) -> Sample:

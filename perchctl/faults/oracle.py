@@ -1,4 +1,4 @@
-"""Whether a simulated flight went wrong, by the truth of the world and nothing else.
+"""Judges by the simulator's ground truth alone whether a simulated flight went wrong.
 
 The oracle raises flags (docs/campaigns.md, "Faults").
 """
@@ -14,8 +14,9 @@ from typing import NamedTuple
 from perchctl.mission import Event, FlightReport, Outcome, Phase, RestState
 
 Claim = str
-"""One that `Oracle._is_true` knows. A claim of hanging or standing includes that the motors are
-off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors off."""
+"""A claim that `Oracle._is_true` can verify. A claim of hanging or standing implies that the motors
+are off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors
+off."""
 Flag = str
 FLAGS: dict[Flag, str] = {
     "crashed": "perchctl ended with an exception that no fault injected",
@@ -29,7 +30,7 @@ FLAGS: dict[Flag, str] = {
     "lied": "perchctl reported a false state at the end",
     "locked_needlessly": "locked without a crash, tumble or excess tilt",
 }
-"""What can go wrong, the gravest first, and what it means."""
+"""What can go wrong and what each flag means, the most serious first."""
 
 LEAST_FALL_HEIGHT_M = 0.1
 """Below this height nothing counts as a fall."""
@@ -38,16 +39,16 @@ WEIGHTLESS_G = 0.2
 """Specific force below which a vehicle falls freely. Larger: a descent with little thrust counts as
 a fall."""
 WEIGHTLESS_S = 0.15
-"""Time that this must last. Larger: short falls are missed."""
+"""Time for which the vehicle must fall freely, s. Larger: short falls are missed."""
 TOUCHDOWN_MPS, TOUCHDOWN_ASIDE_MPS = 0.8, 0.5
 UNPOWERED_G = 0.5
 FAST_MPS = 0.45
-"""A sink rate faster than any order: a fall, until it is slower again."""
+"""Sink rate above any that is commanded, m/s: the vehicle falls until it is slower again."""
 FALL_CAUGHT_MPS = 0.05
 """Sink rate below which a fall is over at once."""
 SLOW_AGAIN_S = 0.3
-"""Time below `FAST_MPS` after which it is over, too. Larger: the drop goes on in the descent that
-follows."""
+"""Time below `FAST_MPS` that also ends a fall, s. Larger: the descent that follows counts as a part
+of the fall."""
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
 """A vehicle that bounces off the ceiling for less than `RELEASED_S` still presses."""
@@ -83,7 +84,7 @@ class Sample(NamedTuple):
     y_m: float
     height_m: float
     vz_mps: float
-    body_up_z: float  # of the body's z axis: 1 level, -1 upside down
+    body_up_z: float  # z component of the body's z axis: 1 level, -1 upside down
     acc_g: float  # size of the specific force
     motors_on: bool
     pressing: bool  # the motors push against ceiling or floor
@@ -93,16 +94,18 @@ class Sample(NamedTuple):
     locked: bool
     supervisor_ended: bool  # crashed or tumbled, as the supervisor saw it
     horizontal_mps: float = 0.0
-    uplink: bool = True  # what the program sends would arrive
-    astray_m: float = 0.0  # from where it should be, less the drift by the fault
-    miss_m: float = 0.0  # of the gear from the target's centre, horizontally
-    below_m: float = 0.0  # the gear below the printed target's plane
+    uplink: bool = True  # a packet from the program would arrive
+    # distance from where the vehicle should be, minus the drift that the fault causes
+    astray_m: float = 0.0
+    miss_m: float = 0.0  # horizontal distance of the gear from the target's centre
+    below_m: float = 0.0  # distance of the gear below the plane of the printed target
     descent_overdue: bool = False
-    telemetry_ok: bool = True  # arrives in time, and tells what is true
+    telemetry_ok: bool = True  # telemetry arrives in time and is correct
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """The depth, m, that a slip off the magnet may have; `hold_ratio`: hold over weight."""
+    """The depth, m, to which a slip off the magnet may fall; `hold_ratio` is the hold over the
+    weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
@@ -111,7 +114,7 @@ def drop_limit_m(hold_ratio: float) -> float:
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
     """The time at which these presses of Ctrl-C order an emergency stop; None if they never do.
 
-    Presses are those of a hand, or of a key that repeats too fast for one."""
+    The presses come from a hand, or from a key that repeats faster than a hand can."""
     for number, press_s in enumerate(presses_s):
         after_s, later_s = press_s - presses_s[0], presses_s[number + 1 : number + 2]
         if after_s >= KEY_HELD_S:
@@ -170,22 +173,22 @@ class Oracle:
         self._max_height_m, self._magnet_radius_m = max_height_m, magnet_radius_m
         self._tilted_up_z = math.cos(math.radians(max_tilt_deg))
         self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
-        self._hung: Sample | None = None  # last sample that hung
+        self._hung: Sample | None = None  # last sample in which the vehicle hung
         self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(WEIGHTLESS_S)
-        self._press_s = -math.inf  # newest sample that pressed
+        self._press_s = -math.inf  # newest sample in which the vehicle pressed
         self._pressed = _Lasting(PRESSED_S)
-        self._calm_height_m = 0.0  # where it last did not sink fast
+        self._calm_height_m = 0.0  # height at which the vehicle last did not sink fast
         self._fall: _Fall | None = None
-        self._weak_s = -math.inf  # when it was last without the thrust to slow down
+        self._weak_s = -math.inf  # last time without enough thrust to slow down
         self._before: Sample | None = None
         self._least_up_z = 1.0
         self._supervisor_ended = False
         self._may_lock = False
-        self._claims: dict[Claim, float] = {}  # those that are not found true yet
-        self._seen_down = _Lasting(SEEN_S)  # at rest with still motors, and heard
+        self._claims: dict[Claim, float] = {}  # claims that have not been found true yet
+        self._seen_down = _Lasting(SEEN_S)  # time at rest with motors off and telemetry arriving
         self._said_off = False  # a claim that the motors are off has been found true
         self._presses_s: list[float] = []
-        self._muted_s = -math.inf  # when last nothing arrived
+        self._muted_s = -math.inf  # last time at which nothing arrived
         self._end_s = math.inf
 
     def add_claims(self, claims: Iterable[Claim], t_s: float) -> None:
@@ -298,7 +301,7 @@ class Oracle:
             self._raise("flies_on", s.t_s)
 
     def _watch_claims(self, s: Sample) -> None:
-        """Judge open claims; motors that were claimed off must not turn again."""
+        """Judge the open claims. Motors that were claimed to be off must not turn again."""
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
@@ -314,7 +317,7 @@ class Oracle:
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         hangs = s.hanging and not s.motors_on
         off_m = math.hypot(s.miss_m, s.below_m)
-        # What lies on its side or its back does not stand.
+        # A vehicle that lies on its side or its back does not stand.
         stands = not s.motors_on and not _airborne(s) and s.body_up_z > self._tilted_up_z
         truths = {
             "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
@@ -352,7 +355,7 @@ def _airborne(s: Sample) -> bool:
     return not s.on_floor and s.height_m > LEAST_FALL_HEIGHT_M
 
 
-# --- What the program says at its end, as claims that are true or false of a vehicle ---
+# What the program says at its end, as claims about the vehicle that are true or false ---
 
 
 Claims = set[Claim]
@@ -383,8 +386,8 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
 }
 """The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
-"""The transitions of flights whose end the program does not know: whether the vehicle hangs or
-stands, and whether it came down at all."""
+"""The transitions that end a flight without knowing whether the vehicle hangs or stands, or whether
+it came down at all."""
 RESCUE_CLAIMS: dict[RestState, Claims] = {
     RestState.STANDS: {"stands"},
     RestState.HANGS: {"hangs"},
@@ -394,7 +397,7 @@ RESCUE_CLAIMS: dict[RestState, Claims] = {
 }
 """The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS: Claims = {"stands"}
-"""A refusal claims that no motor was started."""
+"""A refusal claims that no motor has started."""
 
 
 def last_transition(report: FlightReport) -> str:

@@ -32,7 +32,7 @@ class FaultResult(CampaignFlight):
         outcome: one of `ENDS`.
         flags: what went wrong, each flag with its first time.
         counted: the flags that no expected outcome covers.
-        expected: the names of the expected outcomes whose cause came, whether or not a flag was
+        expected: the names of the expected outcomes whose cause occurred, whether or not a flag was
             raised.
         begin_s: when the fault began, `moment_s` into `phase`; None if the flight ended before.
         miss_m: distance from the target's centre; None if not perched.
@@ -108,13 +108,13 @@ def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
 
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
-    """The flights with a flag that counts, the gravest first."""
+    """Return the flights with a flag that counts, the most serious first."""
     bad, order = [r for r in results if r.is_bad], list(FLAGS)
     return sorted(bad, key=lambda r: (min(map(order.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """The flights of each fault, the figures, and the worst flights as plain text."""
+    """Return the flights of each fault, the figures and the worst flights as plain text."""
     figures, flown = fault_summary(results), Counter(r.fault for r in results)
     wrong = Counter(r.fault for r in results if r.is_bad)
     excused = Counter(r.fault for r in results if r.is_excused)

@@ -1,5 +1,5 @@
-"""What is true in a flight: samples of the vehicle for the oracle, the facts that expected
-outcomes rest on, and what the true vehicle is held to."""
+"""The ground truth of a flight: samples of the vehicle for the oracle, the facts that decide which
+outcomes are expected, and the bounds within which the true vehicle must stay."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
 
 MAX_RAW_THRUST = 60000.0
-"""The largest raw thrust order (docs/firmware.md, "Raw thrust")."""
+"""The largest raw thrust that is commanded (docs/firmware.md, "Raw thrust")."""
 PRESSING_WEIGHT_RATIO = 1.02
-"""Rotors that lift more than this part of the weight press against whatever is in the way."""
+"""Share of the weight that the rotors must lift to press against the ceiling or the floor."""
 
 
 class WatchedVehicle(SimulatedVehicle):
@@ -93,15 +93,16 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
 
 
 LEAST_LIFT = 1.02
-"""The lift over the weight that keeps a vehicle in the air."""
+"""The ratio of lift to weight that keeps a vehicle in the air."""
 CUT_S = 1.9
-"""A longer silence ends in the firmware's cut (2.0 s after the last setpoint)."""
+"""Silence above which the firmware cuts the motors, s (2.0 s after the last setpoint)."""
 LOCKS_S = 0.1
-"""The lock shows this long after the cut; what arrives meanwhile prevents nothing."""
+"""Time after the cut at which the lock shows, s. Packets that arrive meanwhile prevent nothing."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
-"""Motors that stood still take longer than this to regain control."""
+"""Time within which motors that stood still have not regained control, s, and the tilt at which the
+vehicle has turned over meanwhile, as the z component of its body's z axis."""
 WATCH_WITHIN_S = 0.1
-"""The telemetry shows a hanging vehicle up to this late."""
+"""Longest delay until the telemetry shows that a vehicle hangs, s."""
 
 
 @dataclass
@@ -154,10 +155,10 @@ class FactsRecorder(Facts):
         self._watch_s = complete.hang_s + complete.watch_s - WATCH_WITHIN_S
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
-        self._silent_s: float | None = None  # since when nothing has arrived
-        self._heard_s = -math.inf  # when the newest silence ended that was long enough for a cut
+        self._silent_s: float | None = None  # start of the present silence
+        self._heard_s = -math.inf  # end of the newest silence that was long enough for a cut
         self._landed_alone = self._begun = False
-        self._hangs_s: float | None = None  # since when the whole weight has hung
+        self._hangs_s: float | None = None  # time since which the whole weight has hung
         self._before: Sample | None = None
 
     def update(self, sample: Sample) -> None:
@@ -177,7 +178,7 @@ class FactsRecorder(Facts):
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
         self.make_onboard_landing = self.make_onboard_landing or (long and self._landed_alone)
         locks = s.locked and not (self._before and self._before.locked)
-        ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
+        ordered = self._vehicle.firmware.supervisor.emergency  # cut by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
         if locks and (long or late) and self.silence_lock_s is None:
             self.silence_lock_s = s.t_s
@@ -206,7 +207,7 @@ class FactsRecorder(Facts):
             self._hangs_s = s.t_s
 
     def _note_power(self, s: Sample) -> None:
-        """Note when four times what the weakest motor gives no longer lifts the weight."""
+        """Note when four times the thrust of the weakest motor no longer lifts the weight."""
         vehicle, world = self._vehicle, self._vehicle.world
         weakest = min(world.powertrain.strength or (1.0,))
         lift_n = min(4.0 * MOTOR_FORCE_N, weakest * max_thrust_n(world.battery_rest_v))
@@ -229,26 +230,30 @@ TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED
 GUIDED_BY_CAMERA = frozenset(CAMERA_GUIDED) | {Phase.HOVER}
 FREE_AIR = GUIDED_BY_CAMERA | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
-"""The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
-NO_SIGHT = (*NO_PICTURE, "covered")  # in the dark a target that is near is found
+"""The camera faults that leave no usable picture. During a fault in `NO_SIGHT`, no target can be
+seen."""
+# "dark" is missing because a target close by is found in the dark
+NO_SIGHT = (*NO_PICTURE, "covered")
 NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
-"""A loss that ends so soon after its limit may have been waited out."""
+"""A loss that ends this soon after its limit may have been waited out, s."""
 REACTION_S = 1.0
-"""From the profile's limit to the way down, at most: a turn's delay, thrust that goes down."""
+"""Longest time from the profile's limit to the descent, s: one turn's delay, and the time for the
+thrust to decrease."""
 WATCHED_S, SUNK_M = 2.0, 0.15
-"""After so much more time it has come down by this, at less than a third of a landing's speed."""
+"""Time after that, s, and the height that the vehicle must have lost by then, m, at less than a
+third of the landing speed."""
 COMING_DOWN_MPS = 0.1
-"""Or it sinks like that."""
+"""Or the sink rate at which it counts as coming down, m/s."""
 HANDED_OVER_M = 0.3
-"""Where a landing hands over, and slows down."""
+"""Height at which a landing is handed over to the firmware and slows down, m."""
 
 
 class PositionBound:
-    """The horizontal places where the vehicle may be, by phase: at its start (or
-    `planner.approach_xy_m`) in take-off; between start and target in search, estimate, alignment
-    and recovery; under a target in ascent, press and completion; from the landing on where the
-    vehicle should have been when the landing began.
+    """The horizontal places where the vehicle may be in each phase. During take-off it is at its
+    start (or at `planner.approach_xy_m`). During search, estimate, alignment and recovery it is
+    between start and target. During ascent, press and completion it is under a target. From the
+    beginning of a landing on, it stays where it should have been at that moment.
 
     A target that looks like the vehicle's own counts, too.
     """
@@ -350,13 +355,13 @@ class UndetectedDrift:
 
 
 class DescentBound:
-    """When the vehicle should descend: at once by the operator's order or an exception, else once
-    the fault has lasted longer than the profile waits."""
+    """Decides when the vehicle must descend: at once on the operator's order or an exception,
+    otherwise once the fault has lasted longer than the profile waits."""
 
     def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
         self._due_s: float | None = None  # None: the fault has not begun
-        self._from_m: float | None = None  # its height when the way down was due
+        self._from_m: float | None = None  # the vehicle's height when the descent was due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
         """Note when the fault began, and the program's phase then; further calls do nothing."""
