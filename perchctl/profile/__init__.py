@@ -1,11 +1,11 @@
-"""Profiles: one YAML file says everything a flight depends on.
+"""Profiles: one YAML file contains everything that a flight depends on.
 
-schema: the whole; vision, mission, positioning and simulation hold the sections, each key with
-its bounds. limits: keys that must fit each other.
-load: reading, `extends`, the files of weights, calibration and mask. edit: changes, in
-memory and in the file. keys: each with its unit, bounds and meaning, as a commented file, and as
-a schema for editors. base: what all sections share, and keys that have become constants.
-dictionaries: ArUco's.
+schema is the whole profile. vision, mission, positioning and simulation hold its sections, with the
+bounds of each key. limits relates keys that must fit each other. load reads a profile, resolves
+`extends`, and finds the files of weights, calibration and mask. edit changes a profile in memory or
+in its file. keys describes each key with unit, bounds and meaning, as a commented file or as a
+schema for editors. base holds the parts that all sections share, and handles keys that have become
+constants. The ArUco dictionaries are in vision.
 """
 
 import lazy_loader

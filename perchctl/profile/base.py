@@ -1,4 +1,4 @@
-"""What all sections of a profile share."""
+"""The parts that all sections of a profile share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 Vector3 = tuple[float, float, float]
 
 FARTHEST_ON_BODY_M = 0.3
-"""No part of a vehicle that weighs 42 g is farther from its centre, on any axis."""
+"""Largest distance of any part of a vehicle from its centre on one axis, m. No vehicle of 42 g is
+larger."""
 _OnBody = Annotated[float, Field(ge=-FARTHEST_ON_BODY_M, le=FARTHEST_ON_BODY_M)]
 BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
@@ -21,7 +22,7 @@ def key(default: Any, meaning: str, **constraints: Any) -> Any:
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """The pair. Raises ValueError where the lowest is not first."""
+    """Return the pair. Raises ValueError unless the lowest value comes first."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair
@@ -31,12 +32,12 @@ Number = TypeVar("Number")
 Ordered = Annotated[
     tuple[Number, Number], AfterValidator(_ordered), Field(json_schema_extra={"ordered": True})
 ]
-"""Two numbers, the lowest first."""
+"""Two numbers, the lower one first."""
 Range = Ordered[float]
 
 
 class Section(BaseModel):
-    """Keys and values of a YAML file: frozen, and without a key that nobody knows."""
+    """Keys and values of a section of a YAML file: frozen, and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -88,7 +89,7 @@ UNITS = {
     "s": "s",
     "v": "V",
 }
-"""A name's last word, and the unit that it stands for."""
+"""The last word of a key's name, and the unit that it stands for."""
 UNITS_OF = {
     "k1": "cm^2, deg^2",
     "k2": "cm^2, deg^2",
@@ -103,15 +104,15 @@ def key_unit(path: str) -> str:
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
 
 
-# --- Keys that have become constants of their section ---
+# Keys that have become constants of their section ---
 
 
 def split_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """A profile's values without the keys that have become constants (class variables of
-    `model` or of its nested models); a note for each such key with the constant's value; and
-    what is wrong with each that has another value. `path`: the keys' prefix in these texts."""
+    """Return a profile's values without the keys that have become constants (class variables of
+    `model` or of its nested models), a note on each such key with the constant's value, and the
+    problem of each key with another value. `path` is the prefix of the keys in these texts."""
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None

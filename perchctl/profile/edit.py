@@ -1,6 +1,6 @@
-"""Changes of a profile: some keys of a loaded one, and numbers written into its file.
+"""Change a profile: some keys of a loaded one, or numbers in its file.
 
-In the file comments and order stay as they are.
+The comments and the order of the file are preserved.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def _parsed(setting: str, option: str) -> tuple[str, str]:
 
 
 def profile_value(profile: Profile, key: str) -> Any:
-    """The value of a key such as ``camera.latency_s``, in JSON types; None without such a key."""
+    """Return the value of a key such as ``camera.latency_s`` in JSON types; None if there is no
+    such key."""
     value: Any = profile.model_dump(mode="json")
     for name in key.split("."):
         value = value.get(name) if isinstance(value, dict) else None
@@ -74,11 +75,10 @@ _DECIMALS = 6
 
 
 def writable_profile(name: str) -> Path:
-    """The file of a user's own profile, with links resolved.
+    """Return the file of a user's own profile, with links resolved.
 
-    Raises:
-        NotFound: no such profile.
-        InvalidValue: the profile is shipped with perchctl, or not writable.
+    Raises NotFound if there is no such profile, and InvalidValue if the profile is shipped with
+    perchctl or not writable.
     """
     path = find_profile(name).resolve()
     if path.is_relative_to(data_folder("profiles").resolve()):
@@ -149,7 +149,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
                 raise ValueError(f"{section} has no keys and values")
         old = place.get(key)
         if isinstance(old, list) and isinstance(value, tuple) and len(old) == len(value):
-            for index, number in enumerate(new):  # one by one: their comments stay
+            for index, number in enumerate(new):  # one by one, so that their comments are kept
                 old[index] = number
         else:
             place[key] = new
@@ -157,13 +157,13 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     stream = io.StringIO()
     yaml.dump(document, stream)
     written = stream.getvalue()
-    if _values_of(written) != wanted:  # as where an anchor's value is another key's, too
+    if _values_of(written) != wanted:  # also if the value is an anchor that another key refers to
         raise ValueError("the values cannot be written into this file's layout")
     return written
 
 
 def _as_null(representer: Any, nothing: None) -> Any:
-    """Write null as most people do; by itself ruamel leaves the value out."""
+    """Write null explicitly; by default ruamel leaves the value out."""
     return representer.represent_scalar("tag:yaml.org,2002:null", "null")
 
 
@@ -175,7 +175,8 @@ def _values_of(text: str) -> dict[str, Any]:
 
 
 def _flow(value: Value) -> str:
-    """A value in YAML: with a point and without an exponent, which would be read as text."""
+    """Return a value in YAML: with a decimal point and without an exponent, which would be read as
+    text."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(_flow, value))}]"
     if not isinstance(value, float):

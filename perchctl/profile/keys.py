@@ -1,7 +1,6 @@
-"""What people read about a profile's keys: path, unit, default, what is allowed, what it means.
+"""Descriptions of a profile's keys: path, unit, default, allowed values and meaning.
 
-From here are the table of docs/profiles.md, a profile as a commented YAML file, and the schema by
-which an editor completes one.
+The table in docs/profiles.md, commented YAML files and the schema for editors are made from them.
 """
 
 from __future__ import annotations
@@ -152,7 +151,8 @@ def json_schema() -> dict[str, Any]:
     schema = Profile.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         section.pop("title", None)
-        section.pop("required", None)  # a profile that extends another gives some keys only
+        # a profile that extends another one contains only some of the keys
+        section.pop("required", None)
         for name, field in section["properties"].items():
             field.pop("title", None)
             field.pop("ordered", None)

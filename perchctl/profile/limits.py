@@ -20,7 +20,8 @@ from perchctl.profile.mission import (
 )
 
 REACHED_SHARE = 0.8
-"""Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
+"""Distance from the take-off height at which it counts as reached, m
+(`Condition.AT_TAKEOFF_HEIGHT`)."""
 _KEY = re.compile(r"[a-z_]+(?:\.[a-z0-9_]+)+")
 
 
@@ -57,7 +58,7 @@ class Limit:
 
 
 def _read(found: re.Match[str]) -> str:
-    """The key of a profile as an expression; of a latency that is measured its beginning."""
+    """Convert a profile's key to an expression; a measured latency becomes its initial value."""
     key = found[0]
     return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 
@@ -82,7 +83,7 @@ _IMPOSSIBLE = {
         "telemetry would always be too old, so the vehicle would land"
     ),
 }
-"""A relation, and what happens to every flight with a profile that breaks it."""
+"""Relations, and what happens to every flight with a profile that breaks one."""
 
 _DOUBTFUL = {
     "heights": {
@@ -99,7 +100,8 @@ _DOUBTFUL = {
     },
     "battery limits": {
         "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
-        # What a full battery has left under a light vehicle (docs/firmware.md, "Thrust to PWM").
+        # The thrust that a full battery leaves for a light vehicle (docs/firmware.md, "Thrust to
+        # PWM").
         "safety.min_load_v < 3.7": (
             "hovering takes even a full battery down to it, so the vehicle would land as "
             "soon as it takes off"
@@ -145,11 +147,12 @@ _DOUBTFUL = {
         ),
     },
 }
-"""Relations by the name of their row in the check, and what a broken one hardly allows."""
+"""Relations by the name of their row in the check, and what a profile that breaks one can hardly
+do."""
 
 IMPOSSIBLE = tuple(Limit(*each) for each in _IMPOSSIBLE.items())
-"""Every flight with a profile that breaks one comes to nothing."""
+"""Relations whose violation makes every flight fail."""
 DOUBTFUL = {
     name: tuple(Limit(*each) for each in relations.items()) for name, relations in _DOUBTFUL.items()
 }
-"""What is allowed and hardly works together, by the name of its row in the check."""
+"""Combinations that are allowed but hardly work, by the name of their row in the check."""

@@ -1,7 +1,7 @@
-"""From a profile's name or path to a checked, frozen `Profile`.
+"""Load a profile by name or path, check it, and return it as a frozen `Profile`.
 
-`load_profile(name)` reads the file, follows `extends`, and checks the whole.
-Every fault is one `InvalidValue` sentence of the form ``file: key: what is wrong``.
+`load_profile(name)` reads the file, follows `extends`, and checks the result. Every fault is one
+`InvalidValue` sentence of the form ``file: key: what is wrong``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _NAMED_FILES = (
     ("camera", "calibration", "calib"),
     ("camera", "mask", None),
 )
-"""Section and key of what names a file, and the data folder that may hold it by its name."""
+"""Section and key of each file name in a profile, and the data folder in which that name is looked
+up."""
 
 
 def is_profile_path(name: str) -> bool:
@@ -83,8 +84,9 @@ def _with_weights(profile: Profile) -> Profile:
 
 
 def layered_profile(path: Path, base: str, *layers: dict[str, Any]) -> Profile:
-    """The profile that a file at `path` would be if it extended `base` with the keys of all
-    `layers`, of which later ones count more. Names of files in them are relative to its folder.
+    """Return the profile that a file at `path` would give if it extended `base` with the keys of
+    all `layers`; later layers override earlier ones. File names in them are relative to the folder
+    of `path`.
 
     Errors: NotFound, InvalidValue, both beginning with `path`.
     """
@@ -95,13 +97,14 @@ def layered_profile(path: Path, base: str, *layers: dict[str, Any]) -> Profile:
 
 
 def _by_in_full(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with `positioning: mocap` written as the section that other layers add to."""
+    """Return the values with `positioning: mocap` expanded to a section, so that other layers can
+    add to it."""
     by = values.get("positioning")
     return {**values, "positioning": {"by": by}} if isinstance(by, str) else values
 
 
 def target_keys(path: Path) -> dict[str, Any]:
-    """The keys of the section `target` in the profile at `path`, which need not be complete.
+    """Return the keys of the section `target` in the profile at `path`, which may be incomplete.
 
     Errors: NotFound, InvalidValue.
     """
@@ -114,7 +117,8 @@ def target_keys(path: Path) -> dict[str, Any]:
 def check_profile(path: Path, text: str) -> None:
     """Raise NotFound or InvalidValue if the profile would not load with `text` as its content."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ProfileNote)  # said when it was loaded
+        # these notes were shown when the profile was loaded
+        warnings.simplefilter("ignore", ProfileNote)
         _checked(path, _values_of(text, path))
 
 
@@ -135,8 +139,8 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
 
 
 def _read_weights(name: str) -> WeightsConfig:
-    """The weights of the file that a loaded profile names: a whole path, or a name in the
-    user's folder. Raises NotFound, InvalidValue."""
+    """Return the weights from the file that a loaded profile names: an absolute path, or a name in
+    the user's folder. Raises NotFound, InvalidValue."""
     given = Path(name)
     path = given if given.is_file() else data_file("weights", name)
     if path is None:
@@ -173,7 +177,7 @@ def find_calibration(name: str) -> Path:
 
 
 MOST_MASKED_SHARE = 0.75
-"""Of the picture; with more of it covered there is no room for a target."""
+"""Largest covered share of the picture. Larger: no room is left for a target."""
 _WHITE = 127
 
 
@@ -225,7 +229,7 @@ def _choices() -> str:
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
-    """Return what the file at `path` holds itself, on top of what it extends."""
+    """Return the content of the file at `path` itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles refers back to itself")
     values = _without_constants(own, path)
@@ -262,8 +266,9 @@ def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
 def _place_beside(
     values: dict[str, Any], path: Path, section: str, key: str, kind: str | None
 ) -> None:
-    """Place a named file in its profile's folder, whichever other profile extends it and wherever
-    perchctl is called. A name of `kind` may be one from the data folders."""
+    """Resolve the file names in a profile relative to its own folder, independently of the profiles
+    that extend it and of the working directory. A name of `kind` may also refer to a data
+    folder."""
     part = values.get(section)
     name = part.get(key) if isinstance(part, dict) else None
     if not isinstance(name, str):
@@ -274,7 +279,7 @@ def _place_beside(
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The keys and values of a YAML file, unchecked. Errors: NotFound, InvalidValue."""
+    """Return the keys and values of a YAML file, unchecked. Errors: NotFound, InvalidValue."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:

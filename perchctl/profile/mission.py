@@ -17,7 +17,7 @@ class SearchConfig(Section):
     )
     wait_s: float = key(1.5, "waiting time at each height", gt=0, le=60)
     step_m: ClassVar[float] = 0.12
-    """It climbs so far between two looks."""
+    """Height by which the vehicle climbs between two waits, m."""
     max_height_m: float = key(1.3, "maximum height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
         60.0,
@@ -26,17 +26,17 @@ class SearchConfig(Section):
         le=180,
     )
     confirm_frames: ClassVar[int] = 3
-    """In a row with the target."""
+    """Number of successive frames that must show the target."""
 
 
 class EstimateConfig(Section):
     """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
 
-    dwell_s: ClassVar[float] = 0.4  # for which the pose must be steady
+    dwell_s: ClassVar[float] = 0.4  # time for which the pose must be steady
     spread_m: ClassVar[float] = 0.05
-    """Within which it must stay."""
+    """Range within which the pose must stay to count as steady, m."""
     timeout_s: ClassVar[float] = 4.0
-    """A pose that is not steady by then sends it back to search."""
+    """Time after which the vehicle goes back to search if the pose is not steady, s."""
 
 
 class AlignConfig(Section):
@@ -45,13 +45,13 @@ class AlignConfig(Section):
     xy_m: float = key(
         0.04, "maximum distance of the gear from the target's axis to count as aligned", gt=0, le=1
     )
-    yaw_deg: ClassVar[float] = 5.0  # aligned: heading
-    dwell_s: ClassVar[float] = 0.4  # for which both must hold
+    yaw_deg: ClassVar[float] = 5.0  # largest heading error to count as aligned
+    dwell_s: ClassVar[float] = 0.4  # time for which position and heading must both be aligned
     timeout_s: ClassVar[float] = 20.0
-    """An attempt that is not aligned by then counts as failed."""
-    speed_mps: ClassVar[float] = 0.4  # of the setpoint, sideways
+    """Time after which an attempt that is not aligned counts as failed, s."""
+    speed_mps: ClassVar[float] = 0.4  # lateral speed of the setpoint
     yaw_rate_dps: ClassVar[float] = 60.0
-    """Of the setpoint."""
+    """Rotation rate of the setpoint, deg/s."""
 
 
 class AscendConfig(Section):
@@ -65,13 +65,13 @@ class AscendConfig(Section):
 
     speed_mps: float = key(0.25, "climb speed while far below the target", gt=0, le=1)
     near_speed_mps: ClassVar[float] = 0.12
-    """Climb nearer than `near_m`."""
+    """Climb speed closer to the target than `near_m`, m/s."""
     near_m: ClassVar[float] = 0.35
-    """From here on it climbs slowly."""
+    """Distance to the target below which the vehicle climbs slowly, m."""
     cone_base_m: ClassVar[float] = 0.05
-    """The cone's radius at the target."""
+    """The cone's radius at the target, m."""
     cone_slope: ClassVar[float] = 0.2
-    """The cone's radius grows by it a metre below."""
+    """Increase of the cone's radius for each metre below the target."""
     standoff_m: float = key(
         0.08,
         "distance below the target at which the vehicle settles before contact",
@@ -84,15 +84,15 @@ class AscendConfig(Section):
         gt=0,
         le=0.1,
     )
-    settle_z_m: ClassVar[float] = 0.02  # settled: at most so far below the stand-off
+    settle_z_m: ClassVar[float] = 0.02  # largest distance below the stand-off to count as settled
     settle_yaw_deg: ClassVar[float] = 3.0
-    """Settled: heading."""
+    """Largest heading error to count as settled, deg."""
     settle_speed_mps: ClassVar[float] = 0.04
-    """Settled: speed."""
+    """Largest speed to count as settled, m/s."""
     settle_dwell_s: float = key(
         0.3, "time for which position, heading and speed must hold to count as settled", ge=0, lt=10
     )
-    settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
+    settle_timeout_s: ClassVar[float] = 10.0  # time limit for settling at the stand-off
     fresh_s: float = key(
         0.25,
         "maximum age of a fresh target estimate, in addition to the camera latency",
@@ -100,7 +100,7 @@ class AscendConfig(Section):
         le=2,
     )
     timeout_s: ClassVar[float] = 40.0
-    """An ascent that takes longer counts as failed."""
+    """Time after which an ascent counts as failed, s."""
 
 
 class PerchConfig(Section):
@@ -111,9 +111,9 @@ class PerchConfig(Section):
         "position", "press with a position setpoint above the contact, or with raw thrust"
     )
     thrust: int = key(60000, "thrust with `mode: raw`", ge=1000, le=65535)
-    press_m: ClassVar[float] = 0.25  # the setpoint above the contact
+    press_m: ClassVar[float] = 0.25  # distance of the setpoint above the contact
     climb_mps: ClassVar[float] = 0.2
-    """Climb of the setpoint that presses."""
+    """Speed at which the setpoint rises into the press, m/s."""
     contact_dwell_s: float = key(0.25, "time for which the contact must hold", gt=0, lt=3)
     contact_z_m: float = key(
         0.05, "maximum vertical distance to the target in contact", gt=0, le=0.3
@@ -124,9 +124,10 @@ class PerchConfig(Section):
         gt=0,
         le=0.5,
     )
-    contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
+    # largest deviation of the accelerometer from 1 g to count as contact
+    contact_acc_g: ClassVar[float] = 0.12
     timeout_s: ClassVar[float] = 3.0
-    """Without a contact by then the attempt counts as failed."""
+    """Time after which an attempt without contact counts as failed, s."""
 
 
 class CompleteConfig(Section):
@@ -139,23 +140,25 @@ class CompleteConfig(Section):
     """
 
     steps: ClassVar[int] = 5
-    """Steps of the setpoint in the release."""
+    """Number of setpoint steps in the release."""
     release_s: ClassVar[float] = 0.8
-    """Over which the thrust is released."""
+    """Time over which the thrust is released, s."""
     release_drop_m: ClassVar[float] = 0.25
-    """The setpoint's last step lies below the contact."""
+    """Distance of the last setpoint below the contact, m."""
     hold_ratio: ClassVar[float] = 0.6
-    """The magnet is proven where it holds with this share of the hover thrust."""
-    hold_dwell_s: ClassVar[float] = 0.3  # for which it must prove it
+    """Share of the hover thrust at which the magnet must hold to be proven."""
+    hold_dwell_s: ClassVar[float] = 0.3  # time for which the magnet must hold
     ramp_s: ClassVar[float] = 0.5
-    """Raw thrust goes down over this time, from the least of position mode to still motors."""
+    """Time in which the raw thrust decreases from the minimum of position mode to zero, s."""
     hang_s: ClassVar[float] = 1.0
-    """The whole weight must hang for so long before the motors stop."""
-    release_timeout_s: ClassVar[float] = 8.0  # then the attempt counts as failed
-    slip_m: ClassVar[float] = 0.03  # hanging: at most so far below the contact
-    slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
-    slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
-    slip_acc_g: ClassVar[float] = 0.5  # a free fall, or a slip wherever the estimate is: less
+    """Time for which the whole weight must hang before the motors stop, s."""
+    release_timeout_s: ClassVar[float] = 8.0  # time after which the attempt counts as failed
+    slip_m: ClassVar[float] = 0.03  # largest distance below the contact to count as hanging
+    slip_mps: ClassVar[float] = 0.12  # sink rate that counts as a slip
+    # duration of a slip before it is answered; a free fall is answered at once
+    slip_dwell_s: ClassVar[float] = 0.03
+    # specific force below which the vehicle falls freely, or slips whatever the estimate says
+    slip_acc_g: ClassVar[float] = 0.5
     watch_s: float = key(
         1.5,
         "time for which perchctl monitors the stopped vehicle before it reports PERCHED",
@@ -167,13 +170,13 @@ class CompleteConfig(Section):
 class RecoverConfig(Section):
     """After a miss or a slip the vehicle descends, steadies and returns to phase 3."""
 
-    descend_m: ClassVar[float] = 0.10  # below where the attempt ended
+    descend_m: ClassVar[float] = 0.10  # distance below the place where the attempt ended
     dwell_s: ClassVar[float] = 0.5
-    """It must be steady for so long."""
+    """Time for which the vehicle must be steady, s."""
     steady_mps: ClassVar[float] = 0.1
-    """Steady: speed."""
+    """Largest speed to count as steady, m/s."""
     timeout_s: ClassVar[float] = 6.0
-    """It lands if it is not steady by then."""
+    """Time after which the vehicle lands if it is not steady, s."""
 
 
 class HoverConfig(Section):
@@ -186,7 +189,8 @@ class HoverConfig(Section):
 
 
 OVERDUE_SHARE = 0.5
-"""Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
+"""Share of a landing's time for which it proceeds by setpoints. Then the vehicle's own landing
+takes over."""
 
 
 class LandingConfig(Section):
@@ -199,12 +203,13 @@ class LandingConfig(Section):
         0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
     undershoot_m: float = key(0.05, "how far below the ground the landing aims", ge=0, le=1)
-    drift_mps: ClassVar[float] = 0.012  # of the estimate's height: the aim sinks so fast
+    drift_mps: ClassVar[float] = 0.012  # assumed drift of the estimated height
     timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)
 
     @property
     def setpoint_time_s(self) -> float:
-        """Longest time of the landing by setpoints, until the firmware's landing begins."""
+        """Longest time for which the landing proceeds by setpoints before the firmware's landing
+        begins, s."""
         return OVERDUE_SHARE * self.timeout_s
 
 
@@ -216,7 +221,7 @@ class PlannerConfig(Section):
     approach_xy_m: tuple[float, float] | None = key(
         None, "point to fly to after take-off, in the world frame of the state estimate"
     )
-    approach_timeout_s: ClassVar[float] = 15.0  # for take-off and way
+    approach_timeout_s: ClassVar[float] = 15.0  # for take-off and the way to the target together
     search: SearchConfig = SearchConfig()
     estimate: EstimateConfig = EstimateConfig()
     align: AlignConfig = AlignConfig()
@@ -237,7 +242,7 @@ class PlannerConfig(Section):
     )
     integral_per_s: float = key(0.4, "integral gain of the horizontal control", ge=0, le=5)
     integral_limit_m: ClassVar[float] = 0.08
-    """To which that integral grows while the vehicle moves."""
+    """Limit of that integral while the vehicle moves."""
 
 
 class CorridorConfig(Section):
@@ -251,7 +256,7 @@ class CorridorConfig(Section):
     target_top_m: float = key(..., "the same under its target", gt=0, le=20)
 
     def contains(self, x_m: float, y_m: float, height_m: float) -> bool:
-        """True for a place inside; False for one that is not known (NaN)."""
+        """True for a place inside; False for a place that is unknown (NaN)."""
         return Corridor(**dict(self)).contains(x_m, y_m, height_m)
 
 
@@ -260,7 +265,8 @@ class SafetyConfig(Section):
 
     min_rest_v: float = key(3.8, "minimum resting voltage for take-off", ge=0, le=5)
     min_load_v: float = key(3.0, "voltage in flight below which the vehicle lands", ge=0, le=5)
-    battery_debounce_s: ClassVar[float] = 1.5  # below `min_load_v` before it lands
+    # time below `min_load_v` after which the vehicle lands
+    battery_debounce_s: ClassVar[float] = 1.5
     energy_gate: bool = key(
         True, "land instead of starting an attempt that the battery cannot finish"
     )
@@ -271,7 +277,7 @@ class SafetyConfig(Section):
         le=120,
     )
     battery_stale_s: ClassVar[float] = 90.0
-    """A battery reading that stands still for longer is stale."""
+    """Time without a change after which a battery reading is stale, s."""
     telemetry_hold_s: float = key(
         0.3, "age of the telemetry at which the vehicle holds its position", gt=0, le=5
     )
@@ -279,7 +285,7 @@ class SafetyConfig(Section):
         1.0, "age of the telemetry at which the vehicle lands", gt=0, le=10
     )
     proof_age_s: ClassVar[float] = 0.1
-    """Older telemetry proves nothing: no contact, no landing, no stop."""
+    """Age above which telemetry is too old to prove a contact, a landing or a motor stop, s."""
     camera_hold_s: float = key(
         0.5, "time without a good picture after which the vehicle holds its position", gt=0, le=10
     )
@@ -296,20 +302,24 @@ class SafetyConfig(Section):
         le=5,
     )
     jump_z_m: ClassVar[float] = 0.15
-    """Such a step of its height."""
+    """Height jump: a step of the estimate that its velocity does not explain, m."""
     jump_deg: ClassVar[float] = 15.0
-    """Such a step of its heading."""
+    """Heading jump: a step of the estimate that no rotation explains, deg."""
     heading_lost_deg: ClassVar[float] = 40.0
-    """Step of the heading from which it goes down at once, level, by raw thrust."""
+    """Heading jump after which the vehicle descends at once, level, by raw thrust, deg."""
     jump_mps: ClassVar[float] = 1.0
-    """Such a step of its velocity."""
+    """Velocity jump: a step of the estimate beyond what a flight can gain, m/s."""
     flight_velocity_variance_m2ps2: ClassVar[float] = 0.05
-    """Above it in flight, held: 4.5 s after the last position. Larger, and it drifts longer."""
+    """Variance of the velocity in flight above which the vehicle holds its position: it is reached
+    4.5 s after the last position. Larger: the vehicle drifts for longer."""
     flight_variance_m2: ClassVar[float] = 0.05
-    """Above it, of the position, held as well: the estimator has started again, or has lost the
-    positions for 3 s. With decks it is the height's."""
-    variance_land_s: ClassVar[float] = 1.0  # above one of them for so long: landed
-    jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
+    """Variance of the position in flight above which the vehicle holds its position, too: the
+    estimator has restarted, or has received no position for 3 s. With decks, it is the variance of
+    the height."""
+    # time above one of these limits after which the vehicle lands
+    variance_land_s: ClassVar[float] = 1.0
+    # time for which the vehicle holds after a jump before it lands
+    jump_hold_s: ClassVar[float] = 0.5
     max_height_m: float = key(
         3.0, "height above the ground above which the vehicle lands", gt=0, le=20
     )
@@ -320,18 +330,18 @@ class SafetyConfig(Section):
         None, "corridor of a vehicle in a fleet, outside which it lands; the fleet sets it"
     )
     max_tilt_deg: float = key(55.0, "tilt above which perchctl cuts the motors", gt=0, le=180)
-    tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted
+    tilt_debounce_s: ClassVar[float] = 0.2  # time for which the vehicle must be tilted
     loop_late_hold_s: ClassVar[float] = 0.25
-    """With a turn of the loop so late it holds its place."""
+    """Lateness of the loop at which the vehicle holds its position, s."""
     loop_late_land_s: ClassVar[float] = 1.0
-    """With a turn of the loop so late it lands."""
-    estimator_wait_s: ClassVar[float] = 10.0  # on the ground
+    """Lateness of the loop at which the vehicle lands, s."""
+    estimator_wait_s: ClassVar[float] = 10.0  # waiting time on the ground
     estimator_velocity_variance_m2ps2: ClassVar[float] = 0.01
-    """A larger variance of the velocity refuses take-off. Ranging anchors give up to 0.007, an
-    estimator that gets no position passes it within 1 s."""
+    """Variance of the velocity above which take-off is refused. Ranging anchors give up to 0.007;
+    an estimator without positions exceeds the limit within 1 s."""
     estimator_variance_m2: ClassVar[float] = 0.01
-    """A larger variance of the position refuses take-off. Ranging anchors give 0.0013; after a
-    reset it is 1 m^2 in height and 100 m^2 level, until the first position."""
+    """Variance of the position above which take-off is refused. Ranging anchors give 0.0013. After
+    a reset, it is 1 m^2 in height and 100 m^2 horizontally until the first position."""
     ground_z_m: float = key(
         0.0, "height of the ground in the state estimate at take-off", ge=-10, le=10
     )
@@ -342,6 +352,7 @@ class SafetyConfig(Section):
         le=10,
     )
     start_tilt_deg: ClassVar[float] = 10.0
-    """A larger roll or pitch refuses take-off."""
-    blocked_s: ClassVar[float] = 0.7  # pressed and not moving: back off down
+    """Roll or pitch above which take-off is refused, deg."""
+    # time pressed without moving after which the vehicle backs off downwards
+    blocked_s: ClassVar[float] = 0.7
     land_on_log_error: bool = key(False, "land if the log cannot be written")

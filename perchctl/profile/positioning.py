@@ -11,10 +11,11 @@ from perchctl.extensions import PATTERN, has_extension_form
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
-"""Frames do not come to the millisecond."""
+"""Tolerance of the rate, since frames do not arrive to the millisecond."""
 MOST_CAPTURE_LATENCY_S = 0.04
-"""The vehicle takes each position for the one of now. 40 ms late it perches within 2 mm, 50 ms late
-it may swing for a minute and be landed (tests/flight/test_capture_flights.py)."""
+"""Largest delay of a position, s, because the vehicle takes each one as its present position. With
+positions 40 ms late, it perches within 2 mm. At 50 ms, it may oscillate for a minute and then land
+(tests/flight/test_capture_flights.py)."""
 _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
 
 
@@ -38,11 +39,11 @@ System = Annotated[
     WithJsonSchema({"anyOf": [{"enum": list(SYSTEMS)}, {"type": "string", "pattern": PATTERN}]}),
 ]
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
-"""Other defaults, for places that come by pictures, late and with gaps."""
+"""Other defaults for positions from pictures, which arrive late and with gaps."""
 
 
 class PositionSource(Enum):
-    """What measures the position, and what follows from it for whoever relies on it."""
+    """The source of the position, and what follows from it for the code that relies on it."""
 
     DECK = "deck"
     MOCAP = "mocap"
@@ -50,23 +51,26 @@ class PositionSource(Enum):
 
     @property
     def is_deck(self) -> bool:
-        """The vehicle's own decks measure it: there is nothing to send, and of a Flow deck the
-        place drifts."""
+        """True if the vehicle's own decks measure the position: nothing has to be sent, and the
+        position of a Flow deck drifts."""
         return self is PositionSource.DECK
 
     @property
     def is_mocap(self) -> bool:
-        """Cameras in the room measure it, in axes of their own, whatever the vehicle sees."""
+        """True if cameras in the room measure the position, in axes of their own, whatever the
+        vehicle itself sees."""
         return self is PositionSource.MOCAP
 
     @property
     def is_target(self) -> bool:
-        """The vehicle's camera measures it from the target: late, and only while that is seen."""
+        """True if the vehicle's camera measures the position from the target: late, and only while
+        the target is in view."""
         return self is PositionSource.TARGET
 
 
 _SOURCES = {source.value: source for source in PositionSource}
-"""By name: `PositionSource(name)` takes ten times as long, and is asked for in each tick."""
+"""Sources by name. This is read in each tick, and `PositionSource(name)` would take ten times as
+long."""
 
 
 class PositioningConfig(Section):
@@ -110,7 +114,7 @@ class PositioningConfig(Section):
         gt=0,
         le=0.2,
     )
-    attitude_sigma_rad: ClassVar[float] = 0.05  # what the vehicle takes it for
+    attitude_sigma_rad: ClassVar[float] = 0.05  # the error that the vehicle assumes
     hold_s: float = key(
         0.15,
         "time without a fresh position after which the vehicle holds its position",
@@ -130,7 +134,7 @@ class PositioningConfig(Section):
 
     @property
     def source(self) -> PositionSource:
-        """The method as a value to decide by."""
+        """The method as a `PositionSource`."""
         return _SOURCES[self.by]
 
     @property
@@ -141,8 +145,9 @@ class PositioningConfig(Section):
         return f"motion capture at {self.system}:{self.host}".rstrip(":")
 
     def with_method(self, by: str) -> dict[str, Any]:
-        """The values with another `by`. Keys of the method that is left are dropped; but beside a
-        deck a profile may name a capture, whose keys are kept."""
+        """Return the values with another `by`. Keys of the previous method are dropped. A capture's
+        keys are kept if the new method is a deck, because a profile may name a capture beside
+        it."""
         if by == self.by:
             return self.model_dump()
         kept = self.model_dump() if (self.by, by) == ("deck", "mocap") else {"decks": self.decks}
@@ -151,7 +156,7 @@ class PositioningConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:
-        """Read `positioning: mocap` as what measures, with the rest as it is."""
+        """Read `positioning: mocap` as the key `by`, and keep the rest unchanged."""
         values = {"by": values} if isinstance(values, str) else values
         if isinstance(values, dict) and values.get("by") == "target":
             return {**BY_TARGET, **values}
@@ -159,8 +164,8 @@ class PositioningConfig(Section):
 
     @model_validator(mode="after")
     def _is_meant(self) -> PositioningConfig:
-        """Refuse a capture's keys by the decks: the flight would not use them. (A log's profile has
-        every key, and so `by`, too.)"""
+        """Refuse a capture's keys if decks measure the position, since the flight would not use
+        them. (The profile in a log has every key, including `by`.)"""
         given = self.model_fields_set - {"decks"}
         if self.by == "deck" and (self.host if "by" in given else given):
             raise ValueError(

@@ -33,7 +33,7 @@ from perchctl.profile.vision import (
 )
 
 MOTOR_PARAMETERS = ("motorPowerSet.", "health.start")
-"""Beginnings of the firmware parameters that turn motors on the ground, armed or not."""
+"""Prefixes of the firmware parameters that turn motors on the ground, even while disarmed."""
 
 
 class LinkConfig(Section):
@@ -64,7 +64,8 @@ class LinkConfig(Section):
     @field_validator("parameters")
     @classmethod
     def _turn_no_motor(cls, parameters: dict[str, int | float]) -> dict[str, int | float]:
-        """Refuse parameters that turn motors at once: they are set before anybody was asked."""
+        """Refuse parameters that turn motors at once, because they are set before the operator is
+        asked."""
         for name in parameters:
             if name.startswith(MOTOR_PARAMETERS):
                 raise ValueError(
@@ -141,7 +142,8 @@ class Profile(Section):
 
     @classmethod
     def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
-        """For each value that differs from the constant its key has become, what is wrong."""
+        """Return what is wrong with each value that differs from the constant that its key has
+        become."""
         return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")
@@ -197,7 +199,8 @@ def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, s
 
 
 def nearest_names(name: str, allowed: Collection[str]) -> str:
-    """The end of a message about an unknown name: the nearest one of `allowed`, and all of them."""
+    """Return the end of a message about an unknown name: the most similar one of `allowed`, and all
+    of them."""
     close = difflib.get_close_matches(name, allowed, 1)
     return f"{f'did you mean {close[0]}? ' if close else ''}allowed here are {', '.join(allowed)}"
 

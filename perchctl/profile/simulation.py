@@ -1,4 +1,4 @@
-"""The profile's keys of the simulation: what a seed's flight is drawn from."""
+"""The profile's keys of the simulation, from which a seed's flight is drawn."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SimulationConfig(Section):
         0.0, "largest accelerometer bias of each level axis, without a deck", ge=0, le=0.2
     )
     draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
-    magnet_force_n: ClassVar[float] = 1.2  # that the magnet holds
+    magnet_force_n: ClassVar[float] = 1.2  # share of the weight that the magnet holds
     first_contact_fails: float = key(
         0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )
@@ -89,9 +89,9 @@ class SimulationConfig(Section):
         None, "ids of the neighbours' large and small markers; none: the own target's"
     )
     camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
-    """Of the frames lost in one go."""
+    """Number of frames lost in one go."""
     first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
-    """Of the weight, that a first contact carries which does not hold."""
+    """Share of the weight that a first contact carries if it does not hold."""
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )

@@ -40,8 +40,8 @@ def dictionary_size(name: str) -> int:
 
 
 def have_same_pattern(dictionary: str, marker_id: int, other: str, other_id: int) -> bool:
-    """True if two markers, each a dictionary and an id, have the same cells in any rotation, as
-    ``DICT_4X4_50`` has the first ids of ``DICT_4X4_1000``."""
+    """True if two markers, each given by dictionary and id, have the same cells in some rotation.
+    The first ids of ``DICT_4X4_1000``, for example, are those of ``DICT_4X4_50``."""
     one, two = aruco_dictionary(dictionary), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
         return False
@@ -80,7 +80,7 @@ class Mounting(Section):
     @field_validator("rpy_deg")
     @classmethod
     def _in_degrees(cls, rpy_deg: Vector3) -> Vector3:
-        """Refuses turns that are all eighths of a circle, written in radians."""
+        """Refuse angles that are all multiples of an eighth of a turn written in radians."""
         turned = [(angle, _eighths(abs(angle))) for angle in rpy_deg if angle]
         if turned and all(eighths for _, eighths in turned):
             angle, eighths = turned[0]
@@ -97,7 +97,8 @@ class Mounting(Section):
 
 
 def _eighths(angle: float) -> int:
-    """The eighths of a circle the angle is, in radians to two decimals or more; or 0."""
+    """Return the number of eighths of a turn that the angle is if it is in radians with two
+    decimals or more; otherwise 0."""
     return next(
         (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
     )
@@ -105,12 +106,13 @@ def _eighths(angle: float) -> int:
 
 MOST_CAMERA_LATENCY_S = 1.0
 USUAL_LATENCY_S = 0.07
-"""Most cameras are 60 to 100 ms late."""
+"""Default latency, s: most cameras are 60 to 100 ms late."""
 START_LATENCY_S = 0.1
-"""Where a flight begins that measures its latency: in the middle of what it can use, so that
-until it knows more, positions are at most 0.1 s newer or older than they are taken for."""
+"""Latency at the start of a flight that measures it, s. It is the middle of the usable range, so
+until the flight knows more, pictures are at most 0.1 s newer or older than assumed."""
 USED_LATENCY_S = (0.02, 0.2)
-"""What such a flight uses: no camera takes less; later pictures are not to be steered by."""
+"""Latencies that such a flight uses, s. No camera is faster, and later pictures are of no use for
+steering."""
 
 
 class CameraConfig(Section):
@@ -125,7 +127,7 @@ class CameraConfig(Section):
         "example_640x480.yaml",
         "calibration file: one next to the profile or in `calib/`, or a full path",
     )
-    cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
+    cam: ClassVar[None] = None  # of one camera in a Kalibr file with several
     latency_s: Annotated[float, Field(ge=0, le=MOST_CAMERA_LATENCY_S)] | Literal["measured"] = key(
         USUAL_LATENCY_S, "time from exposure to arrival; with `measured`, each flight measures it"
     )
@@ -133,7 +135,7 @@ class CameraConfig(Section):
     start_timeout_s: float = key(8.0, "time limit for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
     mask: str | None = key(None, "mask file, white where the vehicle covers the view")
-    fields: ClassVar[str] = "auto"  # of interlaced pictures: found by measure
+    fields: ClassVar[str] = "auto"  # of interlaced pictures: which field comes first is measured
     readout_s: float | None = key(
         0.0, "rolling shutter: time from the first to the last row; none if unknown", ge=0, le=0.05
     )
@@ -153,7 +155,7 @@ class CameraConfig(Section):
     @field_validator("latency_s", mode="before")
     @classmethod
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
-        """Refuse other values than a time or ``measured`` in one sentence."""
+        """Refuse any value but a time or ``measured``, in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
@@ -194,7 +196,7 @@ class MarkerConfig(Section):
 
 
 FARTHEST_IN_A_ROOM_M = 50.0
-"""No target hangs farther from the zero of a room's positioning, in x or in y."""
+"""Largest distance of a target from the origin of a room's positioning, in x or in y, m."""
 _InARoom = Annotated[float, Field(ge=-FARTHEST_IN_A_ROOM_M, le=FARTHEST_IN_A_ROOM_M)]
 
 
@@ -272,22 +274,25 @@ class DetectorConfig(Section):
         "find corners from edge lines (even if blurred or cut), or with OpenCV's sub-pixel method",
     )
     own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
-    blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
-    blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
-    cut: ClassVar[bool] = True  # with lines: measured where the picture cuts both markers
-    correction_bits_large: ClassVar[int] = 0  # wrong cells that are corrected
+    blurred: ClassVar[bool] = True  # only with lines: searched for where blur may hide the target
+    # number of pictures in a stream without the target before that search
+    blurred_every: ClassVar[int] = 4
+    # only with lines: measured where the picture's edge cuts both markers
+    cut: ClassVar[bool] = True
+    correction_bits_large: ClassVar[int] = 0  # number of wrong cells that are corrected
     correction_bits_small: ClassVar[int] = 1
 
 
 class PoseConfig(Section):
     """The profile's `pose`: how a pose is solved from corners."""
 
-    solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
-    refine: ClassVar[bool] = True  # by least squares on the corners after it
+    solver: ClassVar[str] = "sqpnp"  # OpenCV's method for the first guess
+    refine: ClassVar[bool] = True  # refined by least squares on the corners
     max_reprojection_px: float = key(
         3.0, "RMS reprojection error above which a pose is rejected", gt=0
     )
-    each_marker: ClassVar[bool] = False  # beside the joint pose also each marker's own
+    # next to the joint pose, also compute each marker's own pose
+    each_marker: ClassVar[bool] = False
 
 
 class KalmanConfig(Section):
@@ -321,9 +326,9 @@ class KalmanConfig(Section):
         "process noise",
     )
     acceleration_mps2: ClassVar[float] = 3.0
-    """Of camera or target in the level frame, with `noise: measured`."""
+    """Acceleration of camera or target in the level frame, with `noise: measured`."""
     turn_radps2: ClassVar[float] = 3.0
-    """Of the camera's attitude and heading, likewise."""
+    """Rotational acceleration of the camera's attitude and heading, with `noise: measured`."""
     drift_mps2: float = key(
         0.1,
         "drift of the state estimate as process noise, with `frame: world` and `noise: measured`",
@@ -334,7 +339,7 @@ class KalmanConfig(Section):
         0.3, "constant error of roll and pitch, one sigma, with `noise: measured`", ge=0, le=10
     )
     drift_mps: ClassVar[float] = 0.05
-    """An unmeasured target moves in the estimate's world at most so fast."""
+    """Largest speed at which an unmeasured target moves in the estimate's world, m/s."""
     gate: bool = key(True, "reject poses that contradict the target's track")
 
 
@@ -364,8 +369,9 @@ class MergeConfig(Section):
     z2_m: float = key(0.25, "maximum distance at which the small marker is readable", gt=0)
     z3_m: float = key(0.12, "minimum distance at which the whole large marker is in view", gt=0)
     disagreement_m: ClassVar[float] = 0.03
-    """Farther apart than this the markers contradict."""
-    disagreement_frames: ClassVar[int] = 15  # so many in a row, and it lands
+    """Difference above which the two markers contradict each other."""
+    # number of successive contradictions after which the vehicle lands
+    disagreement_frames: ClassVar[int] = 15
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:
