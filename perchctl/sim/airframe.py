@@ -1,4 +1,4 @@
-"""The airframes that a simulated vehicle can be: what their firmware announces, and their motors.
+"""The airframes of simulated vehicles: what their firmware announces, and their motors.
 
 Figures are the firmware's own platform defaults (release 2026.08), measured on a thrust stand; the
 firmware is built for one airframe.
@@ -63,7 +63,7 @@ CRAZYFLIE_21 = Airframe(
         least_n=0.012817578393224994,
     ),
 )
-"""With the propellers of the 2.1+; the firmware calls both so."""
+"""With the propellers of the 2.1+; the firmware has the same name for both."""
 
 CRAZYFLIE_21_BRUSHLESS = Airframe(
     "Crazyflie 2.1 Brushless",

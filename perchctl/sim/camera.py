@@ -1,4 +1,5 @@
-"""The simulated camera: when frames are exposed, which are lost, when the rest arrives."""
+"""The simulated camera: when frames are exposed, which ones are lost, and when the others
+arrive."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from perchctl.sim.scenario import Scenario
 SCHEDULE_STREAM = 411
 """Number of the random stream of the schedule."""
 LIGHT_STREAM = 412
-"""The same for the light and the receiver."""
+"""Number of the random stream of light and receiver."""
 
 JITTER_LIMIT_SIGMAS = 2.5
 
@@ -33,11 +34,12 @@ class DeliveredFrame:
     t_arrival_s: float
     t_exposure_s: float
     image: Picture
-    index: int  # of the exposure: gaps are lost frames
+    index: int  # index of the exposure: gaps are lost frames
 
 
 class SimCamera:
-    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
+    """A camera that exposes at `camera_rate_hz` with a phase of its own. The same seed gives the
+    same bytes.
 
     Each exposure draws the same random numbers whether or not it is lost, and a
     frame's noise depends on its index, so neither faults nor the steps of
@@ -45,9 +47,9 @@ class SimCamera:
 
     - lost: with `camera_drop_rate`, and `camera_burst` = (start, n): the n
       exposures from start on; these are not rendered;
-    - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
-      2.5 sigma), never before the exposure's end, never overtaking;
-    - frozen: exposures from `camera_freeze_at_s` on show the last picture before.
+    - late: a frame arrives after `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`,
+      cut at 2.5 sigma), but never before the end of its exposure or before an earlier frame;
+    - frozen: exposures from `camera_freeze_at_s` on repeat the last picture before that time.
     """
 
     def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
@@ -67,7 +69,7 @@ class SimCamera:
         rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
-        self._newest: DeliveredFrame | None = None  # that the receiver gives out again
+        self._newest: DeliveredFrame | None = None  # a picture that the receiver gives out again
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -104,8 +106,8 @@ class SimCamera:
         return given_out
 
     def take_newest(self, count: int) -> list[DeliveredFrame]:
-        """Take the frames, but return only the newest `count` exposures; of an exposure that a
-        receiver repeats, the first and the last copy."""
+        """Take the frames, but return only the newest `count` exposures. If a receiver repeats an
+        exposure, its first and its last copy are returned."""
         frames = self.take()
         last = sorted({frame.index for frame in frames})[-count:]
         ends = [[frame for frame in frames if frame.index == index] for index in last]
@@ -138,16 +140,17 @@ class SimCamera:
 
 
 # --- When each row of a frame is exposed and in what light ---
-# A rolling shutter exposes its rows one by one within the read-out time; an interlaced camera takes
-# two pictures a frame, half its period apart, each with its own rows.
+# A rolling shutter exposes its rows one after another within the read-out time. An interlaced
+# camera takes two pictures per frame, half a period apart, each with its own rows.
 
 
 POSES_PER_EXPOSURE = 3
 READOUT_MOMENTS = 5
-"""Between them the camera's motion counts as straight: 5 ms for a read-out of 20 ms."""
-FLICKER_HZ = 100.0  # of lamps on a 50 Hz mains
+"""Number of moments in a read-out between which the camera's motion is taken as straight; they are
+5 ms apart for a read-out of 20 ms."""
+FLICKER_HZ = 100.0  # flicker of lamps on 50 Hz mains
 PUMPING_HZ = (0.4, 2.0)
-"""Range of rates at which the automatic exposure may hunt."""
+"""Range of rates at which the automatic exposure may oscillate, Hz."""
 
 
 class Shutter:
@@ -159,7 +162,7 @@ class Shutter:
     def __init__(self, scenario: Scenario) -> None:
         self._s = scenario
         half_exposure_s = max(scenario.camera_exposure_s, 0.0) / 2.0
-        self._steps_s = (0.0,)  # of one row's exposure, from its middle
+        self._steps_s = (0.0,)  # times within one row's exposure, from its middle
         if half_exposure_s:
             steps_s = np.linspace(-half_exposure_s, half_exposure_s, POSES_PER_EXPOSURE)
             self._steps_s = tuple(steps_s.tolist())
@@ -170,12 +173,13 @@ class Shutter:
         rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._lamp_phase, self._hunt_phase = rng.uniform(0.0, 2.0 * math.pi, size=2)
         self._hunt_hz = float(rng.uniform(*PUMPING_HZ))
-        # An exposure averages over the lamp's swing.
+        # An exposure averages over the lamp's flicker.
         swing = float(np.sinc(FLICKER_HZ * 2.0 * half_exposure_s))
         self._flicker = scenario.camera_flicker * swing
 
     def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Exposure]:
-        """The exposures of a frame `height` px high, in time order: two fields, or one frame."""
+        """Return the exposures of a frame `height` px high in time order: two fields, or one
+        frame."""
         half_s = self._apart_s / 2.0
         moments = (middle_s - half_s, middle_s + half_s) if half_s else (middle_s,)
         return [self._shot(moment_s, T_world_cam_at, height) for moment_s in moments]

@@ -1,5 +1,5 @@
-"""A simulated motion-capture system: what it is like, what goes wrong in it, what its cameras see
-of the simulated vehicle, when that arrives, and its server on loopback."""
+"""A simulated motion-capture system: its properties and faults, the view that its cameras have of
+the simulated vehicle, the delay of its frames, and its server on loopback."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class CaptureFault:
-    """A temporary fault of the motion capture; the defaults are no fault.
+    """A temporary fault of the motion capture. With the defaults, there is no fault.
 
     Attributes:
         occluded: the vehicle's body is hidden from the cameras.
-        frozen: all bodies stay where they were seen last, to the last digit.
+        frozen: all bodies are reported where they were last seen, to the last digit.
         gone: no frame is sent.
         swapped: the vehicle's body and another one have changed names: the one called
             `swapped_with`, or the first other one if that is None.
         scale: factor on all positions; 1000 is millimetres.
-        mirrored: positions with y's sign turned, as a left-handed program sends them.
+        mirrored: the sign of y is inverted, as by a program with left-handed axes.
         axes: rows (3, 3) of the rotation from the world's axes to the capture's.
         late_s: delay in addition to `CaptureSettings.delay_s`.
     """
@@ -116,7 +116,8 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
 
 
 class SimCapture:
-    """Motion capture with exposures at `rate_hz`; same settings and flight, same frames.
+    """Motion capture with exposures at `rate_hz`. The same settings and flight give the same
+    frames.
 
     It is the `CaptureSource` of a flight in lockstep.
 
@@ -131,7 +132,7 @@ class SimCapture:
         self.settings = settings
         self._rng = np.random.default_rng([settings.seed, _CAPTURE_STREAM])
         self._faults = list(settings.faults)
-        self.others_m = [position_m for _, position_m in settings.others]  # where they are now
+        self.others_m = [position_m for _, position_m in settings.others]  # their present positions
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._R_capture_world = rot_z(settings.heading_rad)
         self._due_s = float(self._rng.random()) / settings.rate_hz
@@ -176,12 +177,12 @@ class SimCapture:
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived since the last call, or None."""
+        """Return the newest frame that has arrived since the last call, or None."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 
     def problem(self, now_s: float) -> str | None:
-        """Return None: this connection has no problems."""
+        """Return None: this connection never has a problem."""
         return None
 
     def close(self) -> None:
@@ -215,7 +216,8 @@ class SimCapture:
         turn, scale = np.eye(3), 1.0
         for fault in faults:
             turn, scale = np.array(fault.axes) @ turn, scale * fault.scale
-        # A system defines a body's axes along its own: a level body's attitude is none at all.
+        # A capture defines a body's axes along its own, so the attitude of a level body is the
+        # identity.
         x, y, z = (scale * float(v) for v in turn @ place)
         if any(fault.mirrored for fault in faults):
             y = -y
@@ -223,8 +225,8 @@ class SimCapture:
 
 
 # --- The server on loopback ---
-# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it.
-# Of a frame only the rigid bodies are filled in; a client steps over the empty lists.
+# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` can read it. Only the rigid
+# bodies of a frame are filled in; a client skips the empty lists.
 
 
 CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME_OF_DATA = 0, 1, 4, 5, 7
@@ -258,7 +260,7 @@ class MotionCaptureServer:
 
     def _answer(self) -> None:
         while True:
-            with contextlib.suppress(OSError):  # of a client that has gone
+            with contextlib.suppress(OSError):  # error of a client that has gone
                 request, address = self._socket.recvfrom(2048)
                 kind = int.from_bytes(request[:2], "little") if len(request) >= 4 else None
                 if kind == CONNECT:

@@ -1,8 +1,8 @@
 """A Crazyflie's end of the link: packets in, firmware calls, packets out.
 
-Uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything an
-unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence"; ports and layouts
-are those of "Link" there, signs those of "Signs and units".
+It uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything that an
+unmodified cflib sends is answered as described in docs/firmware.md ("Connect sequence"). "Link"
+there describes ports and layouts, and "Signs and units" the signs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_DATA = 30
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.08"
 OK = 0
-"""The other answers are the numbers of C's errno."""
+"""The other answers are errno codes."""
 
 
 # --- Packets that command the vehicle, turned into the firmware model's calls ---
@@ -45,11 +45,12 @@ _SETPOINTS = {
     9: (MODE_Z_DISTANCE, ("roll_deg", "pitch_deg", "yaw_rate_dps", "z_m")),
     10: (MODE_HOVER, ("vx_mps", "vy_mps", "yaw_rate_dps", "z_m")),
 }
-"""Port 7: the mode and the numbers of each type, as cflib sends them since protocol 11."""
+"""Port 7: the mode and the numbers of each type of setpoint, as cflib has sent them since protocol
+11."""
 
 
 def execute_packet(firmware: Firmware, packet: Packet) -> bytes | None:
-    """Let the firmware execute a packet; return the answer's data, None for no answer.
+    """Let the firmware execute a packet; return the data of its answer, None for no answer.
 
     Raises struct.error for a packet that is too short for its command.
     """
@@ -102,7 +103,7 @@ def _raw(data: bytes) -> Setpoint:
 
 
 def _fly(firmware: Firmware, setpoint: Setpoint) -> None:
-    """Pass on finite numbers. Others would poison the controller for good."""
+    """Pass on finite numbers only: any other number would corrupt the controller permanently."""
     values = (getattr(setpoint, name) for name in Setpoint.__slots__)
     if all(math.isfinite(value) for value in values if isinstance(value, float)):
         firmware.fly_setpoint(setpoint)
@@ -125,7 +126,7 @@ def _plan(firmware: Firmware, data: bytes) -> int:
         case _:
             return ENOEXEC
     is_finite = all(math.isfinite(value) for value in values if value is not None)
-    if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in none
+    if is_finite and data[1:2] == b"\0":  # a command for all groups; this vehicle is in none
         firmware.command_planner(order, *values)
     return OK
 
@@ -171,8 +172,8 @@ BY_CTYPE = {
 BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
 
 
-# --- Tables of contents: which log variables and parameters there are, by number ---
-# cflib keeps a table in a file named after its CRC, which follows from the contents alone.
+# --- Tables of contents: the log variables and parameters, by number ---
+# cflib caches a table in a file named after its CRC, which depends on the contents alone.
 
 
 class Toc:
@@ -191,7 +192,7 @@ class Toc:
         self._info = struct.pack("<BHI", self._INFO, len(codes), crc) + info_tail
 
     def name(self, ident: bytes) -> str | None:
-        """The name with the number `ident`, two bytes; None for an unknown number."""
+        """Return the name with the number `ident` (two bytes); None for an unknown number."""
         number = int.from_bytes(ident, "little")
         return self._names[number] if len(ident) == 2 and number < len(self._names) else None
 
@@ -223,7 +224,8 @@ _EXTENDED_TYPE_V2 = 7
 _IS_PERSISTENT = 1
 _EEPROM = struct.pack("<BI", 0x00, 8192) + bytes(8)  # type I2C, size, address
 _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
-_RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")  # the radio chip's: reset to the firmware, system on
+# commands to the radio chip: reset to the firmware, system on
+_RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")
 
 
 @dataclass
@@ -238,7 +240,7 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer; before protocol 12 the server has no supervisor port.
+    """Serves one firmware to one peer. Before protocol 12, there is no supervisor port.
 
     `device_type`: the name that it announces instead of its airframe's.
     """
@@ -271,8 +273,8 @@ class CrtpServer:
         self._param_toc = Toc(Port.PARAM, param_codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answers to one packet, at most one. A packet too short for its
-        command is ignored, as by the firmware."""
+        """Return the answers to one packet, at most one. Like the firmware, it ignores a packet
+        that is too short for its command."""
         try:
             answer = self._answer(packet)
         except struct.error:
@@ -280,7 +282,7 @@ class CrtpServer:
         return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
     def due_packets(self) -> list[Packet]:
-        """The packets of log data that are due by now."""
+        """Return the packets of log data that are due by now."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():
@@ -290,7 +292,7 @@ class CrtpServer:
         return packets
 
     def reboot(self) -> None:
-        """Start the firmware again; log blocks are lost."""
+        """Restart the firmware, which loses its log blocks."""
         self._firmware.reboot()
         self._blocks.clear()
 
@@ -308,7 +310,7 @@ class CrtpServer:
                 return data
             case Port.LINK, 1:
                 return _LINK_SOURCE
-            case Port.LINK, 3:  # a scan's probe, and the power commands of the radio chip
+            case Port.LINK, 3:  # the probe of a scan, and the power commands of the radio chip
                 if data.startswith(_RESTARTS):
                     self.reboot()
                 return data
@@ -330,7 +332,7 @@ class CrtpServer:
                 persistent = name is not None and self._firmware.PARAMETERS[name].persistent
                 status = (OK, _IS_PERSISTENT) if persistent else (ENOENT,)
                 return data[:3] + bytes(status)
-            case Port.MEM, 0:  # one EEPROM, whose contents no client of this vehicle reads
+            case Port.MEM, 0:  # a single EEPROM, whose contents no client of this vehicle reads
                 if data[0] == 2:
                     return data[:2] + (_EEPROM if data[1:2] == b"\0" else b"")
                 return bytes((data[0], 1)) if data[0] < 2 else None
@@ -407,7 +409,7 @@ class CrtpServer:
         return data[:2] + bytes((OK,)) + self._value(name)
 
     def _write(self, data: bytes) -> bytes | None:
-        """Answers with the kept value; read-only parameters do not change."""
+        """Answer with the value that is kept; read-only parameters do not change."""
         name = self._param_toc.name(data[:2])
         if name is None:
             return data[:2] + bytes((ENOENT,))

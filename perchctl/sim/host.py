@@ -1,5 +1,5 @@
-"""The simulated vehicle behind its link, its video and the room's motion capture: what runs in a
-process of its own."""
+"""The host of the simulated vehicle, in a process of its own: its link, its video, and the room's
+motion capture."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ class VehicleHost:
         return self._steps * CONTROL_PERIOD_S
 
     def serve(self) -> None:
-        """Answer the arrived packets, without time passing; log data waits for the next step."""
+        """Answer the packets that have arrived, without letting time pass; log data waits for the
+        next step."""
         while True:
             try:
                 datagram, address = self.socket.recvfrom(64)
@@ -101,7 +102,8 @@ class VehicleHost:
             self._send(self.server.handle(packet), address)
 
     def step(self) -> None:
-        """Answer the arrived packets, advance by a control period, and send due log data."""
+        """Answer the packets that have arrived, advance by a control period, and send the log data
+        that is due."""
         self.serve()
         vehicle = self.vehicle
         vehicle.step()
@@ -125,14 +127,15 @@ class VehicleHost:
         return self.elapsed_s
 
     def call_method(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Call the method `name` of this host, its server, world, battery or motion capture."""
+        """Call the method `name` of this host, or of its server, world, battery or motion
+        capture."""
         world = self.vehicle.world
         parts = (self, self.server, world, world.powertrain.cell, self.vehicle.capture)
         of = next((part for part in parts if hasattr(part, name)), self)
         return getattr(of, name)(*arguments, **named)
 
     def silence_link(self, duration_s: float) -> None:
-        """Let the link receive and send nothing for `duration_s` of simulated time."""
+        """Let the link neither receive nor send for `duration_s` of simulated time."""
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def truth(self) -> dict[str, Any]:
@@ -168,7 +171,7 @@ class VehicleHost:
     def _send(self, packets: Iterable[Packet], address: Address) -> None:
         for packet in packets:
             if self._passes():
-                with contextlib.suppress(OSError):  # lost like over the air
+                with contextlib.suppress(OSError):  # lost as over the air
                     self.socket.sendto(packet.encode(), address)
 
     def _passes(self) -> bool:
@@ -182,17 +185,17 @@ class VehicleHost:
 
 
 LOOP_PATIENCE_S = 2.0
-"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
+"""Time on the wall clock for which the simulator waits for a loop that shows no sign of life, s."""
 
 
 def serve_parent(
     channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
 ) -> None:
-    """Run the vehicle until the parent closes the channel or is gone. Send it
-    the host's addresses first, and if the vehicle fails, the error as text."""
-    os.setsid()  # away from the terminal
+    """Run the vehicle until the parent closes the channel or is gone. Send the parent the host's
+    addresses first and, if the vehicle fails, the error as text."""
+    os.setsid()  # detached from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)  # the picture must not take the physics' core
+    cv2.setNumThreads(1)  # rendering must not slow down the physics
     try:
         with contextlib.closing(VehicleHost(scenario, **settings)) as host:
             channel.send(host.addresses)
@@ -210,7 +213,8 @@ def serve_parent(
 
 
 MAX_LAG_S = 1.0
-"""A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
+"""Delay above which the simulator does not catch up but drops the time, s, as after a suspension of
+the computer."""
 _IDLE_S = 0.25
 _CATCH_UP_STEPS = 50  # steps between two polls of the control connection while catching up
 
@@ -272,7 +276,7 @@ class HostRunner:
             return False
         now_s, self._limit_s = self._clock(), limit_s
         if self._waiting_since_s is None or limit_s != before_s:
-            self._waiting_since_s = now_s  # the loop has given a sign of life
+            self._waiting_since_s = now_s  # the loop has shown a sign of life
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
@@ -282,8 +286,9 @@ class HostRunner:
             return False, f"{type(error).__name__}: {error}"
 
 
-# --- The simulated camera's picture over HTTP, as a network camera would send it ---
-# One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
+# --- The simulated camera's pictures over HTTP, as from a network camera ---
+# Each part of a multipart answer is one JPEG. A slow client misses frames, but always gets the
+# newest.
 
 
 SIMULATED_JPEG_QUALITY = 92
@@ -292,7 +297,7 @@ _CLIENT_TIMEOUT_S = 5.0
 
 
 class MjpegServer(ThreadingHTTPServer):
-    """Serves the newest of the published pictures on loopback, whatever the path."""
+    """Serves the newest published picture on loopback, for any path."""
 
     daemon_threads = True
     block_on_close = False
@@ -311,7 +316,7 @@ class MjpegServer(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def wait_for_newer(self, number: int) -> tuple[int, Picture]:
-        """The newest picture and its number as soon as that is above `number`."""
+        """Wait for a picture newer than `number`; return it with its number."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest[0] > number)
             return self._newest
@@ -328,7 +333,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         number = 0
-        with contextlib.suppress(OSError):  # a client that goes away
+        with contextlib.suppress(OSError):  # error of a client that goes away
             self.send_response(200)
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
             self.end_headers()

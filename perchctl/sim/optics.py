@@ -1,4 +1,5 @@
-"""A camera's optics: its pixels' view rays, where they meet the target's plane, and its shade.
+"""A camera's optics: the view rays of its pixels, their intersections with the target's plane, and
+its vignetting.
 
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV. Pure.
 """
@@ -20,12 +21,12 @@ from perchctl.vision import CameraModel
 Picture = NDArray[np.uint8]
 
 FINE_PX, COARSE_PX = 2, 8
-"""Distances of the nodes of the two ray grids."""
+"""Distances between the nodes of the two ray grids, px."""
 
 FAR_AWAY_M = 1e4
-"""The coordinates given to rays that miss the plane."""
+"""Coordinates assigned to rays that miss the plane."""
 LEAST_RISE = 0.02
-"""z of a ray (target axes, depth 1 in the view) that still meets the plane."""
+"""Least z of a ray (target axes, depth 1 in the view) that still meets the plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,8 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     undistort: Any = cv2.undistortPoints
     if camera.model == "fisheye":
         undistort = cv2.fisheye.undistortPoints
-    criteria = (3, 100, 1e-12)  # by default OpenCV stops early, 0.12 px off in the corners
+    # by default, OpenCV stops iterating early, with errors of 0.12 px in the corners
+    criteria = (3, 100, 1e-12)
     xy = undistort(pixels, camera.K, camera.dist, criteria=criteria)
     rays = np.ascontiguousarray(np.reshape(xy, (rows, cols, 2)), np.float32)
     down = np.asarray(v / (camera.size_px[1] - 1.0), np.float32)
@@ -63,8 +65,8 @@ def ray_to_plane_map(T_target_cam: Array) -> Array:
     """The homographies (..., 3, 3) from rays (x, y, 1) to homogeneous points (X w, Y w, w)
     of the target's plane, for poses (..., 4, 4).
 
-    From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
-    (w is made negative).
+    They follow from X = t + s R r with X_z = 0. A camera above the plane does not see it (w is made
+    negative).
     """
     R, t = T_target_cam[..., :3, :3], T_target_cam[..., :3, 3:]
     H = np.empty(R.shape)
@@ -82,7 +84,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
     """
     x, y = grid.xy[..., 0], grid.xy[..., 1]
     if to_plane.ndim == 2:
-        # The rise is linear over the rays, so it is least on the outline.
+        # The rise is linear over the rays, so its minimum is on the outline.
         rise = to_plane[2].astype(np.float32)
         if grid.boundary_xy.dot(rise[:2]).min() + rise[2] >= LEAST_RISE:
             points = cv2.perspectiveTransform(grid.xy, to_plane)
@@ -104,7 +106,8 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
-    """Pixels per metre around a node, mean of both directions, from the nodes' points, m."""
+    """Return the pixels per metre around each node, the mean of both directions, from the nodes'
+    points in m."""
     row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
     a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
@@ -112,11 +115,11 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
     return 2.0 * stride / math.sqrt(max(area, 1e-12))
 
 
-# --- What a lens makes of its pixels, for all pictures and all flights alike ---
+# --- How a lens maps its pixels, the same for all pictures and flights ---
 
 
 VIGNETTING_EXPONENT = 0.6
-"""Relative light is (1 + tan^2(angle))^-exponent."""
+"""Exponent of the vignetting: relative light is (1 + tan^2(angle))^-exponent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +136,7 @@ class Lens:
 
 
 def shared_lens(camera: CameraModel) -> Lens:
-    """The camera's lens, which flights share."""
+    """Return the camera's lens, which all flights share."""
     return _lens(*camera.calibration_key)
 
 

@@ -1,16 +1,16 @@
-"""Four motors and the cell that feeds them: duty cycles in, newtons out.
+"""Four motors and the battery cell that feeds them, from duty cycles to thrust.
 
 - A motor's voltage is its duty cycle times the battery's. Its speed follows that voltage
   with a lag, and its thrust is the curve at the voltage that belongs to the speed
   (`thrust_n`).
-- The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is
-  a w + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and
-  its square rises linearly with that voltage. A motor that hovers has the lag of 0.05 s of
-  docs/firmware.md, "Catching a slip". One that stands still has `STANDING_LAG_S`: with it the
-  slips of that page cost what was measured there.
-- Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within
-  `MOTOR_COAST_S`, which fits best what that page measured of falls, landings and take-offs. At any
-  other duty recorded flights show the same lag up and down (`Scenario.motors_brake`).
+- The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is a w +
+  b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
+  rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md, "Catching a
+  slip". At standstill it is `STANDING_LAG_S`, with which the slips on that page lose the measured
+  height.
+- Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within `MOTOR_COAST_S`,
+  the value that best fits the falls, landings and take-offs measured on that page. At any other
+  duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).
 - Motors of a kind differ (`Scenario.motor_strength`), and what each gives fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
@@ -37,17 +37,17 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 
 FULL_COMMAND = 65535.0
-"""Both of the thrust command and of the duty cycle (PWM)."""
+"""Full scale of both the thrust command and the duty cycle (PWM)."""
 MOTOR_FORCE_N = CRAZYFLIE_21.thrust.most_n
-"""Thrust of one motor at `FULL_COMMAND`, any battery that can still give it."""
+"""Thrust of one motor at `FULL_COMMAND`, with any battery that can still deliver it."""
 
 VoltageFunction = Callable[[float], float]
 
 
 def inverse_thrust(curve: ThrustCurve) -> VoltageFunction:
-    """Return the function from one motor's thrust, N, to the motor voltage that gives it."""
-    # The cubic has one real root for every thrust: Cardano, with all that is constant
-    # taken out. q is linear in the thrust.
+    """Return the function that converts one motor's thrust, N, to its voltage."""
+    # The cubic has one real root for every thrust (Cardano). All constant terms are computed in
+    # advance; q is linear in the thrust.
     c0, c1, c2, c3 = curve.coefficients
     p = -c2 / (3.0 * c3)
     q0 = p**3 + (c2 * c1 - 3.0 * c3 * c0) / (6.0 * c3 * c3)
@@ -63,7 +63,7 @@ def inverse_thrust(curve: ThrustCurve) -> VoltageFunction:
 
 
 def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
-    """Return the function from a motor voltage to one motor's steady thrust, N."""
+    """Return the function that converts a motor voltage to one motor's steady thrust, N."""
     c0, c1, c2, c3 = curve.coefficients
     standstill_v = inverse_thrust(curve)(0.0)
 
@@ -77,9 +77,9 @@ def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
 
 
 motor_voltage, thrust_n = inverse_thrust(CRAZYFLIE_21.thrust), steady_thrust(CRAZYFLIE_21.thrust)
-"""Those of the Crazyflie 2.1."""
+"""The functions of the Crazyflie 2.1."""
 STANDSTILL_V = motor_voltage(0.0)
-"""0.45 V: the dead band."""
+"""Voltage at which the motor stands still, the dead band: 0.45 V."""
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
@@ -92,7 +92,7 @@ STANDSTILL_V = motor_voltage(0.0)
 
 
 CHARGE_C = 900.0
-"""250 mAh."""
+"""Charge of the cell, C: 250 mAh."""
 RESISTANCE_OHM = 0.143
 ION_DIFFUSION_S = 15.0
 _CELL_CURVE: tuple[tuple[float, float], ...] = (
@@ -179,7 +179,7 @@ MOTOR_LAG_S = 0.05
 STANDING_LAG_S = 0.18
 MOTOR_COAST_S = 0.12
 FLUCTUATION_S = 0.02
-"""Memory of the fluctuation of a motor's thrust."""
+"""Time constant of the fluctuation of a motor's thrust, s."""
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
 # The share of the way in one control period is sqrt(_STANDING + per_v * v).
@@ -203,9 +203,9 @@ class Powertrain:
             scenario.cell_knee,
         )
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
-        self.strength = scenario.motor_strength  # each motor's thrust over the curve's
+        self.strength = scenario.motor_strength  # each motor's thrust relative to the curve
         self._fluctuation = Fluctuation(scenario) if scenario.thrust_noise else None
-        self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
+        self._speeds_v = [0.0] * 4  # each motor's speed, as the voltage that would sustain it
         self._brakes = scenario.motors_brake
         self._coasting = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
         curve = scenario.airframe.thrust
@@ -233,7 +233,7 @@ class Powertrain:
 
 
 class Fluctuation:
-    """The fluctuation of four motors' thrust, as shares of it."""
+    """Fluctuation of the thrust of four motors, as shares of it."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._rng = np.random.default_rng([scenario.seed, _FLUCTUATION_STREAM])
@@ -243,7 +243,7 @@ class Fluctuation:
         self._now = (0.0, 0.0, 0.0, 0.0)
 
     def step(self) -> tuple[float, float, float, float]:
-        """The shares one control period later."""
+        """Return the fluctuation one control period later."""
         if not self._white:
             self._white = (self._kick * self._rng.standard_normal(_FLUCTUATION_BATCH)).tolist()
         keep, take, (a, b, c, d) = self._keep, self._white.pop, self._now
@@ -252,7 +252,7 @@ class Fluctuation:
 
 
 def max_thrust_n(rest_v: float) -> float:
-    """Return four motors' steady thrust at full duty from a cell of that resting voltage."""
+    """Return the steady thrust of four motors at full duty with a cell of that resting voltage."""
     battery_v = rest_v
     for _ in range(30):
         forces_n = 4.0 * thrust_n(battery_v)

@@ -1,6 +1,6 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
-The child does not share its terminal's Ctrl-C, and ends with its parent.
+Ctrl-C on the terminal does not reach the child, which ends with its parent.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.sim.scenario import Scenario
 
 ANSWER_TIMEOUT_S = 60.0
-"""Also of `advance`, which takes a second for half a minute."""
+"""Also for `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
 def _serve_parent(*arguments: Any) -> None:
-    from perchctl.sim.host import serve_parent  # with the physics: in the child only
+    from perchctl.sim.host import serve_parent  # loads the physics: in the child only
 
     serve_parent(*arguments)
 
@@ -54,7 +54,7 @@ class SimProcess:
         self._channel, childs = _CONTEXT.Pipe()
         arguments = (childs, self.shared_time, pace, scenario, settings)
         self._child = _CONTEXT.Process(target=_serve_parent, args=arguments, daemon=True)
-        # The child takes over that Ctrl-C is blocked, until it has left the terminal.
+        # The child inherits that Ctrl-C is blocked, until it has left the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._child.start()
@@ -73,8 +73,8 @@ class SimProcess:
         pace: Literal["realtime", "stepped"] = "realtime",
         **settings: Any,
     ) -> SimProcess:
-        """Start the vehicle and wait until it answers. With `pace` "stepped" time passes by
-        `advance` only.
+        """Start the vehicle and wait until it answers. With the `pace` "stepped", only `advance`
+        lets time pass.
 
         `settings` are further arguments of `VehicleHost`.
         """
@@ -99,7 +99,7 @@ class SimProcess:
 
     def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
         with self._lock:
-            with contextlib.suppress(OSError):  # then there is no answer either
+            with contextlib.suppress(OSError):  # then no answer comes either
                 self._channel.send((name, arguments, named))
             good, result = self._receive()
         if not good:

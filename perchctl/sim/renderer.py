@@ -1,9 +1,9 @@
-"""The picture of the ceiling and its target from a camera pose.
+"""Render the picture of the ceiling and its target from a camera pose.
 
-Every image pixel is a ray, traced to the ceiling's plane and looked up in
-textures; lens distortion lies in the rays, which are precomputed. The sheets' map
-is exact at each pixel. The ceiling's is evaluated at every eighth and interpolated,
-which errs by less than 0.01 px for lenses up to 90 degrees.
+Each pixel is a ray that is traced to the plane of the ceiling and looked up in textures. The rays
+are precomputed and contain the lens distortion. The map of the sheets is exact at each pixel. The
+map of the ceiling is evaluated at every eighth pixel and interpolated, with an error below 0.01 px
+for lenses up to 90 degrees.
 """
 
 from __future__ import annotations
@@ -46,13 +46,15 @@ from perchctl.sim.sheets import (
 from perchctl.vision import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
-"""Numbers of this part's random streams."""
+"""Numbers of the renderer's random streams."""
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""The bank of noise is larger than a picture by this: each frame has another part of it."""
+"""Margin by which the bank of noise is larger than a picture, px: each frame uses another part of
+it."""
 _PLAIN_PX = 1.5
-"""Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
+"""Blur of the lens above which the whole picture is blurred, px. A smaller blur does not show on
+the bare ceiling, which is drawn at half the size or less."""
 _COVERING_SIGMA = 4.0
 """Noise, grey levels, which hides that the ceiling is drawn at a quarter of the size."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
@@ -74,7 +76,7 @@ class Exposure:
 
 
 class Renderer:
-    """Renders frames; `render` depends on its arguments and the seed only.
+    """Renders frames. The result of `render` depends only on its arguments and the seed.
 
     Args:
         scenario: the ceiling's height, the target's place and true print sizes
@@ -160,7 +162,7 @@ class Renderer:
         return picture
 
     def _exposed(self, shot: Exposure, defocus_px: float | None) -> Picture:
-        """Return what falls onto the sensor in one shot, before noise."""
+        """Return the light that reaches the sensor in one shot, before noise."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.row_poses]
         motion_px = self._paths_px(rows[len(rows) // 2])
         length_px = longest_path_px(motion_px)
@@ -180,7 +182,7 @@ class Renderer:
     def _projected(
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
     ) -> Picture:
-        """The picture at poses T_target_cam, of each row (n, 4, 4)."""
+        """Return the picture at the poses T_target_cam (n, 4, 4) of its rows."""
         count = blur_sample_count(length_px)
         by_row = [ray_to_plane_map(resample_poses(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
@@ -189,7 +191,7 @@ class Renderer:
             middle = (maps[count // 2 - 1] + middle) / 2.0
         nodes, misses = trace_rays(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        # At the ray grids' padded size.
+        # The grids of rays are padded to this size.
         if any(view.covers_all for view in views):
             picture = np.zeros(self._pixels.xy.shape[:2], np.uint8)
         else:
@@ -212,13 +214,13 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """The bare ceiling, several pixels drawn as one."""
+        """Draw the bare ceiling, with several pixels drawn as one."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
         step = self._ceiling_px
         texture, texels_per_m = self._ceiling.tile_and_texels_per_m(px_per_m / step)
-        # Whole tiles, to have the view in the middle of the texture.
+        # Shift by whole tiles, so that the view is in the middle of the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
         texels = nodes * np.float32(texels_per_m)
         texels += (_CENTER_TEXEL - tile * texels_per_m).astype(np.float32)
@@ -239,7 +241,7 @@ class Renderer:
 
     def _add_sheet(self, picture: Picture, view: SheetView, maps: Array) -> None:
         pixels = self._pixels
-        if maps.ndim > 3:  # a rolling shutter: each row has a map of its own
+        if maps.ndim > 3:  # with a rolling shutter, each row has its own map
             rows, cols = pixel_slices(view.box)
             xy = np.ascontiguousarray(pixels.xy[rows, cols])
             rays = RayGrid(xy, pixels.row_share[rows], pixels.boundary_xy)
@@ -258,8 +260,8 @@ class Renderer:
     # --- motion ---
 
     def _paths_px(self, poses: Array) -> Array:
-        """The ceiling's path in the image during the exposure at five places, (5, n, 2) px,
-        of poses (n, 4, 4)."""
+        """Return the path of the ceiling in the image during the exposure at five places, (5, n, 2)
+        px, for poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
         points = ray_to_plane_map(poses[len(poses) // 2]).dot(self._places)
@@ -312,8 +314,9 @@ def mean_picture(pictures: Sequence[Picture]) -> Picture:
 
 
 def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """The bilinear values at `texels` (h, w, 2) float32; outside by OpenCV's `border` mode."""
-    remap: Any = cv2.remap  # its stub denies that the second map may be None
+    """Return the bilinear values at `texels` (h, w, 2) float32; outside, by OpenCV's `border`
+    mode."""
+    remap: Any = cv2.remap  # OpenCV's stub does not know that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
@@ -328,13 +331,13 @@ def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
 
 
 # --- A camera that does not move ---
-# Where the picture moves by less than `STILL_EXPOSURE_PX` within the exposure, its pose is rounded,
-# so that a vehicle at rest sees the same picture again and again but for the noise.
+# If the picture moves by less than `STILL_EXPOSURE_PX` within the exposure, the pose is rounded, so
+# that a vehicle at rest sees the same picture each time, apart from the noise.
 
 
 STILL_EXPOSURE_PX = 0.005
 POSE_STEP = 2.0**-17
-"""Steps of the directions, and of the place in parts of its distance: below 0.01 px."""
+"""Rounding steps of the directions, and of the position relative to the distance: below 0.01 px."""
 
 
 def round_pose(T_target_cam: Array) -> Array:
@@ -350,10 +353,11 @@ def round_pose(T_target_cam: Array) -> Array:
 
 
 SHARP_MOTION_PX = 0.25
-"""Motion in one exposure below which one pose is enough (its blur has sigma 0.07 px)."""
+"""Motion during one exposure below which one pose is enough, px (its blur has a sigma of 0.07
+px)."""
 SAMPLE_SPACING_PX = 1.3
-"""Distance of the poses averaged for motion blur: the ripple this leaves lies above
-the pixels' own resolution."""
+"""Distance between the poses that are averaged for motion blur, px: the resulting ripple is finer
+than the pixels can resolve."""
 MAX_SAMPLES = 16
 MAX_KERNEL_REACH_PX = 12
 
@@ -365,7 +369,8 @@ def longest_path_px(motion_px: Array) -> float:
 
 
 def blur_sample_count(length_px: float) -> int:
-    """Return how many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    """Return the number of poses needed for the blur of a path of that length; 1 for a sharp
+    frame."""
     if length_px < SHARP_MOTION_PX:
         return 1
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
@@ -387,7 +392,7 @@ def resample_poses(poses: Array, count: int) -> Array:
 
 
 def motion_blur_kernel(motion_px: Array) -> NDArray[np.float32] | None:
-    """The blur kernel of the path at the image's middle; None if the path is too short."""
+    """Return the blur kernel of the path at the image's centre; None if the path is too short."""
     path = motion_px[0] - motion_px[0].mean(axis=0)
     reach = float(np.abs(path).max())
     if reach < SHARP_MOTION_PX / 2.0:
@@ -422,12 +427,13 @@ SNOW_LINES_PER_FRAME = 12.0
 def add_analogue_faults(
     image: NDArray[np.uint8], strength: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
+    """Return the picture as a receiver shows it; `strength` is 0 (clean) to 1 (about to be
+    lost)."""
     height, width = image.shape
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
     for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):
         start, length = int(rng.integers(height)), int(rng.integers(4, 40))
-        # A torn band comes back to its place over its length, as the receiver's line lock does.
+        # A torn band moves back into place along its length, as a receiver's line lock makes it.
         band = slice(start, min(start + length, height))
         fade = np.linspace(1.0, 0.0, length)[: band.stop - band.start]
         shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade

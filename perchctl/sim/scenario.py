@@ -1,5 +1,5 @@
-"""One simulated flight's conditions: what they are, how a profile's ranges and a seed give them,
-and when the radio is silent."""
+"""The conditions of one simulated flight, how they are drawn from a profile's ranges with a seed,
+and when its radio is silent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perchctl.profile import Profile, SimulationConfig
 from perchctl.sim.airframe import CRAZYFLIE_21, Airframe
 
 CONTROL_PERIOD_S = 0.002
-"""Step of the physics and of the firmware model (500 Hz)."""
+"""Time step of the physics and of the firmware model, s (500 Hz)."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Neighbour:
 
     Attributes:
         xy_m: its centre in the axes of the vehicle's own target.
-        yaw_rad: its heading less the own target's.
+        yaw_rad: its heading minus that of the vehicle's own target.
         large_id, small_id: its markers' ids, in the own dictionaries; None: the own target's ids.
     """
 
@@ -35,7 +35,7 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that differs between two simulated flights; SI, world frame.
+    """Everything that can differ between two simulated flights; SI, world frame.
 
     The world's origin is the floor under the vehicle's start, its x axis the vehicle's heading
     there.
@@ -152,7 +152,7 @@ class Scenario:
     airframe: Airframe = CRAZYFLIE_21
 
     def radio_bursts(self) -> RadioBursts | None:
-        """The times at which the flight's radio is silent; None without losses."""
+        """Return the times at which the flight's radio is silent; None without losses."""
         return (
             RadioBursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
         )
@@ -161,7 +161,7 @@ class Scenario:
 # --- From a profile's ranges and a seed to a scenario ---
 
 
-# The scenario's own random streams.
+# The random streams of the scenario alone.
 _SCENARIO_STREAM = 1
 _GROUPS_STREAM = 21
 _IMU_BIAS_STREAM = 22
@@ -185,15 +185,15 @@ _AS_GIVEN = (
 )
 """Keys of the profile that are the same for every seed."""
 _LEAST_STRENGTH = 0.8
-"""Of a motor that still flies, as a share of the others'."""
+"""Least strength of a motor that still flies, as a share of the others' strength."""
 _LONGEST_S = 240.0
-"""No simulated flight lasts longer."""
+"""Upper limit for the duration of a simulated flight, s."""
 _LEAST_GAP_S = 1.0
 
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
-    """The seed's scenario. Values are drawn in a fixed order, so a range added at the end
-    leaves a seed's earlier values; harder worlds draw from other random streams."""
+    """Return the seed's scenario. Values are drawn in a fixed order, so a new range at the end
+    leaves a seed's earlier values unchanged. Harder worlds draw from other random streams."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _SCENARIO_STREAM])
 
@@ -205,7 +205,8 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     drawn: dict[str, Any] = {key: between(key) for key in _DRAWN}
     burst_s, frames = between("camera_burst_start_s"), sim.camera_burst_frames or (0, 0)
     if frames[0] == frames[1]:
-        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
+        # numpy draws nothing for a range of one number, but the draws after it must not change
+        rng.integers(2)
     burst = burst_s, int(rng.integers(frames[0], frames[1] + 1))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(sim, rng)
     direction = rng.normal(size=3)
@@ -247,7 +248,8 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
 
 
 def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
-    """A turn and shift the profile lacks, up to `mount_error_deg` and `mount_error_m`."""
+    """Return a rotation and shift of the camera that the profile does not contain, up to
+    `mount_error_deg` and `mount_error_m`."""
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
@@ -257,8 +259,8 @@ def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """The biases of gyroscope and accelerometer; none along the accelerometer's z,
-    which the firmware's scale corrects."""
+    """Return the biases of gyroscope and accelerometer; none along the accelerometer's z, which the
+    firmware's scale corrects."""
     rng = np.random.default_rng([seed, _IMU_BIAS_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
@@ -284,7 +286,7 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _vehicle(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """What differs between two vehicles of a kind: each from a random stream of its own."""
+    """Return the differences between vehicles of one kind, each from a random stream of its own."""
     motors, mass, authority, thrust, vibration, air = (
         np.random.default_rng([seed, _VEHICLE_STREAM, part]) for part in range(6)
     )
@@ -306,7 +308,8 @@ def _vehicle(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    """A value whose logarithm is drawn evenly: recorded vehicles differ tenfold."""
+    """Draw a value whose logarithm is uniformly distributed: recorded vehicles differ by a factor
+    of ten."""
     low, high = bounds
     part = float(rng.uniform())
     return low if low <= 0.0 else low * (high / low) ** part
@@ -317,7 +320,8 @@ def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float
     towards_rad = math.radians(float(rng.uniform(-180.0, 180.0)))
     if not tilt_rad:
         return (0.0, 0.0)
-    # Lifted on the side of +x is a turn about -y, on that of +y one about x.
+    # A target that is higher on the side of +x is rotated about -y; one that is higher on the side
+    # of +y, about x.
     return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
 
 
@@ -339,13 +343,14 @@ def _capture_holes(
 
 _BURSTS_STREAM = 14
 CONNECTED_S = 4.0
-"""Before that nothing is lost: what is sent until the take-off is repeated until it is answered."""
+"""Time before which nothing is lost, s: packets sent before take-off are repeated until they are
+answered."""
 
 
 class RadioBursts:
-    """Gilbert's two-state channel in continuous time: good and bad times have exponentially
-    distributed lengths, whatever the packets' rate. Both directions are lost together.
-    The times given to `is_lost` must not decrease; same seed, same bursts.
+    """Gilbert's two-state channel in continuous time: the lengths of good and bad periods are
+    exponentially distributed and do not depend on the packet rate. Both directions are lost
+    together. The times passed to `is_lost` must not decrease. The same seed gives the same bursts.
 
     Args:
         share: lost share of the time, above 0 and below 1.

@@ -1,5 +1,5 @@
-"""What the simulated camera looks at: printed sheets and the ceiling, as textures, and where a
-sheet is seen in one exposure.
+"""The scene of the simulated camera: printed sheets and the ceiling as textures, and the part of a
+picture that a sheet covers in one exposure.
 
 Textures are kept at several resolutions, each the exact or filtered mean over its texels' areas,
 so that sampling near one texel a pixel is correct near and far. Pure.
@@ -26,18 +26,18 @@ from perchctl.target import TargetDrawing, draw_target
 PAPER_GREY, INK_GREY, CEILING_GREY = 225.0, 30.0, 140.0
 
 SHEET_FINEST_PX_PER_M = 8000.0
-SHEET_LEVELS = 28  # a factor 2^(1/4) between levels: 8000 .. 74 px/m
+SHEET_LEVELS = 28  # by a factor of 2^(1/4) per level: 8000 .. 74 px/m
 TEXELS_PER_PIXEL = 2.0**0.875
-"""Texels per image pixel, at least: 1.83 to 2.18 from one level to the next."""
+"""Least number of texels per image pixel: 1.83 to 2.18 between two levels."""
 PIXEL_WINDOW_TEXELS = 2.0
-"""Each texel is the exact mean over a window of one image pixel's size. A smaller
-window, or one that is no whole number of texels, aliases: edges would be out of
-place by up to 0.03 px."""
+"""Width of the window over which each texel is the exact mean, in texels: one image pixel. With a
+smaller window, or one that is not a whole number of texels, edges would alias and be displaced by
+up to 0.03 px."""
 SAMPLING_SIGMA_PX = 1.0 / (PIXEL_WINDOW_TEXELS * math.sqrt(6.0))
 """Blur that bilinear sampling between texels adds to the pixel's own window."""
 
 TILE_M = 2.0
-"""The ceiling's texture repeats after this length."""
+"""Length after which the ceiling's texture repeats, m."""
 TILE_FINEST_PX = 1024
 CEILING_TEXTURE_PX = 2048
 CEILING_OCTAVES: tuple[tuple[int, float], ...] = (
@@ -51,7 +51,7 @@ CEILING_OCTAVES: tuple[tuple[int, float], ...] = (
 
 
 _BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
-"""Spread of bytes that are all as likely."""
+"""Standard deviation of uniformly distributed bytes."""
 
 
 class SheetTexture(NamedTuple):
@@ -79,7 +79,8 @@ class Sheet:
     def texture(self, image_px_per_m: float) -> SheetTexture:
         """The texture at the resolution for an image of `image_px_per_m` pixels per metre."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
-        # Level -1 is the finest resolution with single texels, for views nearer than it suits.
+        # Level -1 is the finest resolution without averaging, for views from closer than it is
+        # meant for.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
         if level not in self._levels:
             px_per_m = SHEET_FINEST_PX_PER_M * 2.0 ** (-max(level, 0) / 4.0)
@@ -88,7 +89,7 @@ class Sheet:
 
     def _build(self, px_per_m: float, window_px: float) -> SheetTexture:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
-        # In place: a campaign's peak of memory is here.
+        # Computed in place, because a campaign uses the most memory here.
         sheet = self.drawing.sheet_coverage(px_per_m, size, window_px)
         alpha = np.multiply(sheet, 255.0)
         alpha = np.rint(alpha, out=alpha).astype(np.uint8)
@@ -110,11 +111,11 @@ class CeilingTexture:
     """A seeded, seamless grey texture with detail from 2 mm to half a metre."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        # The coarsest first, each sum made finer before the next is added.
+        # Begin with the coarsest detail, and refine each sum before adding the next.
         tile = np.full((1, 1), CEILING_GREY, np.float32)
         for cells, sigma in CEILING_OCTAVES:
             tile = _finer(tile, cells // len(tile))
-            # As wide as a normal distribution, at a tenth of the price.
+            # As wide as a normal distribution, but ten times faster to draw.
             grey = rng.integers(0, 256, (cells, cells), np.uint8)
             tile += grey * np.float32(sigma / _BYTE_SIGMA) - np.float32(127.5 * sigma / _BYTE_SIGMA)
         self._tiles = [np.clip(tile, 0.0, 255.0)]
@@ -137,9 +138,10 @@ class CeilingTexture:
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
-    """The same smooth, seamless surface with more cells."""
+    """Return the same smooth, seamless surface with more cells."""
     padded = np.pad(tile, 2, mode="wrap")
-    # One axis after the other, without what lies around the tile: at the coarsest a third.
+    # Interpolate one axis after the other, without the surroundings of the tile: at the coarsest
+    # detail, this takes a third of the time.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
     wide = np.ascontiguousarray(wide[:, 2 * zoom : -2 * zoom])
     big = cv2.resize(wide, None, fx=1, fy=zoom, interpolation=cv2.INTER_CUBIC)
@@ -153,7 +155,8 @@ Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
 
 
-_LOOK_UP_TEXELS = 2.5  # from a block's middle, rounded, to what a bilinear look-up reads
+# distance from a block's centre, rounded, to the farthest texel of a bilinear look-up
+_LOOK_UP_TEXELS = 2.5
 
 
 class SheetView(NamedTuple):
@@ -188,8 +191,8 @@ class PlacedSheet:
             turn, shift = self.to_sheet[:2, :2].T, self.to_sheet[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
         x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
-        # How far each block's centre is from the sheet's, along the axis along which it is farther,
-        # and how far from there its pixels look at most: half a block to each side.
+        # Distance of each block's centre from the sheet's, along the axis with the larger distance,
+        # and the distance that the block's pixels extend from there: half a block to each side.
         off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
         reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
         half_m = self.sheet.drawing.sheet_side_m / 2.0
@@ -251,5 +254,6 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
 
 @lru_cache(maxsize=32)  # the targets of a fleet
 def printed_sheet(target_json: str) -> Sheet:
-    """A target's sheet; flights share its textures, which cost more than a second."""
+    """Return a target's sheet. Flights share its textures, which take more than a second to
+    make."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

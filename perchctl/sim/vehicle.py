@@ -41,7 +41,7 @@ class SimulatedVehicle:
             renderer = Renderer(scenario, camera, target or TargetConfig())
             self.camera = SimCamera(scenario, renderer)
         self.capture = None if capture is None else SimCapture(capture)
-        self.watched = True  # somebody takes the camera's pictures; no others are made
+        self.watched = True  # the camera's pictures are being used; otherwise none are rendered
         self._past: deque[tuple[Vector, tuple[float, float, float, float]]] = deque(maxlen=_PAST)
 
     @property
@@ -55,11 +55,11 @@ class SimulatedVehicle:
             self.step()
 
     def receive(self, packet: Packet) -> None:
-        """Take a packet as it comes from the radio."""
+        """Receive a packet as it comes from the radio."""
         execute_packet(self.firmware, packet)
 
     def step(self) -> None:
-        """Advance by one control period, with the exposures that fall into it."""
+        """Advance by one control period, and take the exposures that fall into it."""
         self.firmware.step()
         world = self.world
         if self.capture is not None:
@@ -75,7 +75,7 @@ class SimulatedVehicle:
             self.camera.renderer.move_target(xy_m)
 
     def _pose_at(self, t_s: float) -> Array:
-        """Return T_world_body (4, 4) at a time of the near past."""
+        """Return T_world_body (4, 4) at a time shortly before now."""
         back = max(0, round((self.t_s - t_s) / CONTROL_PERIOD_S))
         place_m, quaternion = self._past[max(-len(self._past), -1 - back)]
         return make_T(rotation_from_quaternion(quaternion), place_m)

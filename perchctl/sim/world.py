@@ -38,7 +38,7 @@ from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
-# Nothing is drawn with it; its window library would start a process with each import.
+# Nothing is drawn with MuJoCo, whose window library would start a process at each import.
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 try:
@@ -51,7 +51,7 @@ YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
 GROUND_LENGTH_M = 0.035
-"""Clearance in which the ground effect falls by a factor of e."""
+"""Clearance over which the ground effect decreases by a factor of e, m."""
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
@@ -79,7 +79,7 @@ class World:
         self.powertrain = Powertrain(scenario)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
-        self.downwash_mps = 0.0  # from other vehicles, straight down
+        self.downwash_mps = 0.0  # downward wind from other vehicles
         self._hand: Callable[[World], None] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -194,7 +194,7 @@ class World:
         self.set_state(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
     def move_by_hand(self, hand: Callable[[World], None]) -> None:
-        """Call `hand` every period, to set the held vehicle's state, until `let_go`."""
+        """Call `hand` every period to set the state of the held vehicle, until `let_go`."""
         self._hand = hand
 
     def let_go(self) -> None:
@@ -314,17 +314,17 @@ MAGNET_TOUCH_M = 0.001
 
 
 class Magnet:
-    """One magnet gear under one ceiling; evaluated once a control period."""
+    """One magnet gear under one ceiling, evaluated once per control period."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._came_off = False
         self.engaged = False
         self.target_xy_m = scenario.target_xy_m
-        self.let_go = False  # for good: it pulls no more
+        self.let_go = False  # permanently: it no longer pulls
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
-        """The pull on the gear's tip at `tip_m`, world axes; 0 unless `upright`."""
+        """Return the pull on the gear's tip at `tip_m`, world axes; 0 unless `upright`."""
         scenario = self._scenario
         gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
         target_x, target_y = self.target_xy_m
@@ -337,7 +337,7 @@ class Magnet:
 
     @property
     def hold_n(self) -> float:
-        """The force that parts magnet and gear; may be less at the first contact."""
+        """Return the force that separates magnet and gear; may be smaller at the first contact."""
         scenario = self._scenario
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
@@ -356,8 +356,8 @@ class Magnet:
 
 _TERMS = 5
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
-_STEADY = 0.7  # the steady part of the draught's speed
-_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
+_STEADY = 0.7  # share of the steady part in the draught's speed
+_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts relative to that speed: x, y, z
 _WIND_STREAM = 1
 
 

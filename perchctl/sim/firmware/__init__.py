@@ -1,4 +1,4 @@
-"""The Crazyflie's firmware, release 2026.08, as far as its answers can be seen."""
+"""The Crazyflie's firmware, release 2026.08, modelled as far as its answers can be observed."""
 
 from perchctl.sim.firmware.firmware import Firmware
 

@@ -19,7 +19,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S
 Motors = tuple[float, float, float, float]
 MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
 
-# --- Setpoints: which axes are controlled how ---
+# --- Setpoints: which axes are controlled, and how ---
 
 DISABLED = 0
 ABSOLUTE = 1
@@ -40,7 +40,7 @@ class Setpoint:
     """One setpoint in the firmware's own units: m, m/s, degrees, pitch nose up.
 
     Yaw rates are counter-clockwise positive, `thrust` is 0..65535; the velocity is along the
-    world's axes, with `MODE_HOVER` along the body's. Without arguments it is the one of
+    world's axes, with `MODE_HOVER` along the body's. The default is the setpoint of
     `send_stop_setpoint`: no thrust.
     """
 
@@ -72,7 +72,7 @@ TILT_MAX_DEG, SPEED_MAX_MPS = 20.0, 1.0  # posCtlPid.rLimit, pLimit, xVelMax, yV
 THRUST_LEAST = 20000.0  # posCtlPid.thrustMin
 INT16_MAX = 32767.0
 UINT16_MAX = 65535.0
-_OVERHEAD = 1.1  # a loop may request a little more than its successor's limit
+_OVERHEAD = 1.1  # a loop may request a little more than the limit of the next one
 _THRUST_SCALE = 1000.0
 
 
@@ -99,7 +99,7 @@ class Pid:
         self._measured = measured
 
     def update(self, desired: float, measured: float, is_angle: bool = False) -> float:
-        """The output after one period; an angle's error is wrapped to +-180 degrees."""
+        """Return the output after one period; the error of an angle is wrapped to +-180 degrees."""
         error, change = desired - measured, measured - self._measured
         if is_angle:
             error, change = wrap_deg(error), wrap_deg(change)
@@ -115,7 +115,7 @@ class Pid:
 
 
 def wrap_deg(angle: float) -> float:
-    """The same angle within +-180 degrees."""
+    """Return the same angle within +-180 degrees."""
     return math.remainder(angle, 360.0)
 
 
@@ -238,14 +238,14 @@ class Controller:
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out ---
 # In the firmware's order (source: power distribution, motor driver and stabiliser of release
 # 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
-# exceeds the full duty cycle is taken off all four. More than the full thrust may so be requested
-# of one motor, and is given while the battery suffices: a yaw step at hover costs no height
-# (docs/firmware.md, "Yaw step").
+# exceeds the full duty cycle is taken off all four. One motor may therefore be requested to give
+# more than its full thrust, and gives it as long as the battery suffices, so a yaw step at hover
+# costs no height (docs/firmware.md, "Yaw step").
 
 SUPPLY_AT_BOOT_V = 4.2
 SUPPLY_FILTER = 0.01  # of each sample, at `SUPPLY_RATE_HZ`
 SUPPLY_RATE_HZ = 1000.0
-SUPPLY_LEAST_V = 2.0  # below this the reading is taken for broken: no thrust
+SUPPLY_LEAST_V = 2.0  # a reading below this counts as broken: no thrust
 
 _KEEP = (1.0 - SUPPLY_FILTER) ** (SUPPLY_RATE_HZ * CONTROL_PERIOD_S)
 
@@ -274,7 +274,7 @@ class MotorDriver:
         most = max(p1, p2, p3, p4)
         if most == 0.0:
             return MOTORS_OFF
-        # Attitude comes before thrust: all four give way together.
+        # Attitude takes precedence over thrust: all four requests are reduced equally.
         excess = max(0.0, most - FULL_COMMAND)
         p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in (p1, p2, p3, p4))
         return p1, p2, p3, p4

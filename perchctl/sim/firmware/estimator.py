@@ -1,8 +1,8 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
-Drift runs from the moment the motors first turn. A vehicle without a deck (scenario
-`extra["external_position"]`) has what it is sent from outside instead, which counts with
-parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
+The drift starts when the motors first turn. A vehicle without a deck (scenario
+`extra["external_position"]`) uses external positions instead, if the parameter
+`stabilizer.estimator` is 2 (`perchctl.sim.firmware.outside`).
 """
 
 from __future__ import annotations
@@ -36,26 +36,27 @@ _ESTIMATOR_STREAM = 2
 _DEG_PER_RAD = 180.0 / math.pi
 _NOISE_BATCH = 2048
 _NOISE_EVERY = 5  # coloured noise advances at 100 Hz
-_POSITION_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.3)  # a memory of 0.3 s
+_POSITION_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.3)  # time constant 0.3 s
 _VELOCITY_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.1)
 _VELOCITY_LATE = 4  # control periods: the group delay of two poles at 30 Hz, 7.5 ms
-_VELOCITY_NOISE_PER_S = 2.5  # m/s of noise a metre of position noise
+_VELOCITY_NOISE_PER_S = 2.5  # m/s of noise per metre of position noise
 _GYRO_NOISE_DPS = 0.08
 _ACC_NOISE_G = 0.004
-_ACC_LAG = 1.0 - math.exp(-2 * math.pi * 30.0 * CONTROL_PERIOD_S)  # cut off at 30 Hz
+_ACC_LAG = 1.0 - math.exp(-2 * math.pi * 30.0 * CONTROL_PERIOD_S)  # cutoff at 30 Hz
 _NO_BIAS = (0.0, 0.0, 0.0)
-_ATTITUDE_GAIN = CONTROL_PERIOD_S / 2.0  # a memory of 2 s
+_ATTITUDE_GAIN = CONTROL_PERIOD_S / 2.0  # time constant 2 s
 
-# What the firmware's filter claims with a deck, in steady state, by its own noise parameters.
+# Variances that the firmware's filter reports with a deck in steady state, according to its noise
+# parameters.
 _FIRST_DECK_S = 0.03
-"""From a reset to the deck's first measurement: a range comes every 25 ms."""
+"""Time from a reset to the deck's first measurement, s; ranges come every 25 ms."""
 _RANGED_M2, _CLIMB_M2PS2 = 2.4e-6, 1.8e-4
-"""Of height and vertical speed with the range of a Flow deck, sigma 2.5 mm."""
+"""Variances of height and vertical speed with the range sensor of a Flow deck, sigma 2.5 mm."""
 _FLOW_M2PS2, _FLOW_LEAST_M = 2.15e-3, 0.1
-"""Of the horizontal velocity by optical flow, sigma 0.2 px, 1 m over the ground; it grows with the
-height's 1.5th power, and is as at 0.1 m below that."""
+"""Variance of the horizontal velocity from optical flow, sigma 0.2 px, at 1 m above the ground. It
+grows with the height to the power of 1.5; below the second value, m, it stays constant."""
 _ABSOLUTE_M2, _ABSOLUTE_M2PS2 = 1e-6, 2.5e-4
-"""Of position and velocity with a Lighthouse deck."""
+"""Variances of position and velocity with a Lighthouse deck."""
 
 
 class Estimator:
@@ -80,8 +81,8 @@ class Estimator:
         if scenario.extra.get("external_position"):
             self.outside, self._imu = ExternalFilter(parameters), Imu(scenario)
         self._reset_s = 0.0
-        self._rng.uniform()  # keeps the flights of all seeds as they were
-        self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
+        self._rng.uniform()  # so that the flights of all seeds stay the same
+        self.spoil: Callable[[Estimate], None] | None = None  # called by a fault on each estimate
 
     def reset(self, t_s: float) -> None:
         """Forget drift and external positions, as `kalman.resetEstimation` does."""
@@ -104,10 +105,10 @@ class Estimator:
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION_STATE) -> float:
-        """The variance of a state of position or velocity, in the order of `ExternalFilter`'s.
+        """Return the variance of a position or velocity state, numbered as in `ExternalFilter`.
 
-        Zero, as in memory that nothing has written, while another estimator runs. A Flow deck
-        measures no horizontal position: its variance stays what it is after a reset.
+        While another estimator runs, it is zero, like memory that was never written. A Flow deck
+        does not measure the horizontal position, whose variance stays at its value after a reset.
         """
         if self._parameters["stabilizer.estimator"] != KALMAN:
             return 0.0
@@ -133,8 +134,8 @@ class Estimator:
     ) -> None:
         """Advance by one control period.
 
-        Drift runs once the vehicle `has_flown`; `spinning` motors shake the accelerometer,
-        `pressed` to the ceiling it is biased; `flying` is the supervisor's state.
+        The drift runs once the vehicle `has_flown`. `spinning` motors shake the accelerometer, and
+        a vehicle `pressed` against the ceiling biases it. `flying` is the supervisor's state.
         """
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_NOISE_BATCH).tolist()
@@ -188,7 +189,7 @@ class Estimator:
         tw, tx, ty, tz = truth
         half = 0.5 * CONTROL_PERIOD_S
         p, q, r = half * world.p_radps, half * world.q_radps, half * world.r_radps
-        # The tangent's step, then towards the truth, then back on the unit sphere.
+        # Step along the tangent, then towards the truth, then back onto the unit sphere.
         gain = _ATTITUDE_GAIN if w * tw + x * tx + y * ty + z * tz >= 0.0 else -_ATTITUDE_GAIN
         keep = 1.0 - _ATTITUDE_GAIN
         nw = keep * (w - x * p - y * q - z * r) + gain * tw
@@ -199,7 +200,7 @@ class Estimator:
         return (scale * nw, scale * nx, scale * ny, scale * nz)
 
     def _walk(self, noise: Vector, keep: float, sigma: float) -> Vector:
-        """Return coloured noise a step later."""
+        """Return coloured noise one step later."""
         take, kick = self._white.pop, sigma * math.sqrt(1.0 - keep * keep)
         x, y, z = noise
         return keep * x + kick * take(), keep * y + kick * take(), keep * z + kick * take()

@@ -1,4 +1,5 @@
-"""The firmware as one object: commands in, motors out, one control period a step."""
+"""The firmware as one object: it takes commands, drives the motors, and steps by control
+periods."""
 
 from __future__ import annotations
 
@@ -32,9 +33,9 @@ class Firmware:
     """A Crazyflie 2.1, or the scenario's airframe, as firmware release 2026.08 (CRTP protocol 12)
     behaves.
 
-    Every behaviour is a fact of docs/firmware.md. `step` senses, estimates,
-    supervises, controls, drives the motors and advances the world by
-    `CONTROL_PERIOD_S`. Commands take effect in the next step.
+    docs/firmware.md describes and documents each behaviour. `step` senses, estimates, supervises,
+    controls, drives the motors and advances the world by `CONTROL_PERIOD_S`. Commands take effect
+    in the next step.
     """
 
     LOG_VARIABLES: ClassVar[dict[str, LogVariable]] = LOG_VARIABLES
@@ -47,7 +48,7 @@ class Firmware:
         self.reboot()
 
     def reboot(self) -> None:
-        """Start anew, in the world as it is; no parameter has been stored."""
+        """Restart in the present world; no parameter was stored."""
         self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self._steps = 0
         self._flown = False
@@ -100,8 +101,8 @@ class Firmware:
                 acc_g=self.estimator.acc_g,
             )
             if ended:
-                # The setpoint of a flight that is over must not fly the next one: after
-                # re-arming only a new packet, or the planner, spins the motors.
+                # A setpoint from a flight that is over must not fly the next one. After re-arming,
+                # only a new packet or the planner can spin the motors.
                 self._low_level = False
             self.planner.set_blocked(not supervisor.motors_allowed)
             self._watch_battery(t_s)
@@ -126,7 +127,7 @@ class Firmware:
     def fly_setpoint(self, setpoint: Setpoint) -> None:
         """Fly this setpoint, which overrides the high-level commander.
 
-        Raw thrust is limited, and locked at 0 until a packet with thrust 0 arrives after boot
+        Raw thrust is limited. After boot it is locked at 0 until a packet with thrust 0 arrives
         (docs/firmware.md, "Raw thrust").
         """
         if setpoint.mode == MODE_RAW:
@@ -141,7 +142,7 @@ class Firmware:
         self.planner.stop()
 
     def notify_setpoint_stop(self) -> None:
-        """End the low-level setpoints, so that the high-level commander may fly again."""
+        """End the low-level setpoints, so that the high-level commander can fly again."""
         self._inform_planner()
         self._low_level = False
 

@@ -1,12 +1,13 @@
 """The state estimate of a vehicle without a positioning deck: its IMU, and positions or poses
 from outside.
 
-The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second the
-gyroscope turns the attitude and the accelerometer moves the velocity: in flight along the thrust's
-axis alone, so that drag and draught go unfelt; otherwise along all three, and the attitude is
-drawn to the initial one. A position corrects position, velocity and attitude, by what the
-covariance says each has to do with it. Nothing here looks at the truth. The sensors' errors
-(`Imu`) lead the estimate astray, and whatever is sent: there is no gate (source).
+The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second, the
+gyroscope updates the attitude and the accelerometer updates the velocity. In flight, the velocity
+is updated along the thrust axis only, so drag and draught are not felt. Otherwise it is updated
+along all three axes, and the attitude is pulled towards the initial one. A position corrects
+position, velocity and attitude according to their covariance with it. The filter never sees the
+truth: the errors of the sensors (`Imu`) mislead the estimate, and so does any wrong position, since
+there is no gate (source).
 """
 
 from __future__ import annotations
@@ -24,27 +25,27 @@ Reading = tuple[float, float, float, float, float, float]
 """Acceleration, m/s^2, and turning rates, rad/s, body axes."""
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
-# --- What the gyroscope and the accelerometer read, as the estimator gets it: means of 100 a second
-# Their errors are those of the trial in docs/firmware.md, "Target as position": white noise, that
-# sums up to a random walk of attitude and velocity, and a bias. A gyroscope's bias is
-# what the firmware's own, taken on the ground, leaves of it.
+# --- What the gyroscope and the accelerometer read, as means of 100 a second for the estimator ---
+# The errors are those of the trial in docs/firmware.md, "Target as position": white noise, which
+# accumulates to a random walk of attitude and velocity, and a bias. The gyroscope's bias is what
+# remains after the firmware has subtracted the bias that it measured on the ground.
 
 
 IMU_EVERY = 5
-"""Control periods from one mean to the next."""
+"""Number of control periods from one mean to the next."""
 IMU_PERIOD_S = IMU_EVERY * CONTROL_PERIOD_S
 
 _IMU_NOISE_STREAM = 12
 _IMU_BATCH = 1536
-_SAMPLES = 1000.0 * IMU_PERIOD_S  # of a real one, in each mean
+_SAMPLES = 1000.0 * IMU_PERIOD_S  # samples of a real sensor in each mean
 _GYRO_NOISE_RADPS = math.radians(0.1) / math.sqrt(_SAMPLES)
 _ACC_NOISE_MPS2 = 0.01 * GRAVITY_MPS2 / math.sqrt(_SAMPLES)
 _GYRO_LEFT_RADPS = 5e-4
-"""Bias about level axes that a real one has at its best: blind for 12 s of flight, a vehicle
-touched down 0.9 m aside (docs/firmware.md, "Target covered")."""
+"""Smallest bias of a real sensor about the level axes: after 12 s of blind flight, a vehicle
+touched down 0.9 m away (docs/firmware.md, "Target covered")."""
 _PRESSED_MPS2 = 0.03
-"""Error of the accelerometer along z while the vehicle is pressed against a ceiling: blind, the
-height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
+"""Error of the accelerometer along z while the vehicle is pressed against a ceiling. Without
+positions, the height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
 
 
 class Imu:
@@ -78,7 +79,8 @@ class Imu:
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """The mean since the last reading, with sensor errors; `pressed`: to the ceiling."""
+        """Return the mean since the last reading, with sensor errors; `pressed` means against the
+        ceiling."""
         if len(self._white) < 6:
             self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
         take = self._white.pop
@@ -102,11 +104,11 @@ class Imu:
 
 
 POSITION_STATE = 0
-"""Index of the position's x among the nine states; y and z follow."""
+"""Index of x of the position among the nine states; y and z follow."""
 VELOCITY_STATE = 3
-"""The same for the velocity."""
+"""Index of x of the velocity."""
 ATTITUDE_STATE = 6
-"""The same for the attitude."""
+"""Index of x of the attitude error."""
 
 _FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
 """Standard deviations after a reset (source: `stdDevInitial*`)."""
@@ -117,8 +119,8 @@ _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
 _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
-"""Share of the way to the initial attitude, each time while not in flight (source:
-`attitudeReversion`)."""
+"""Share of the difference to the initial attitude that each step removes while not in flight
+(source: `attitudeReversion`)."""
 
 
 def first_covariance() -> Array:
@@ -134,7 +136,7 @@ class ExternalFilter:
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
-        self._parameters = parameters  # the firmware's, as they are now
+        self._parameters = parameters  # the firmware's parameters with their present values
         self.reset()
 
     def reset(self) -> None:
@@ -191,7 +193,7 @@ class ExternalFilter:
         w, x, y, z = self.quaternion
         left = multiply_quaternions(measured, (w, -x, -y, -z))
         if abs(left[0]) < 1e-6 * norm:
-            return  # half a turn, which has no direction
+            return  # half a turn, whose direction is undefined
         twice = 2.0 / left[0]
         wrong = (twice * left[1], twice * left[2], twice * left[3])
         self._correct(ATTITUDE_STATE, wrong, self._parameters["locSrv.extQuatStdDev"])
@@ -234,7 +236,7 @@ class ExternalFilter:
         np.fill_diagonal(self.covariance, bounded)
 
     def _force(self, acceleration_mps2: Sequence[float], *, flying: bool) -> Vector:
-        """The assumed specific force, world axes."""
+        """Return the assumed specific force, world axes."""
         w, x, y, z = self.quaternion
         ax, ay, az = acceleration_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
@@ -254,7 +256,7 @@ def normalize_quaternion(quaternion: Quaternion) -> Quaternion:
 
 
 def multiply_quaternions(first: Quaternion, second: Quaternion) -> Quaternion:
-    """The turn by `second` and then by `first`."""
+    """Return the rotation by `second` followed by `first`."""
     w, x, y, z = first
     a, b, c, d = second
     return (

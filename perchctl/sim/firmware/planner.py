@@ -23,13 +23,14 @@ class AxisState(NamedTuple):
 
 
 class Polynomial:
-    """An axis' way from a state at t = 0 to rest at `goal` at t = T; no jerk at either end."""
+    """One axis of a trajectory from a state at t = 0 to rest at `goal` at t = T, without jerk at
+    either end."""
 
     def __init__(self, start: AxisState, goal: float, duration_s: float) -> None:
         self.goal = goal
         self._duration = T = max(duration_s, 1e-9)
-        # In u = t / T with the goal subtracted, eight end conditions fix eight
-        # coefficients; the first four are the start itself (its jerk is zero).
+        # With u = t / T and the goal subtracted, eight boundary conditions determine eight
+        # coefficients. The first four are the initial state itself (its jerk is zero).
         p, v, a = start.value - goal, start.rate * T, start.accel * T * T
         coefficients = (
             start.value,
@@ -55,7 +56,8 @@ class Polynomial:
 
 
 class HighLevelPlanner:
-    """Plans with states idle, flying and landing; setpoints for the commander at 100 Hz."""
+    """Plans trajectories, with the states idle, flying and landing, and provides setpoints at 100
+    Hz."""
 
     def __init__(self) -> None:
         self.state = TRAJECTORY_IDLE
@@ -63,7 +65,7 @@ class HighLevelPlanner:
         self._begin_s = 0.0
         self._duration_s = 0.0
         self._axes: tuple[Polynomial, ...] = ()
-        self._now = [AxisState(0.0)] * 4  # where a new plan begins
+        self._now = [AxisState(0.0)] * 4  # state at which a new plan begins
 
     @property
     def active(self) -> bool:
@@ -78,7 +80,8 @@ class HighLevelPlanner:
         self.state = TRAJECTORY_IDLE
 
     def set_blocked(self, blocked: bool) -> None:
-        """Forbid or allow motors. While forbidden, plans end and new ones are refused."""
+        """Forbid or allow the motors. While they are forbidden, plans end and new ones are
+        refused."""
         if blocked and not self.blocked:
             self.stop()
         self.blocked = blocked

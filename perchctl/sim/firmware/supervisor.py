@@ -56,7 +56,7 @@ _IN_FLIGHT = frozenset({State.FLYING, State.LEVEL_OUT})
 
 
 class Supervisor:
-    """The firmware's supervisor; `update` runs at 25 Hz, the other methods only record.
+    """The firmware's supervisor. `update` runs at 25 Hz; the other methods only record events.
 
     `arms_itself` and `spin_up_s` as in `perchctl.sim.airframe.Airframe`.
     """
@@ -166,8 +166,8 @@ class Supervisor:
                 return State.RESET
             case State.FLYING | State.LEVEL_OUT if age_s > SILENCE_LEVEL_S + _TICK_S:
                 return State.LEVEL_OUT
-            # A level-out that ends goes back through FLYING, so `flying` cannot clear
-            # while setpoints are missing: silence after a lone stop ends in the lock.
+            # When levelling out ends, the state returns to FLYING, so `flying` cannot clear while
+            # setpoints are missing: silence after a single stop ends in the lock.
             case State.LEVEL_OUT:
                 return State.FLYING
             case State.FLYING if not flying:
