@@ -1,4 +1,5 @@
-"""Calibration of the camera's lens, of its mounting and latency, and of the gear's tip."""
+"""Calibration of the camera's lens, of its mounting and latency, and of the position of the gear's
+tip."""
 
 import lazy_loader
 

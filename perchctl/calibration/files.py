@@ -1,4 +1,5 @@
-"""Calibration files of ROS, OpenCV and Kalibr; one YAML for ROS, OpenCV and PyYAML written."""
+"""Read calibration files of ROS, OpenCV and Kalibr, and write one YAML for ROS, OpenCV and
+PyYAML."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ def profile_camera(config: CameraConfig) -> CameraModel:
 
 @dataclass(frozen=True)
 class CalibrationNotes:
-    """What a calibration of perchctl says about its origin; empty in files of other programs.
+    """The notes of a perchctl calibration on its origin; empty for files of other programs.
 
     Attributes:
         board: the board's notation.
@@ -56,7 +57,7 @@ def load_calibration(file: Path | str) -> CameraModel:
 
 
 def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
-    """The camera, and the values of all keys of the file."""
+    """Return the camera and the values of all keys of the file."""
     text = _text(path)
     try:
         lens, values = parse_calibration(text)
@@ -67,8 +68,8 @@ def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
 
 
 def _text(path: Path) -> str:
-    """The text of a file, in UTF-8 or, of some editors, UTF-16 or Latin-1. Raises NotFound, and
-    InvalidValue for bytes that are no text."""
+    """Return the text of a file in UTF-8 or, as some editors write it, UTF-16 or Latin-1. Raises
+    NotFound, and InvalidValue for bytes that are no text."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -82,7 +83,8 @@ def _text(path: Path) -> str:
             return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         if file_kind(path) in ("another kind of file", "a camera calibration", "a profile"):
-            return data.decode("cp1252", errors="replace")  # Latin-1, and quotes of Windows
+            # Latin-1, with the quotation marks of Windows
+            return data.decode("cp1252", errors="replace")
     raise InvalidValue(
         f"{path}: this is {file_kind(path)}, not a camera calibration: name the .yaml file from "
         "perchctl calibrate, or one from ROS, OpenCV or Kalibr"
@@ -90,10 +92,10 @@ def _text(path: Path) -> str:
 
 
 def _checked(lens: Lens) -> CameraModel:
-    """The camera of a lens. Raises InvalidValue for a camera matrix that cannot be meant."""
+    """Return the camera of a lens. Raises InvalidValue for an implausible camera matrix."""
     camera = CameraModel(lens.size_px, lens.K, lens.distortion, lens.model)
     K = lens.K.copy()
-    K[0, 1] = 0.0  # a skew that `CameraModel` allows, and that no computation uses
+    K[0, 1] = 0.0  # a skew that `CameraModel` allows, but no computation uses
     (width, height), (cx, cy) = camera.size_px, K[:2, 2]
     if not (0 < cx < width and 0 < cy < height and K[0, 0] > 0 and K[1, 1] > 0):
         raise InvalidValue(
@@ -104,7 +106,7 @@ def _checked(lens: Lens) -> CameraModel:
 
 
 # --- Writing ---
-# FileStorage wants ``dt: d`` and a first line ``%YAML 1.0``; PyYAML reads ``1e-05`` as a string.
+# FileStorage requires ``dt: d`` and the first line ``%YAML 1.0``; PyYAML reads ``1e-05`` as text.
 
 
 def calibration_text(
@@ -114,7 +116,7 @@ def calibration_text(
 
     `notes` are further keys, ignored by ROS readers, with numbers, texts or arrays (n, m).
     """
-    # ROS wants five coefficients of plumb_bob.
+    # ROS requires five coefficients for plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4
     entries: dict[str, str | float | int | Array] = {
         "image_width": camera.size_px[0],
@@ -140,8 +142,8 @@ def calibration_text(
 
 
 def _number(value: float | int) -> str:
-    """Return text that reads back to the very same number; with a point, or PyYAML reads a
-    string."""
+    """Return text that reads back as exactly the same number. It contains a point, because PyYAML
+    would read it as text without one."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

@@ -1,15 +1,15 @@
-"""Calibration files of other programs: the form is recognised, and each key has a meaning.
+"""Calibration files of other programs: recognise the form, and interpret each key.
 
-A lens that is taken for another one moves the target by centimetres at a standard deviation of
-millimetres, and nothing later notices. Therefore the keys decide, by one table for each form:
+Confusing two lens models moves the target by centimetres at a standard deviation of millimetres,
+and nothing notices it later. Therefore the keys decide, according to one table for each form:
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must be neutral, as another value would change the projection (binning, xi, ...);
-- notes, which say nothing about the projection of the camera's own pictures: in the table, or made
-  of words about boards, pictures, errors and dates.
+- notes, which do not concern the projection of the camera's own pictures: those in the table, and
+  keys that consist of words about boards, pictures, errors and dates.
 
-A key that is in no table might change the projection, so its file is refused, unless the value is
-0 or empty, by which no term of a lens model does anything. Among the notes are
+A key that is in no table might change the projection, so its file is refused, unless the value is 0
+or empty, with which no term of a lens model has any effect. Among the notes are
 `rectification_matrix` and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified
 pictures, while K and D belong to the camera's own.
 
@@ -81,8 +81,8 @@ CAMERA_FILE = Form(
         *("target_error", "target_error_columns", "converted_from", "picture_hashes"),
     ),
 )
-"""A file of ROS's camera_calibration, of OpenCV's calibration programs, or of a script: their keys
-are the same, and mix."""
+"""A file of ROS's camera_calibration, of OpenCV's calibration programs, or of a script: they use
+the same keys, in any combination."""
 
 CAMERA_MESSAGE = Form(
     name="CameraInfo message",
@@ -133,7 +133,8 @@ _NOTE_WORDS = frozenset(
         *("file", "path", "comment", "comments", "note", "notes", "description"),
     )
 )
-"""Words about boards, pictures, errors and dates: a key of nothing else is a note, too."""
+"""Words about boards, pictures, errors and dates: a key that consists only of these is a note,
+too."""
 _UNITS = frozenset(("px", "mm", "cm", "m", "deg"))
 
 _LENSES = {
@@ -143,13 +144,14 @@ _LENSES = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
-"""The lenses that are read, by their names in ROS, OpenCV and Kalibr."""
+"""The lens models that are supported, by their names in ROS, OpenCV and Kalibr."""
 _COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,)}
 _OPENCV_LONG = (12, 14)
 """Coefficients of OpenCV's thin prism and tilted sensor models."""
 
 _MAX_RMS_SHARE = 0.01
-"""Of the picture's width: a calibration that says to miss its own board by more is none."""
+"""Largest reprojection error relative to the picture's width: a calibration that reports a larger
+one on its own board is unusable."""
 
 _AS_CAMERA_INFO = (
     "write its numbers into a file with image_width, image_height, camera_matrix, "
@@ -181,7 +183,7 @@ _OTHER_FORMS = (
     (r'"camera_type"\s*:', "a Basalt calibration", _AS_CAMERA_INFO),
     (r'"cameraData"\s*:', "a DepthAI (OAK) calibration", _AS_CAMERA_INFO),
 )
-"""Forms that are known and not read: a pattern in the text, the name, and what to do."""
+"""Forms that are recognised but not supported: a pattern in the text, the name, and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +198,10 @@ class Lens:
 
 
 def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
-    """The lens that a calibration file's text describes, and the values of all its keys.
+    """Return the lens that the text of a calibration file describes, and the values of all its
+    keys.
 
-    Raises InvalidValue, with the form that was found and what is needed.
+    Raises InvalidValue with the form that was found and what is needed.
     """
     for pattern, name, advice in _OTHER_FORMS:
         if re.search(pattern, text, re.MULTILINE):
@@ -219,10 +222,10 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
 
 
 def _values(text: str) -> dict[str, Any]:
-    """The values by key of a text in YAML, JSON, or OpenCV's XML."""
+    """Return the values by key from a text in YAML, JSON or OpenCV's XML."""
     if text.lstrip().startswith("<"):
         return _xml_values(text)
-    # The first line and the tags of OpenCV are not YAML; the keys say the same.
+    # OpenCV's first line and tags are not YAML; its keys contain the same information.
     plain = re.sub(r"^%YAML.*$", "", text, count=1, flags=re.MULTILINE)
     plain = re.sub(r"!!opencv-(?:nd-)?matrix", "", plain)
     try:
@@ -234,11 +237,11 @@ def _values(text: str) -> dict[str, Any]:
             raise InvalidValue(str(error)) from None
     if not documents or not all(isinstance(each, dict) for each in documents):
         raise InvalidValue(f"holds no keys: a calibration is a {READ_FORMS}")
-    # Of a topic each message is a document, with a time of its own.
+    # In the output of a topic, each message is a document with a time of its own.
     first, *others = ({str(k): v for k, v in d.items() if k != "header"} for d in documents)
     try:
         differ = any(other != first for other in others)
-    except RecursionError:  # in YAML a value may hold itself
+    except RecursionError:  # in YAML, a value may contain itself
         raise InvalidValue("values are nested too deeply") from None
     if differ:
         raise InvalidValue(f"holds {len(documents)} different documents: keep one")
@@ -246,8 +249,8 @@ def _values(text: str) -> dict[str, Any]:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON. Raises InvalidValue for a key that is there twice, of which Python would
-    keep the last one silently."""
+    """Build a JSON object. Raises InvalidValue for a duplicate key, of which Python would silently
+    keep the last value."""
     values = dict(pairs)
     if len(values) < len(pairs):
         (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
@@ -325,16 +328,16 @@ def _kalibr_lens(cam: str, camera: Any) -> Lens:
 
 
 _Found = dict[str, list[tuple[str, Any]]]
-"""Of each meaning that a file has: its keys and their values."""
+"""The keys and values of each meaning that the file contains."""
 
 
 def _plain_key(key: str) -> str:
-    """A key without underscores and upper case, in which programs and versions differ."""
+    """Return a key without underscores and upper case, in which programs and versions differ."""
     return key.replace("_", "").lower()
 
 
 def _is_note(key: str) -> bool:
-    """True if a key consists of words that say nothing about the projection."""
+    """True if a key consists of words that do not concern the projection."""
     words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", key)} - _UNITS
     return bool(words) and words <= _NOTE_WORDS
 
@@ -397,7 +400,7 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
 
 
 def _check_region(found: _Found) -> None:
-    """Raise InvalidValue if the pictures are a part of those that were calibrated."""
+    """Raise InvalidValue if the pictures are a section of those that were calibrated."""
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
             raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")
@@ -415,7 +418,7 @@ def _check_region(found: _Found) -> None:
 
 
 def _check_rms(found: _Found, width_px: int) -> None:
-    """Raise InvalidValue if the file itself says that it fits nothing."""
+    """Raise InvalidValue if the file itself says that it is of no use."""
     for key, value in found.get("rms", []):
         rms_px = _numbers(key, value)
         if (rms_px > _MAX_RMS_SHARE * width_px).any():
@@ -426,7 +429,7 @@ def _check_rms(found: _Found, width_px: int) -> None:
 
 
 def _check_entries(found: _Found, K: NDArray[np.float64]) -> None:
-    """Raise InvalidValue if fx, fy, cx or cy stand beside another camera matrix (9,)."""
+    """Raise InvalidValue if fx, fy, cx or cy contradict a camera matrix (9,) in the same file."""
     for entry, i in (("fx", 0), ("fy", 4), ("cx", 2), ("cy", 5)):
         for key, value in found.get(entry, []):
             if not np.allclose(_numbers(key, value), K[i]):
@@ -464,14 +467,14 @@ def _pixels(key: str, value: Any, least: int = 1) -> int:
 
 
 def _named_lens(found: _Found) -> str | None:
-    """The model that the file names; None if it names none."""
+    """Return the model that the file names; None if it names none."""
     named: dict[str, str] = {}
     for key, value in found.get("lens", []):
         name = re.sub(r"[\s-]+", "_", str(value or "").strip().lower())
         if not name:
             raise InvalidValue(f"{key} is empty: the camera was not calibrated")
         if name == "pinhole":
-            continue  # the projection; the distortion has a key of its own, or stays unnamed
+            continue  # the projection only; the distortion has its own key, or is not named
         if name not in _LENSES:
             raise InvalidValue(
                 f"{key} {clip_text(repr(value))} is unknown; allowed are {', '.join(_LENSES)}"
@@ -488,7 +491,7 @@ def _named_lens(found: _Found) -> str | None:
 
 
 def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float64]]:
-    """The lens model and its coefficients: as many as it has, without the zeros behind them."""
+    """Return the lens model and its coefficients, as many as it has, without trailing zeros."""
     key, value = found["distortion"][0]
     given = _numbers(key, value)
     model = named
@@ -504,7 +507,7 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
     while kept.size > counts[-1] and kept[-1] == 0.0:
         kept = kept[:-1]
     if model == "rational_polynomial" and kept.size in _COEFFICIENTS["plumb_bob"]:
-        return "plumb_bob", kept  # the further ones are 0
+        return "plumb_bob", kept  # the other coefficients are 0
     if kept.size in counts:
         return model, kept
     if given.size in _OPENCV_LONG and model != "fisheye":

@@ -1,6 +1,7 @@
-"""The part of the picture that the vehicle itself covers, learned from pictures that move.
+"""Learn which part of the picture the vehicle itself covers, from pictures taken while it moves.
 
-While the vehicle is turned about, only it stays the same, connected with the picture's edge.
+While you turn the vehicle in your hand, only its own parts stay the same in the picture. They are
+connected with the picture's edge.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue
 
 LIVE_S = 20.0
-"""How long a live camera is watched."""
+"""Time for which a live camera is watched, s."""
 LEAST_PICTURES = 20
 MOST_GEAR_SHARE = 0.6
-_LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room go by
-_STILL_RATIO = 0.3  # of that
-_LEAST_BLOB_SHARE = 5e-4  # of the picture, for a part of the gear
-_CLOSED_PX = 7  # gaps up to this wide are gear; larger covers pixels between two parts
-_DILATION_PX = 3  # blur around the gear; larger covers more of the picture than it does
+_LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room pass by
+_STILL_RATIO = 0.3  # share of that spread below which a pixel belongs to the gear
+_LEAST_BLOB_SHARE = 5e-4  # least share of the picture for a part of the gear
+_CLOSED_PX = 7  # width of gaps that are filled; larger: pixels between two parts are covered, too
+_DILATION_PX = 3  # margin for blur around the gear; larger: more is covered than the gear hides
 
 
 def learn_gear_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """The mask (h, w) of the pixels that the vehicle covers, by the pictures of a recording,
-    or of a live camera for `LIVE_S` or until `stopped`.
+    """Return the mask (h, w) of the pixels that the vehicle covers, from the pictures of a
+    recording, or of a live camera for `LIVE_S` or until `stopped`.
 
     Raises:
         InvalidValue: too few pictures, unequal sizes, too little motion, or nothing found.
@@ -74,7 +75,7 @@ def learn_gear_mask(
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts that reach the picture's edge, without specks and gaps."""
+    """Return the parts that touch the picture's edge, without specks and gaps."""
     clean = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     gap = np.ones((_CLOSED_PX, _CLOSED_PX), np.uint8)
     clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, gap)

@@ -1,4 +1,4 @@
-"""A live camera that guides a person: its frames, and what is shown."""
+"""A live camera in a guided measurement: its frames, and what is shown to the person."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def poll_frames(
 ) -> Iterator[tuple[float, Frame | None]]:
     """Poll a source until it has ended; yield the time of each poll with the new frame, or None.
 
-    Raises TimedOut: the source reports a problem, and gave no frame for `GONE_AFTER_S`.
+    Raises TimedOut if the source reports a problem and has given no frame for `GONE_AFTER_S`.
     """
     last_s = clock()
     while True:

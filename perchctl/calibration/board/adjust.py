@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, undistort_to_normalised
 
 ModelName = Literal["plumb_bob", "fisheye"]
-MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)  # the simplest first
+MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)  # from the simplest to the most general
 PARAMETERS: dict[str, tuple[str, ...]] = {
     "plumb_bob": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
     "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
@@ -157,7 +157,8 @@ VIEW_FACTOR = 2.5
 VIEW_FLOOR_PX = 0.1
 MAX_CORNERS_OUT = 0.25
 MAX_VIEWS_OUT = 1.0 / 3.0
-"""When more of the views would go, not they are wrong, but the board, its size or the lens."""
+"""Largest share of rejected views. If more are rejected, the views are not wrong, but the board,
+its size or the lens."""
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median distance of a round Gaussian with spread 1
 _REJECTION_ROUNDS = 10
 
@@ -225,13 +226,14 @@ def _spread_px(residual: Array) -> float:
     return float(np.median(np.linalg.norm(residual, axis=1))) / _MEDIAN_OF_RAYLEIGH
 
 
-# --- The covariance of a least-squares solution whose errors go together within a block of rows
+# --- The covariance of a least-squares solution whose errors are correlated within a block of rows
 
 
 SIGMAS_95 = 1.96
 """Standard deviations to each side of a 95 % interval."""
 _LEAST_INFORMATION_SHARE = 1e-10
-"""Share of a parameter's information that keeps one finite which nothing holds."""
+"""Share of a parameter's information that is added, so that a parameter that nothing determines
+stays finite."""
 
 
 def jackknife_covariance(
@@ -250,7 +252,7 @@ def jackknife_covariance(
         information_factor: further factor on the blocks' information (sandwich covariance).
     """
     seen = np.sum([information for information, _ in blocks], axis=0)
-    # Unlike units are brought to one scale.
+    # Scale the parameters, which have different units, to comparable sizes.
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(prior + curvature_factor * seen), 1e-300))
     both = np.outer(scale, scale)
     known = prior + np.diag(_LEAST_INFORMATION_SHARE / scale**2)
@@ -267,7 +269,8 @@ def jackknife_covariance(
     )
     count = len(blocks)
     spread = (count - 1) * moves.var(axis=0) * student_to_normal_ratio(count - 1) ** 2
-    # Each parameter by itself: all together would be more than the blocks can tell.
+    # Treat each parameter by itself: all of them together would be more than the blocks can
+    # determine.
     grown = np.sqrt(np.maximum(spread / np.diagonal(inverted), 1.0)) * scale
     return np.asarray(inverted * np.outer(grown, grown))
 

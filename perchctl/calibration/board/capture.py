@@ -36,13 +36,13 @@ def find_views(
     board: Board,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Detect the board in picture files; pictures that are broken or show no board are returned
-    apart. `progress` is called with the number of pictures done, and of all.
+    """Detect the board in picture files. Pictures that are broken or show no board are returned
+    separately. `progress` is called with the number of pictures done and their total number.
 
-    Raises InvalidValue, before the search: unequal sizes.
+    Raises InvalidValue, before the search, if the pictures differ in size.
     """
     names = [path.name for path in pictures]
-    if len(set(names)) < len(names):  # a glob reached into several folders
+    if len(set(names)) < len(names):  # a glob may match files in several folders
         names = [str(path) for path in pictures]
 
     def search(name: str, path: Path) -> BoardView | str:
@@ -97,7 +97,8 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
 
 
 def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Rejection]]:
-    """The views of the layout that most show, and the others as rejected: there is one board."""
+    """Return the views of the layout that most pictures show, and reject the others: there is only
+    one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
     reason = "its markers have another layout than in most pictures"
     others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
@@ -108,13 +109,13 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
 
 
 COVERAGE_AXES = ("position x", "position y", "size", "skew")
-"""Called as in ROS's camera_calibration."""
+"""Named as in ROS's camera_calibration."""
 GOALS = {"position x": 0.5, "position y": 0.5, "size": 0.3, "skew": 0.4}
-"""Spread of each over the views, after which it counts as covered."""
+"""Spread over the views at which each axis counts as covered."""
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
 MOST_VIEWS = 40
-"""So many show the lens, whatever they cover."""
+"""Number of views that suffice whatever they cover."""
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
 
@@ -133,14 +134,15 @@ def view_signature(view: BoardView, board: Board) -> Array:
     affine = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
     columns, rows = board.squares
     size = np.sqrt(abs(np.linalg.det(affine)) * columns * rows / (w * h))
-    # Brought from the board's axes to the picture's.
+    # Rotated from the board's axes to those of the picture.
     rotation = affine / max(float(np.linalg.norm(affine[:, 0])), 1e-9)
     tilt = _TILT_GAIN * 0.5 * max(columns, rows) * (rotation @ H[2, :2])
     return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
 
 
 def signature_distance(signature: Array, other: Array) -> float:
-    """The weighted distance of two view signatures (5,); beyond `NEW_BEYOND` a view is new."""
+    """Return the weighted distance of two view signatures (5,); a view farther than `NEW_BEYOND`
+    from all others is new."""
     return float(np.abs(signature - other) @ _WEIGHTS)
 
 
@@ -171,10 +173,10 @@ def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
 # --- Guided capture ---
 
 
-_STILL_SHARE = 1.5 / 640.0  # of the width, between two frames
+_STILL_SHARE = 1.5 / 640.0  # share of the width, between two frames
 _BLUR_SHARE = 2.5 / 640.0
 _UNSEEN_EVERY = 15
-"""Of the frames without a board every so many is kept, to name the board that they show."""
+"""Of the frames without a board, one in this many is kept, to name the board that they show."""
 _ADVICE = (
     (0.5, "move the board to the right edge", "move the board to the left edge"),
     (0.5, "move the board to the bottom edge", "move the board to the top edge"),
@@ -182,7 +184,7 @@ _ADVICE = (
     (0.0, "tilt the board's right side away", "tilt the board's left side away"),
     (0.0, "tilt the board's bottom side away", "tilt the board's top side away"),
 )
-"""The middle of each part of a signature, and what brings more and less of it."""
+"""The middle of each component of a signature, and instructions for more and for less of it."""
 
 
 def capture_views(
@@ -206,7 +208,7 @@ def capture_views(
                 break
             if frame is None:
                 continue
-            if frame.repeated:  # it would look still
+            if frame.repeated:  # otherwise it would look still
                 capture.count_repeated()
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
@@ -225,8 +227,8 @@ def capture_views(
 
 
 class GuidedCapture:
-    """State of a guided capture: the views `taken`, `advice` on the next view (of a recording: what
-    became of the frame), and `counts` of what became of all frames."""
+    """State of a guided capture: the views `taken`, `advice` on the next view (with a recording,
+    the result of the frame), and `counts` of the results of all frames."""
 
     def __init__(self, board: Board, live: bool = True) -> None:
         self._board = board
@@ -247,9 +249,9 @@ class GuidedCapture:
         self._count("repeated")
 
     def update(self, view_or_reason: BoardView | str) -> bool:
-        """Process the next picture: its view of the board, or why it has none.
+        """Process the next picture: extract its view of the board, or find out why it has none.
 
-        Return True if the view was taken, as it is new, sharp and still.
+        Return True if the view was taken because it is new, sharp and still.
         """
         before, seen = self._last, view_or_reason
         self._last = seen if isinstance(seen, BoardView) else None
@@ -302,7 +304,8 @@ class GuidedCapture:
 
 
 def _moved_px(before: BoardView, now: BoardView) -> float:
-    """The median motion in px of the corners that both views show; infinite without any."""
+    """Return the median motion in px of the corners that both views show; infinite if there are
+    none."""
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
     ways = np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)
     return float(np.median(ways)) if len(a) else float("inf")

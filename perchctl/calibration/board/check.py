@@ -1,14 +1,16 @@
-"""The check of an existing calibration by new pictures.
+"""Check an existing calibration against new pictures.
 
-The file's camera, with only the boards' poses fitted, is compared with a camera fitted to the new
-views. The former's reprojection error shows a wrong lens; but poses take up a wrong focal length,
-so the target's positions by the two cameras are compared as well. The check fails
+The camera of the file, with only the poses of the boards fitted, is compared with a camera fitted
+to the new views. Its reprojection error reveals a wrong lens. The poses absorb a wrong focal
+length, however, so the target positions that follow from the two cameras are compared as well. The
+check fails
 
 - when the file's RMS is more than twice that of the free camera and above 0.3 px, or
 - when these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
-  distance) and than the 95 % line of the new pictures.
+  distance) and by more than the 95 % bound of the new pictures.
 
-Pictures whose 95 % line is above twice the limit cannot judge: the check is refused.
+If the 95 % bound of the new pictures is above twice the limit, they cannot decide, and the check is
+refused.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ class Deviation:
 
     @property
     def allowed_error_share(self) -> float:
-        """`mm` over the error that perching allows; 0 if `mm` is within `mm95`."""
+        """`mm` relative to the error that perching allows; 0 if `mm` is within `mm95`."""
         return self.mm / allowed_error_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
@@ -79,11 +81,12 @@ class CheckResult:
 def check_calibration(
     camera: CameraModel, found: FoundViews, own_hashes: Collection[str] = ()
 ) -> CheckResult:
-    """Judge a calibration by new views of a board.
+    """Judge a calibration against new views of a board.
 
     Args:
         own_hashes: `BoardView.picture_hash` of the pictures that the calibration was made from.
-            They are left out: a calibration fits its own pictures whatever is wrong with both.
+            These pictures are left out: a calibration always fits its own pictures, even if both
+            are wrong.
 
     Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
     """
@@ -137,7 +140,7 @@ def _verdict(
 
 
 def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
-    """Raises InvalidValue where the pictures could not show a wrong focal length."""
+    """Raises InvalidValue if the pictures could not reveal a wrong focal length."""
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(

@@ -1,4 +1,4 @@
-"""A board in a picture: found, its corners refined, or the reason why not."""
+"""Find a board in a picture and refine its corners, or explain why there is none."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from perchctl.target import Board
 from perchctl.vision import deinterlace_image
 
 MIN_CORNERS = 6
-"""Fewer give a pose, but nothing about the lens."""
+"""Least number of corners in a view. Fewer determine a pose, but nothing about the lens."""
 SEARCH_PX = 1600
-"""Larger pictures are scaled down to it for the search; corners are fitted at full size."""
+"""Size to which larger pictures are scaled down for the search; corners are fitted at full size."""
 _HASH_BYTES = 6
-"""Fewer make it likelier than 1 in 10^8 that two of a thousand pictures have one hash by chance."""
+"""Length of a picture's hash, bytes. With a shorter one, the probability that two of a thousand
+pictures have the same hash by chance would exceed 1 in 10^8."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-_SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
+# an exhaustive search would take a second in a picture without a board
+_SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +75,15 @@ class Rejection:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames of a video or a camera were looked at, and why some of them were no views.
+    """How many frames of a video or a camera were examined, and why some of them gave no view.
 
     Attributes:
-        live: a camera, whose user can be told to hold still; else a recording.
+        live: a camera, whose user can be asked to hold still; otherwise a recording.
         taken: frames that became views.
         without_board: frames without a board, or with too little of it.
         moved: the board moved by more than `still_px` from the frame before, or was not in it.
-        blurred: too blurred for their corners.
-        alike: like a view that was taken already.
+        blurred: too blurred for the corners to be found.
+        alike: similar to a view that was already taken.
         repeated: frames that the source gave twice.
     """
 
@@ -101,7 +103,7 @@ class FrameCounts:
 
     @property
     def text(self) -> str:
-        """What became of the frames, in words."""
+        """The results of the frames, in words."""
         reasons = (
             (self.taken, "taken"),
             (self.moved, f"moved by more than {self.still_px:.2g} px since the previous frame"),
@@ -114,7 +116,8 @@ class FrameCounts:
 
     @property
     def advice(self) -> str:
-        """What brings more views: empty if the board has to be shown elsewhere, or at all."""
+        """Advice on how to get more views; empty if the board has to be shown in another place, or
+        at all."""
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
@@ -131,8 +134,9 @@ class FoundViews:
 
     Attributes:
         without_board: pictures without a board, each with the reason.
-        frames: of a video or camera, what became of its frames; None for pictures.
-        other_board: if there are no views, the board that is seen instead; empty if none is.
+        frames: the results of a video's or camera's frames; None for pictures.
+        other_board: if there are no views, the board that the pictures show instead; empty without
+            one.
     """
 
     views: tuple[BoardView, ...]
@@ -141,14 +145,14 @@ class FoundViews:
     other_board: str = ""
 
     def layout_of(self, board: Board) -> Board:
-        """The board that was named, in the layout that was seen."""
+        """The named board, in the layout that was seen."""
         return replace(board, legacy=self.views[0].legacy) if self.views else board
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """The view of a board in a grey picture (h, w), or why no board was found. In an interlaced
-    picture the first field is used, as a moving board has two positions. Both layouts of a ChArUco
-    board are looked for, whichever `board` has."""
+    """Return the view of a board in a grey picture (h, w), or the reason why no board was found. In
+    an interlaced picture, the first field is used, since a moving board has two positions. Both
+    layouts of a ChArUco board are tried, whatever `board` says."""
     picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
     image = deinterlace_image(image)[0]
     h, w = image.shape
@@ -164,7 +168,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     ids, corners, legacy = found
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
-    # A ChArUco board's markers begin so far inside of its white squares.
+    # Distance of a ChArUco board's markers from the edge of their white squares.
     white = 1.0 if board.marker_m is None else 0.5 * (1.0 - board.marker_m / board.square_m)
     fit = fit_saddles(image, corners, _local_axes(_cells(board, ids), corners), white)
     if fit.is_valid.sum() < MIN_CORNERS:
@@ -176,18 +180,18 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
 
 
 _Corners = tuple[NDArray[np.intp], Array, bool]
-"""The numbers (n,) and places (n, 2) px of a board's corners, and whether its layout is the legacy
-one."""
+"""Indices (n,) and positions (n, 2), px, of a board's corners, and whether it has the legacy
+layout."""
 
 
 def _charuco(image: Grey, board: Board) -> _Corners | str:
     """The corners of a ChArUco board in either layout, or why there are none.
 
-    The two layouts of a board differ in the squares of its markers, not in its corners: by the
-    wrong one no corner is found, since neighbouring markers contradict each other.
+    The two layouts of a board have the same corners, but their markers are in other squares. With
+    the wrong layout no corner is found, since neighbouring markers contradict each other.
     """
     numbers, corners, markers = charuco_corners(image, board)
-    # By the right layout there are more corners than markers, unless little of the board is seen.
+    # The right layout gives more corners than markers, unless only little of the board is visible.
     if board.has_two_layouts and len(numbers) < markers:
         other = replace(board, legacy=not board.legacy)
         more, places, _ = charuco_corners(image, other)
@@ -202,15 +206,16 @@ def _charuco(image: Grey, board: Board) -> _Corners | str:
 
 
 def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array, int]:
-    """The numbers (n,) and places (n, 2) px of the corners by the board's layout, and how many
-    markers were found."""
-    # A detector of its own for each call: pictures are searched on several threads.
+    """Return the indices (n,) and positions (n, 2), px, of the corners in the board's layout, and
+    the number of markers that were found."""
+    # Each call has its own detector, because pictures are searched on several threads.
     detector = cv2.aruco.CharucoDetector(board.cv2_board())
     finding = detector.getDetectorParameters()
     finding.minMarkerPerimeterRate = 0.01
     finding.minDistanceToBorder = 0
     detector.setDetectorParameters(finding)
-    # Markers missed at first are looked for where the board has them: far more corners.
+    # Markers that were missed at first are searched for where the board has them: this yields far
+    # more corners.
     completing = detector.getCharucoParameters()
     completing.tryRefineMarkers = True
     detector.setCharucoParameters(completing)
@@ -221,7 +226,7 @@ def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array,
 
 
 def _chessboard(image: Grey, board: Board) -> _Corners | str:
-    """As `_charuco`, of a chessboard."""
+    """The same as `_charuco` for a chessboard."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
     if not found:
@@ -232,7 +237,8 @@ def _chessboard(image: Grey, board: Board) -> _Corners | str:
 
 
 def _without_board(image: Grey) -> str:
-    """Return why a picture shows no board: the target is the other print that lies about."""
+    """Return why a picture shows no board: it may show the target, the other print that lies
+    about."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
@@ -245,14 +251,14 @@ def _without_board(image: Grey) -> str:
 
 
 def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
-    """The places of inner corners in squares, (n, 2)."""
+    """Return the positions of the inner corners, in squares, (n, 2)."""
     return np.asarray(board.corners_m()[ids, :2] / board.square_m)
 
 
 def _local_axes(cells: Array, corners: Array) -> Array:
-    """A square's two sides at each corner, the columns of (n, 2, 2) px.
+    """Return the two sides of a square at each corner, the columns of (n, 2, 2), px.
 
-    They are the homography's derivative, which smooths over single bad corners.
+    They are the derivative of the homography, which smooths out single bad corners.
     """
     H, _ = cv2.findHomography(cells, corners, cv2.RANSAC, 5.0)
     if H is None:
@@ -263,7 +269,7 @@ def _local_axes(cells: Array, corners: Array) -> Array:
     return np.asarray((H[:2, :2] - at * H[2, :2]) / w)
 
 
-# --- The corner where four squares meet, by fitting the picture around it ---
+# --- The corner where four squares meet, found by fitting the picture around it ---
 # `cv2.cornerSubPix` with a fixed window takes in the neighbouring corners of small squares, and a
 # ChArUco board's markers: it errs by 0.03 to 0.5 px where this errs by 0.02. Here the window
 # follows the square's own size and slant, and the grey levels in it are fitted by what a lens
@@ -277,11 +283,11 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 
 
 REACH = 0.42
-"""Half of the window, in squares; the next corner's edges begin at 1."""
+"""Half the width of the window, in squares; the edges of the next corner begin at 1."""
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
-WINDOW_SAMPLES = 21  # samples across the largest window
+WINDOW_SAMPLES = 21  # number of samples across the largest window
 _CORNER_ITERATIONS = 6
-_LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # step: px, rad, logarithms
+_LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # step: px, rad, and logarithms
 _MIN_SLOPE_PX = 5.0
 _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
@@ -310,7 +316,7 @@ def fit_saddles(
     """
     start = np.asarray(corners_px, dtype=np.float64)
     area = np.abs(np.linalg.det(axes_px))
-    # The narrower height of the parallelogram that a square makes.
+    # The smaller height of the parallelogram that a square forms.
     size_px = np.maximum(area / np.linalg.norm(axes_px, axis=1).max(axis=1), 1e-6)
     reach = np.clip(REACH, MIN_REACH_PX / size_px, MAX_REACH_PX / size_px)
     t = np.linspace(-1.0, 1.0, WINDOW_SAMPLES)
@@ -355,11 +361,12 @@ def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.
 
 
 def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
-    """Return 0 in what is printed in the white squares, and in its blur, else 1, (n, m)."""
+    """Return 0 at what is printed in the white squares and in its blur, otherwise 1, (n, m)."""
     if white >= REACH:
         return np.ones(grey.shape)
     positive = uv[..., 0] * uv[..., 1] > 0.0
-    # Near the corner even a ChArUco board's white is empty: there it shows which squares are white.
+    # Near the corner, even the white squares of a ChArUco board are empty, which shows which
+    # squares are white.
     near = np.abs(uv).max(axis=2) < 0.5 * np.abs(uv).max(axis=(1, 2))[:, None]
     brighter = (grey * np.where(positive, 1.0, -1.0) * near).sum(axis=1) > 0.0
     clear = np.maximum(white - 1.0 / size_px, 0.5 * white)[:, None]
@@ -368,8 +375,9 @@ def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
 
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """The best contrast c (n,) for the state (n, 6), the weighted residuals (n, m), and the
-    derivative of the modelled grey (n, m, 6), freed of what a, gx, gy, c, hx, hy can take up."""
+    """Return the best contrast c (n,) for the state (n, 6), the weighted residuals (n, m), and the
+    derivative of the modelled grey (n, m, 6), from which the part is removed that a, gx, gy, c, hx
+    and hy can absorb."""
     x = offsets[..., 0] - state[:, 0, None]
     y = offsets[..., 1] - state[:, 1, None]
     parts = []
@@ -383,7 +391,7 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
     u = offsets[..., 0]
     v = offsets[..., 1]
     cross = t1 * t2
-    # In a window of few pixels the contrast's slope cannot be distinguished from a shift.
+    # In a window of few pixels, the slope of the contrast cannot be distinguished from a shift.
     slope = cross * (np.abs(offsets).max(axis=(1, 2)) > _MIN_SLOPE_PX)[:, None]
     base = np.stack([np.ones_like(x), u, v, cross, u * slope, v * slope], axis=2)
     base *= weight[..., None]

@@ -1,10 +1,10 @@
-"""What a calibration's error means in mm at the target.
+"""Convert the error of a calibration to mm at the target.
 
-The pose solve takes up a part of a wrong calibration. So the error at the target is not the ray's
-error times the distance but the change of the solved position. For a target at a place, with J the
-derivative of its corners by its pose and L by the lens, a lens error d moves the solved pose by
--(J'J)^-1 J'L d; its translation is the error at the target's centre, and the parameters' covariance
-gives its 95 % line.
+The solved pose absorbs a part of a wrong calibration. The error at the target is therefore not the
+error of the ray times the distance, but the change of the solved position. For a target at some
+place, let J be the derivative of its corners with respect to its pose, and L with respect to the
+lens. A lens error d then moves the solved pose by -(J'J)^-1 J'L d. The translation of this step is
+the error at the target's centre, and the covariance of the parameters gives its 95 % bound.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def predict_errors(
         for place in _places(camera, z_m, covered):
             corners_m = _marker_m(camera, z_m)
             lens, pose = projection_derivatives(camera, np.concatenate([_FACING, place]), corners_m)
-            # Corners stay where they are, so the pose moves against the lens.
+            # The corners stay where they are, so the pose moves against the error of the lens.
             moved = np.linalg.lstsq(pose, lens, rcond=None)[0][3:]
             lines_mm.append(1e3 * SIGMAS_95 * np.sqrt(np.trace(moved @ covariance @ moved.T)))
         result.append(ErrorAtRange(z_m, float(max(lines_mm)), float(lines_mm[0])))
@@ -82,9 +82,10 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """The position errors (n,) if pictures that camera `truth` took of a target are evaluated with
-    `camera` (inf if out of its view). The n targets, at distance z_m, lie on a grid within the
-    `covered` cells of the picture (None: all); the first is on the axis."""
+    """Return the position errors (n,) that result from evaluating pictures of a target that were
+    taken with the camera `truth` by the model `camera` (inf if out of its view). The n targets at
+    distance z_m lie on a grid within the `covered` cells of the picture (None: all); the first is
+    on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
     views = [
@@ -98,7 +99,8 @@ def position_errors_mm(
 
 
 def _marker_m(camera: CameraModel, z_m: float) -> Array:
-    """The corners (4, 3) of the marker measured at that distance, in its own axes."""
+    """Return the corners (4, 3) of the marker that is measured at that distance, in its own
+    axes."""
     large_m = _SQUARE * LARGE_M
     return (
         large_m
@@ -127,7 +129,7 @@ def _cells(camera: CameraModel, place: Array, corners_m: Array) -> NDArray[np.in
     w, h = camera.size_px
     if not ((pixels >= 0).all() and (pixels <= (w - 1, h - 1)).all()):
         return None
-    # Far outside its field a lens polynomial folds back into the picture.
+    # Far outside its field of view, the polynomial of a lens folds back into the picture.
     straight = corners_m[:, :2] * (1.0, -1.0) + place[:2]
     if not np.allclose(undistort_to_normalised(pixels, camera), straight / place[2], atol=1e-3):
         return None

@@ -1,8 +1,8 @@
-"""Which board pictures show, when it is not the one that was named.
+"""Find out which board the pictures show if it is not the one that was named.
 
-Of chessboards the grid of corners is taken that most pictures show, two at least; of boards with
-markers the dictionary that decodes most of them, and the layout whose corners OpenCV then finds.
-What is unsure is not named.
+For chessboards, this is the grid of corners that most pictures show, at least two. For boards with
+markers, it is the dictionary that decodes most of them, and the layout whose corners OpenCV then
+finds. A board is named only if it is certain.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from perchctl.profile import aruco_dictionary
 from perchctl.target import Board, mm_text
 
 MOST_PICTURES = 5
-"""As many are searched for a chessboard, each within some tenths of a second."""
+"""Number of pictures that are searched for a chessboard, each within some tenths of a second."""
 MARKER_PICTURES = 3
-"""As many of them are searched for markers, each within about a second."""
+"""Number of them that are searched for markers, each within about a second."""
 MIN_MARKERS = 4
-"""Fewer may be the perching target, or patterns that look like markers."""
+"""Least number of markers. Fewer may belong to the perching target, or be patterns that look like
+markers."""
 MIN_MARKER_CORNERS = 12
-"""Corners of a ChArUco board that a layout must explain to be named."""
+"""Number of a ChArUco board's corners that a layout must explain to be named."""
 GRID_START = (5, 4)
-"""The grid from which OpenCV grows. From a smaller one it stops inside of a board; one that has not
-grown may be a part, or a keyboard."""
+"""Grid from which OpenCV grows the board. From a smaller grid, it stops inside the board. A grid
+that has not grown may be a part of a board, or a keyboard."""
 _SIZES = (50, 100, 250)
-"""Of the dictionaries of one family. Boards have fewer than 250 markers, and 1000 take longer."""
+"""Sizes of the dictionaries of one family. Boards have fewer than 250 markers, and the dictionary
+of 1000 would take longer."""
 _DICTIONARIES = (
     *(f"DICT_{bits}X{bits}_{_SIZES[-1]}" for bits in (4, 5, 6, 7)),
     "DICT_ARUCO_ORIGINAL",
@@ -43,13 +45,13 @@ _GRID_FLAGS = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
-    """The board in the grey pictures, and how to name it; empty if none is plainly visible, or if
-    it is the one that was named."""
+    """Return the board in the grey pictures and its notation; empty if none is clearly visible, or
+    if it is the board that was named."""
     images = [_small(picture) for picture in pictures[:MOST_PICTURES]]
     if not images:
         return ""
     with_markers = _markers_text(images[:MARKER_PICTURES], named)
-    # Of a board with markers a part would pass for a chessboard.
+    # First the boards with markers, a part of which would pass for a chessboard.
     return _grid_text(images, named) if with_markers is None else with_markers
 
 
@@ -63,7 +65,7 @@ def _small(picture: Grey) -> Grey:
 
 
 def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
-    """As `describe_other_board`, of a board with markers; None if there are no markers."""
+    """The same as `describe_other_board` for boards with markers; None if there are no markers."""
     seen = [_marker_ids(image, _DICTIONARIES) for image in images]
     family, _ = max(
         ((name, sum(len(ids[name]) for ids in seen)) for name in _DICTIONARIES),
@@ -102,10 +104,10 @@ def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
 def _marker_ids(
     image: Grey, dictionaries: Sequence[str], border_bits: int = 1
 ) -> dict[str, set[int]]:
-    """The numbers of the markers in a picture, by dictionary."""
+    """Return the ids of the markers in a picture, by dictionary."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
-    parameters.errorCorrectionRate = 0.0  # squares of a chessboard decode with it
+    parameters.errorCorrectionRate = 0.0  # squares of a chessboard decode with this dictionary
     books = [aruco_dictionary(name) for name in dictionaries]
     detector = cv2.aruco.ArucoDetector(books, parameters)
     _, ids, _, which = detector.detectMarkersMultiDict(image)
@@ -117,19 +119,20 @@ def _marker_ids(
 
 
 def _smallest(family: str, largest_id: int) -> str:
-    """The smallest dictionary of a family that holds the number; they begin alike."""
+    """Return the smallest dictionary of a family that contains this id; all of them begin with the
+    same markers."""
     if not family.endswith(f"_{_SIZES[-1]}"):
         return family
     return next(f"{_stem(family)}_{n}" for n in _SIZES if n > largest_id)
 
 
 def _stem(dictionary: str) -> str:
-    """A dictionary's name without its size, as in ``DICT_4X4``."""
+    """Return a dictionary's name without its size, as in ``DICT_4X4``."""
     return dictionary.rpartition("_")[0]
 
 
 def _layouts(named: Board, markers: int) -> list[Board]:
-    """The boards of squares with so many markers."""
+    """Return the boards of squares with that many markers."""
     sizes = [
         (columns, rows)
         for columns in range(3, markers)
@@ -144,8 +147,8 @@ def _layouts(named: Board, markers: int) -> list[Board]:
 
 
 def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
-    """The first of the boards that has most corners in the picture, in either layout; None if none
-    has enough."""
+    """Return the board with the most corners in the picture in either layout, the first of several;
+    None if none has enough."""
     best, most = None, MIN_MARKER_CORNERS - 1
     for board in boards:
         for legacy in {board.legacy, board.has_two_layouts}:

@@ -1,8 +1,9 @@
-"""The report of a calibration: what the views cover, how well the lens follows them, what to add.
+"""The report of a calibration: what the views cover, how well the camera model fits them, and what
+to add.
 
 A residual is the found corner minus the corner that the camera model predicts. Residuals that point
-at random come from noise in the pictures. Neighbours that point the same way, in many views, come
-from a lens that the model does not follow, or from a board that is not flat.
+at random come from noise in the pictures. Neighbouring residuals that point the same way in many
+views mean that the model does not describe the lens, or that the board is not flat.
 """
 
 from __future__ import annotations
@@ -30,17 +31,18 @@ from perchctl.target import Board
 
 _VERDICT_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
 _LONG_SHARE = 0.04
-"""Length of a long residual as drawn, in picture widths. Larger: neighbours cross. Smaller: their
-directions cannot be seen."""
+"""Length at which a long residual is drawn, in picture widths. Larger: neighbours cross. Smaller:
+their directions cannot be seen."""
 _LONG_PERCENTILE = 95.0
-"""Of the residuals' lengths: the length that counts as long. Larger: a few outliers shrink the
-others. Smaller: the longest leave the picture."""
+"""Percentile of the residuals' lengths that counts as a long residual. Larger: a few outliers
+shrink the others. Smaller: the longest ones leave the picture."""
 _LEAST_RESIDUAL_PX = 1e-3
-"""Residuals below this are drawn as if they were so long: exact corners have none."""
+"""Length as which shorter residuals are drawn, px: exact corners have none."""
 _LEAST_STEPS = 2
-"""The distance axis has so many steps or up to 2.5 times as many. Larger: labels overlap."""
+"""Least number of steps of the distance axis, which has up to 2.5 times as many. Larger: labels
+overlap."""
 _STEPS = (1.0, 2.0, 5.0)
-"""Leading digits of the enlargement, the length of the key and the steps of an axis."""
+"""Leading digits of the enlargement, of the key's length and of an axis's steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,8 @@ class CalibrationReport:
 
     @property
     def rejections(self) -> list[Rejection]:
-        """The views and pictures that were not used, with the reasons; without single corners."""
+        """The views and pictures that were not used, with the reasons. Single corners are not
+        included."""
         whole = [r for r in self.result.rejections if not r.corner_ids]
         return [*whole, *self.result.without_board]
 
@@ -165,14 +168,14 @@ class CalibrationReport:
 
     @cached_property
     def enlargement(self) -> float:
-        """How many times longer than they are residuals are drawn."""
+        """Factor by which residuals are enlarged in the drawing."""
         lengths_px = np.linalg.norm(np.concatenate(self.result.fit.residuals), axis=1)
         long_px = max(float(np.percentile(lengths_px, _LONG_PERCENTILE)), _LEAST_RESIDUAL_PX)
         return round_down(_LONG_SHARE * self.result.camera.size_px[0] / long_px)
 
     @property
     def key_px(self) -> float:
-        """A round residual, drawn as the key: about as long as a long one."""
+        """A round residual that is drawn as the key, about as long as a long one."""
         return round_down(_LONG_SHARE * self.result.camera.size_px[0] / self.enlargement)
 
     @property
@@ -234,7 +237,7 @@ def _reported_view(
 ) -> ReportedView:
     R = np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=np.float64)
     middle_m = R @ view.corners_m.mean(axis=0) + pose[3:]
-    normal = -R[:, 2] if R[2, 2] > 0 else R[:, 2]  # towards the camera
+    normal = -R[:, 2] if R[2, 2] > 0 else R[:, 2]  # its z points towards the camera
     hull = cv2.convexHull(view.corners_px.astype(np.float32))
     sideways = float(np.linalg.norm(normal[:2]))
     return ReportedView(

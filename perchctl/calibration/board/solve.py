@@ -1,5 +1,5 @@
-"""From views of a board to a camera with its verdict, and whether they are enough; if not, what to
-add."""
+"""Solve for the camera from the views of a board, judge the result, and say what to add if the
+views are not enough."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TITLES: dict[Level, str] = {
 }
 CARE_FACTOR = 3.0
 ASIDE_FACTOR = 2.0
-_EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
+_EASIER = 0.95  # largest share of the simpler model's spread that a richer model may leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Calibration:
         errors: predicted position error of the target, by distance.
         covered_cells: mask (rows, columns) of the picture's grid cells that boards covered.
         defects: sentences on the views' defects, with remedies; any rules out the best verdict.
-        frames: of a video or camera, what became of its frames; None for pictures.
+        frames: the results of a video's or camera's frames; None for pictures.
     """
 
     board: str
@@ -81,8 +81,8 @@ class Calibration:
 
     @property
     def verdict(self) -> Level:
-        """Verdict by defects and by the predicted error straight ahead, where perching happens; off
-        axis twice the limit is accepted."""
+        """The verdict, from the defects and the predicted error straight ahead, where perching
+        happens. Off the axis, twice the limit is accepted."""
         ahead = max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.defects:
@@ -186,7 +186,7 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
     models = MODEL_NAMES if model == "auto" else (model,)
     fit, kept, rejections = robust_fit(found.views, models)
     _check_count(kept, found)
-    # Tilt and coverage first: their messages name best what to add.
+    # First tilt and coverage: their messages say best what to add.
     covered = covered_cells(kept)
     _check_variety(fit, covered)
     covariance = lens_covariance(kept, fit)
@@ -208,11 +208,11 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
 def robust_fit(
     views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """Fit the views without outliers, with the simplest of `models` that describes the lens (an
-    unfit model would reject views at the picture's rim). Return the fit, the views used, and the
-    rejected views and corners.
+    """Fit the views without outliers, with the simplest of the `models` that describes the lens. (A
+    model that does not fit would reject views at the edge of the picture.) Return the fit, the
+    views used, and the rejected views and corners.
 
-    Raises InvalidValue: the views fit no camera.
+    Raises InvalidValue if the views fit no camera.
     """
     best: CameraFit | None = None
     for model in models:
@@ -243,7 +243,7 @@ def _is_usable(camera: CameraModel) -> bool:
     return bool(np.abs(again - pixels).max() < 0.05)
 
 
-# --- Whether there is enough to calibrate from; if not, what to add ---
+# --- Whether the views are enough for a calibration and, if not, what to add ---
 
 
 MIN_VIEWS, GOOD_VIEWS = 5, 10

@@ -1,2 +1,2 @@
-"""How the camera is turned in the vehicle, how late its pictures are, and where the gear's tip is:
-measured from a vehicle that is moved by hand in view of the target."""
+"""Measure the camera's rotation in the vehicle, the latency of its pictures, and the position of
+the gear's tip, with a vehicle that is moved by hand in view of the target."""

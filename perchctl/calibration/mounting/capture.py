@@ -1,4 +1,4 @@
-"""Recording a vehicle that is moved by hand, with guidance on what is still missing."""
+"""Record a vehicle that is moved by hand, with advice on the motions that are still missing."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame
 
 LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
-"""For which a part is recorded, also where no turn is missing any more."""
+"""Least duration of each part's recording, s, even if no motion is missing any more."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5
-"""Attitudes older than this when a part begins belong to no picture of it."""
+"""Age at the beginning of a part above which an attitude belongs to none of its pictures, s."""
 MIRRORED_PICTURES = 60
-"""After so many mirrored pictures, and no other, the recording ends."""
+"""Number of mirrored pictures, with no others, after which the recording ends."""
 SHARE_OVER = 60
-"""Number of the newest pictures whose share with a target is shown."""
+"""Number of newest pictures over which the displayed share with a target is computed."""
 LEAST_TARGET_SHARE = 0.3
 
 
@@ -65,7 +65,7 @@ def record_mounting(
             continue
         poses = reader.read_poses(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
-        if frame.repeated and not reader.trouble:  # no picture without a target: no picture
+        if frame.repeated and not reader.trouble:  # a picture without a target counts as no picture
             continue
         recording.poses += poses
         recording.mirrored_pictures = reader.mirrored
@@ -86,7 +86,7 @@ class _Progress:
 
     @property
     def over(self) -> bool:
-        """True when no motion is missing, or too much time has gone."""
+        """True if no motion is missing, or if too much time has passed."""
         enough = not self._missing and self._seconds >= self._least_s
         return enough or self._seconds >= MOST_S
 

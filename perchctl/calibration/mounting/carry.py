@@ -1,10 +1,9 @@
-"""The carry: the camera's turn and latency, from the rotations of vehicle and target.
+"""The carry: find the camera's rotation and latency from the rotations of vehicle and target.
 
-One rotation chain holds at each picture's exposure:
-``R_cam_target = R_body_cam^T R_world_body(t - latency)^T R_world_target``. The gyroscope's rates,
-integrated, give R_world_body; its world is the body at the first sample. What is solved for
-together: the camera's turn, the target's, the latency, the gyroscope's constant error and scale,
-and a random walk of the integrated rotation.
+One rotation chain holds at each picture's exposure: ``R_cam_target = R_body_cam^T R_world_body(t -
+latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body, in the world that
+is the body frame at the first sample. The solution contains the rotations of camera and target, the
+latency, the bias and scale error of the gyroscope, and a random walk of the integrated rotation.
 """
 
 from __future__ import annotations
@@ -31,12 +30,13 @@ from perchctl.geometry import Array, rpy_from_rotation
 MOST_TURN_SIGMA_DEG = 0.5
 MOST_LATENCY_SIGMA_S = 0.01
 MOST_MISFIT_RAD = math.radians(3.0)
-BIAS_SIGMA_RADPS = math.radians(3.0)  # of a BMI088 that nobody has calibrated
+BIAS_SIGMA_RADPS = math.radians(3.0)  # bias of an uncalibrated BMI088
 SCALE_SIGMA = 0.005
 KNOT_S = 2.0
 GYRO_WALK_RAD = math.radians(0.03)
-"""Of the integrated rotation in the first second; grows as its root."""
-FLOOR_RAD = math.radians(0.02)  # of a pose: lens, print and paper
+"""Random walk of the integrated rotation in the first second, rad; it grows with the square root of
+time."""
+FLOOR_RAD = math.radians(0.02)  # least error of a pose: lens, print and paper
 _CARRY_ITERATIONS = 15
 
 TURN, TARGET, BIAS, SCALE = (slice(3 * k, 3 * k + 3) for k in range(4))
@@ -78,8 +78,8 @@ class RotationSolution:
 def solve_rotation(recording: MountingRecording) -> RotationSolution:
     """Solve for the camera's rotation in the body and its latency.
 
-    Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
-    agree; the error has advice.
+    Raises InvalidValue, with advice, for too little motion or a mirrored picture, or if vehicle and
+    camera do not agree.
     """
     check_recording(recording, "carry")
     t_s, first = np.unique([a.t_s for a in recording.attitudes], return_index=True)
@@ -136,7 +136,7 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """The target's turn in the world, the middle one of all pictures'."""
+    """Return the target's rotation in the world, the middle one of all pictures."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam
@@ -216,7 +216,7 @@ def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Arra
 
 
 def _integral(values: Array, dt: Array) -> Array:
-    """The integral (n, 3, 3) from the first sample on, by trapezia."""
+    """Return the integral (n, 3, 3) from the first sample on, by the trapezoid rule."""
     steps = 0.5 * dt[:, :, None] * (values[1:] + values[:-1])
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
@@ -253,14 +253,14 @@ def _vectors(R: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
-# --- Turn of the camera and latency from nothing ---
-# Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
-# ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
-# that fits best follows in closed form; the latency with the least misfit wins.
+# --- The camera's rotation and latency without an initial guess ---
+# Between two pictures, the camera rotates by the same rotation as the body, expressed in its own
+# axes: ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid, the best
+# R_body_cam follows in closed form; the latency with the smallest misfit is used.
 
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
-"""Impossible ones included, so that a wrong clock is named."""
+"""Latencies of the grid, s. It contains impossible ones, so that a wrong clock is recognised."""
 _SPAN_S = (0.2, 0.5)
 _MOST_PAIRS = 400
 _FIT_ROUNDS = 3
@@ -268,8 +268,8 @@ _HALF_COUNTED_RAD = 0.02
 
 
 def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
-    """A first estimate of R_body_cam and of the latency in s. Raises InvalidValue without
-    pairs of pictures some tenths of a second apart."""
+    """Return a first estimate of R_body_cam and of the latency in s. Raises InvalidValue if no two
+    pictures are some tenths of a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         raise InvalidValue(
@@ -306,10 +306,11 @@ def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
     return R, float((miss * weight).mean())
 
 
-# --- Robust least squares of misfits (n, 3), and what it leaves uncertain ---
-# A pose's own covariance is taken as true up to a factor, and a pose whose timestamp is off errs
-# along the vehicle's rotation, by the rate times the jitter. Both are found from the misfits, which
-# are counted as Student's t with few degrees of freedom, so that wrong poses do not bend them.
+# --- Robust least squares of misfits (n, 3), and the remaining uncertainty ---
+# The covariance of a pose is assumed to be correct up to a factor. A wrong timestamp adds an error
+# along the vehicle's rotation: the rate times the jitter. Factor and jitter are both estimated from
+# the misfits, which are treated as Student's t with few degrees of freedom, so that wrong poses
+# have little influence.
 
 
 FREEDOM = 5.0
@@ -338,13 +339,13 @@ class PoseResiduals:
 
     @property
     def rejected_share(self) -> float:
-        """Share of the poses whose robust weight is nearly 0."""
+        """Return the share of the poses whose robust weight is nearly 0."""
         return float((self.robust_weights < _COUNTS_LITTLE).mean())
 
     def normal_equations(
         self, poses: slice | NDArray[np.intp] = slice(None)
     ) -> tuple[Array, Array]:
-        """Return information (p, p) and gradient (p,) of the poses with the indices `poses`."""
+        """Return the information (p, p) and gradient (p,) of the poses with the indices `poses`."""
         p = self.jacobian.shape[2]
         jacobian = self.jacobian[poses]
         weights = self.robust_weights[poses, None, None]
@@ -366,8 +367,8 @@ class PoseResiduals:
         )
 
     def parameter_covariance(self) -> Array:
-        """The parameters' covariance (p, p), by a block jackknife, as errors of consecutive
-        pictures may correlate."""
+        """Return the parameters' covariance (p, p) by a block jackknife, since errors of successive
+        pictures may be correlated."""
         blocks = [
             self.normal_equations(k)
             for k in np.array_split(np.arange(len(self.misfit)), JACKKNIFE_BLOCKS)
@@ -414,7 +415,7 @@ def _weights(distance2: Array) -> Array:
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """The curvature and information factors of robust weights for `jackknife_covariance`."""
+    """Return the curvature and information factors of robust weights for `jackknife_covariance`."""
     w = _weights(distance2)
     curved = float((w * (1.0 - 2.0 * distance2 / (3 * (FREEDOM + distance2)))).mean())
     pushed = float((w**2 * distance2).mean()) / 3

@@ -1,8 +1,10 @@
-"""The pivot: the gear's tip stands on one point while the vehicle is tilted around it.
+"""The pivot: find the position of the gear's tip, which stands on one point while the vehicle is
+tilted around it.
 
-The point c in the target's frame and the tip in the camera's hold for every picture:
-``tip = R_cam_target c + p_cam_target``. Both are found by linear least squares, each picture by
-its own covariance, and wrong ones count little. No attitude and no time is needed.
+The point c in the target's frame and the tip in the camera's frame are the same in every picture:
+``tip = R_cam_target c + p_cam_target``. Both are found by linear least squares, in which each
+picture is weighted by its own covariance and outliers count little. Neither the vehicle's attitude
+nor the times of the pictures are needed.
 """
 
 from __future__ import annotations
@@ -24,11 +26,12 @@ from perchctl.geometry import Array
 
 MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
-"""Of the misfit; of a tip that stays where it is a jump explains 4 % at most."""
-TIP_SIGMA_FLOOR_M = 5e-5  # of the tip on its point
-_PIVOT_ITERATIONS = 12  # of the least squares for the tip; more take longer
-_SPLITS = 19  # moments at which a jump of the tip is tried; fewer miss its moment
-_SLIP_ITERATIONS = 4  # of the least squares for each of them; more take longer
+"""Size of a jump, m, and the share of the misfit that it must explain to count as a slip. If the
+tip stays in place, a jump explains 4 % at most."""
+TIP_SIGMA_FLOOR_M = 5e-5  # standard deviation of the tip on its point
+_PIVOT_ITERATIONS = 12  # iterations of the least squares for the tip; more: takes longer
+_SPLITS = 19  # moments at which a jump of the tip is tried; fewer: its moment may be missed
+_SLIP_ITERATIONS = 4  # iterations of the least squares for each moment; more: takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         size_sigma: relative sigma of the printed sizes (`target.size_sigma`), which scale all
             distances.
 
-    Raises InvalidValue: too few or too equal tilts, a tip that slipped, a mirrored picture.
+    Raises InvalidValue for too few or too similar tilts, a tip that slipped, or a mirrored picture.
     """
     check_recording(recording, "pivot")
     poses = pose_arrays(recording)
@@ -89,7 +92,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
 
 
 def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
-    """The covariance (n, 3, 3) of what each pose's error does to the tip."""
+    """Return the covariance (n, 3, 3) of the tip that each pose's error causes."""
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
@@ -99,8 +102,8 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
 def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
     """Raises InvalidValue if the tip jumped from one point to another at some moment.
 
-    For moments all over the recording, each with a point before and one after: that with the
-    least misfit, counted robustly.
+    Each of several moments throughout the recording is tried with one point before and another
+    point after it. The moment with the smallest robust misfit is used.
     """
     n, alone = len(rows.misfit), _size(rows)
     explains, moved_m, at_s = 0.0, 0.0, 0.0
@@ -126,5 +129,5 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
 
 
 def _size(rows: PoseResiduals) -> float:
-    """The size of all misfits together; single wrong ones add little."""
+    """Return the total size of all misfits, to which single outliers add little."""
     return float(np.log1p(rows.chi2 / 3.0).mean())

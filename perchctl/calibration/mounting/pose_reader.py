@@ -1,4 +1,5 @@
-"""A stream's pictures through the pipeline, as far as the mounting is measured by them."""
+"""Read the target's poses from the pictures of a stream, as far as measuring the mounting needs
+them."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ class PoseReader:
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
-        # A pipeline that knows nothing of how the camera is mounted.
+        # This pipeline knows nothing about the camera's mounting.
         bare = make_camera_only_profile(profile).model_copy(update={"pose": profile.pose})
         self._perception = Perception(make_pipeline(bare, camera), bare)
         self._live = live
@@ -39,7 +40,8 @@ class PoseReader:
         self.trouble = ""
 
     def read_poses(self, frame: Frame) -> list[TargetPose]:
-        """The target's poses in a frame: at most one, or one in each field if interlaced."""
+        """Return the target's poses in a frame: at most one, or one per field of an interlaced
+        frame."""
         judged = self._perception.health.assess(frame, self._live)
         if judged == "repeated":
             return []

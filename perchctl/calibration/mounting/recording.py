@@ -1,7 +1,7 @@
-"""Poses and attitudes of a vehicle that is moved by hand, the motion that they need, and their file
-of JSON lines.
+"""Recordings of poses and attitudes of a vehicle that is moved by hand: the motion that they need,
+and their file of JSON lines.
 
-Each part begins with a line ``{"part": "carry", ...}``; one line a sample follows, first all
+Each part begins with a line ``{"part": "carry", ...}``. One line per sample follows, first all
 attitudes, then all poses. A file holds one part or both.
 """
 
@@ -69,7 +69,7 @@ class MountingRecording:
 
     @staticmethod
     def write(path: Path, recordings: Sequence[MountingRecording]) -> None:
-        """Write the recordings into one file atomically. Raises InvalidValue if it cannot be
+        """Write the recordings to one file atomically. Raises InvalidValue if it cannot be
         written."""
         records: list[dict[str, Any]] = []
         for recording in recordings:
@@ -154,7 +154,7 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
     )
 
 
-# --- The motion that a recording needs, named while it is recorded and before it is solved ---
+# --- The motion that a recording needs, checked during the recording and before the solution ---
 
 
 HOW_TO_RECORD: dict[MountingPart, str] = {
@@ -170,7 +170,8 @@ LEAST_POSES: dict[MountingPart, int] = {"carry": 150, "pivot": 100}
 LEAST_ATTITUDES = 500
 TILT_DEG: dict[MountingPart, float] = {"carry": 30.0, "pivot": 25.0}
 YAW_DEG, LEAST_RATE_DPS = 90.0, 15.0
-"""From one side to the other, while the target is seen; of a carry."""
+"""Range of the rotation about the vertical from one side to the other with the target in view, and
+its least rate; only for a carry."""
 MOST_LATE_S = 1.0
 
 
@@ -223,7 +224,7 @@ def missing_motion(recording: MountingRecording) -> list[str]:
             lacking.append(f"turn faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
         if len(attitudes) < LEAST_ATTITUDES:
             lacking.append(f"telemetry: {len(attitudes)} of {LEAST_ATTITUDES} samples")
-    seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # in which the target is seen
+    seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # time in which the target is seen
     if seen_s < LEAST_SEEN_S[part] or len(poses) < LEAST_POSES[part]:
         lacking.append(f"continue: {seen_s:.0f} of {LEAST_SEEN_S[part]:.0f} s in view")
     return lacking

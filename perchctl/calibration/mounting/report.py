@@ -1,4 +1,5 @@
-"""A measured mounting against the profile's: as text, JSON record and profile keys."""
+"""Compare a measured mounting with the profile's: as text, as a JSON record, and as profile
+keys."""
 
 from __future__ import annotations
 
@@ -131,7 +132,7 @@ def _rounded(values: Any, decimals: int) -> tuple[float, ...]:
 def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
     """Solve for the mounting from the recorded parts.
 
-    Raises InvalidValue, with advice: a recording is too short or inconsistent.
+    Raises InvalidValue, with advice, if a recording is too short or inconsistent.
     """
     by_part = {recording.part: recording for recording in recordings}
     carry = by_part.get("carry")
