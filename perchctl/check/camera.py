@@ -1,6 +1,6 @@
-"""The camera and the target in it: rows from a rehearsal on its pictures. Pure.
+"""Rows on the camera and the target in its pictures, from a rehearsal. Pure.
 
-Where the target is the positioning system, one more row says whether it is in view.
+If the target is the positioning system, one more row says whether it is in view.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ from perchctl.target import overhead_text
 from perchctl.vision import CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
-"""An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""
+"""Picture rates below which the check warns and fails, Hz. An AI-deck's program gives 8 as it is
+delivered, and a simulated vehicle perches with 7."""
 GAP_WARN = 0.4
-"""Of `safety.camera_hold_s`."""
+"""Longest gap between pictures before the check warns, as a share of `safety.camera_hold_s`."""
 SEEN_WARN = 0.5
-"""Of the pictures."""
+"""Share of the pictures that must show the target, below which the check warns."""
 LEAST_RATED = 10
-"""Pictures; of fewer no rate is known."""
+"""Number of pictures below which no rate can be computed."""
 _AGAIN = {
     "camera": "plug the receiver or camera in again",
     "aideck": "switch the Crazyflie off and on again",
@@ -56,7 +57,7 @@ _RESTART, _NETWORK = (
     "switch the camera off and on again",
     "check the network between this computer and the camera",
 )
-"""For sources of any other kind."""
+"""Advice for sources of any other kind."""
 _LIGHT = "add light, lengthen the exposure, or take off the lens cap"
 _ADVICE = {
     "frozen": _RESTART,
@@ -67,7 +68,7 @@ _ADVICE = {
 
 
 def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list[Row]:
-    """The rows of a camera `source` that fails: the first failed, the others skipped."""
+    """Return the rows of a camera `source` that fails: the first one failed, the others skipped."""
     advice = error.advice or "see docs/check.md"
     if not error.advice and source.startswith("camera:"):
         advice += "; perchctl check --cameras lists the cameras"
@@ -76,7 +77,7 @@ def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
-    """Judge the pictures' size (None: unknown) against the calibration's."""
+    """Compare the size of the pictures (None: unknown) with the calibration's."""
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
@@ -202,11 +203,12 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 }
 
 
-# --- Where the target is the positioning system ---
+# --- If the target is the positioning system ---
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
+    """Judge the view from where the vehicle stands and on its way up. The row fails if `fly` would
+    refuse the flight."""
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
@@ -220,7 +222,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
-    # The world of a level vehicle that stands at the origin, its front along x.
+    # The world of a level vehicle that stands at the origin and faces along x.
     gear_m = np.asarray(profile.vehicle.gear_body_m)
     place = Place(np.array(feet) + rehearsal.target.e_m + gear_m, rehearsal.target.e_yaw_rad)
     problem = view_problem(place, feet, 0.0, profile, camera)
@@ -237,11 +239,11 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
     return (*PICTURES, *([IN_VIEW] if profile.positioning.source.is_target else ()))
 
 
-# --- The computer that looks at the pictures ---
+# --- The computer that processes the pictures ---
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by its processing time for a picture and by late ticks; None: skipped."""
+    """Judge the loop by its processing time per picture and by late ticks; None: skipped."""
     if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

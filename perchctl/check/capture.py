@@ -1,12 +1,14 @@
-"""The motion capture that gives a vehicle its position: answers, body, rate, noise, axes. Pure.
+"""Rows on the motion capture that gives a vehicle its position: answer, body, rate, noise and axes.
+Pure.
 
-With R_own and R_seen the attitudes that vehicle and capture have of it, and A the capture's world,
-B the rigid body's axes, where they should be none:
+Let R_own be the vehicle's attitude by its own estimate, and R_seen by the capture. Let A be the
+rotation of the capture's world, and B that of the rigid body's axes; both should be the identity:
 
     R_seen = A R_own B
 
-A turn between two moments is ``A w`` in the capture's world where the vehicle has ``w``, and
-``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors.
+A rotation between two moments that the vehicle measures as ``w`` in its world is ``A w`` in the
+capture's world. One that it measures as ``v`` in its own axes is ``B^T v`` in those of the rigid
+body. A and B are therefore two rotations between sets of vectors.
 """
 
 from __future__ import annotations
@@ -48,12 +50,14 @@ from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
 CAPTURE_S = 3.0
-"""In less a body that wanders off at 0.05 m/s does not show."""
+"""Time for which the capture is watched, s. In less time, a body that drifts at 0.05 m/s does not
+show."""
 CAPTURE_POLL_S = 0.005
 NOISE_FAIL = 4.0
-"""Times `positioning.position_sigma_m`: so much more than the vehicle takes it for."""
+"""Noise above which the row fails, in units of the `positioning.position_sigma_m` that the vehicle
+assumes."""
 WILD_M = 0.1
-"""No capture is so noisy."""
+"""Spread above any capture's noise, m: the body moves."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,7 @@ def collect_samples(
     began_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
-    source.poll(began_s)  # what came before is old
+    source.poll(began_s)  # discards older samples
     take_telemetry()
     while (now_s := clock()) - began_s < duration_s:
         telemetry.extend(take_telemetry())
@@ -175,7 +179,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
 
 
 def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
-    """Judge the place by the criteria of `fly`."""
+    """Judge the position by the criteria of `fly`."""
     newest = samples.telemetry[-1] if samples.telemetry else None
     place = places[-1].to_external(attitude=True)
     if newest is None:
@@ -193,34 +197,39 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
     return passed(f"x {x:.2f}, y {y:.2f}, z {z:.2f} m")
 
 
-# --- In a hand ---
+# --- Moved by hand ---
 
 HOW_TO_TURN = (
     "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and sideways, and put it back"
 )
 POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
-"""Turns between two moments: smaller ones are noise, larger ones have no certain axis."""
+"""Range of rotations between two moments: smaller ones are noise, and larger ones have no certain
+axis."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 BODY_STILL_RAD = math.radians(4.0)
-"""Turn up to which the capture's body stands still. Larger: a body that moves counts as still."""
+"""Rotation up to which the capture's body counts as still, rad. Larger: a body that moves counts as
+still."""
 BODY_STILL_M = 0.03
-"""The same for its way."""
+"""Displacement up to which the capture's body counts as still, m."""
 MANY_SHARE = 0.9
-"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`."""
+"""Share of the rotations that deviate from one axis by less than `LEAST_STEP_RAD`, above which all
+count as rotations about this axis."""
 WORLD_TILT_DEG = 25.0
-"""Angle between the capture's z and the vertical from which on its world is wrong. Larger: a tilted
-world passes."""
+"""Angle between the capture's z and the vertical above which its world is wrong, deg. Larger: a
+tilted world passes."""
 BODY_WARN_DEG = 5.0
-"""Angle between the axes of rigid body and vehicle from which on there is a warning."""
+"""Angle between the axes of rigid body and vehicle above which the row warns, deg."""
 BODY_FAIL_DEG = 15.0
-"""The same for a failure. Larger: a body that is defined turned passes with a warning."""
+"""Angle above which the row fails, deg. Larger: a body whose axes are rotated passes with a
+warning."""
 LEAST_RISE_M = 0.12
-"""Way from which on a lift shows where up is. Larger: a short lift tells nothing."""
+"""Least displacement of a lift that shows the vertical, m. Larger: a short lift is of no use."""
 HAND_REACH_M = 5.0
-"""A hand lifts no farther: what moved farther is given in another unit."""
+"""Highest lift by hand, m: a body that moved farther is reported in another unit."""
 STRANGER = 0.4
-"""Share of a turn, on the average, that A and B leave unexplained for another body."""
+"""Mean share of a rotation that A and B leave unexplained, above which the capture sees another
+body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,14 +328,14 @@ def solve_alignment(motion: PairedMotion) -> FrameAlignment | None:
 
 
 def _has_many_axes(turns: Array) -> bool:
-    """Turns are vectors (n, 3)."""
-    axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # the largest comes last
+    """Rotations are vectors (n, 3)."""
+    axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # the largest eigenvalue comes last
     aside_rad = np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1)
     return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
 
 
 def _turned_rad(attitudes: Rotation) -> Array:
-    """Each attitude's turn from the first, (n,)."""
+    """Each attitude's rotation from the first one, (n,)."""
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
@@ -364,8 +373,8 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
 
 
 def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
-    """The way (3,) from the first place to the one farthest along the capture's vertical,
-    or, where that is too near for a lift, to the farthest of all."""
+    """Return the displacement (3,) from the first position to the one that is farthest along the
+    capture's vertical or, if that is too close for a lift, to the farthest of all."""
     displacements_m = motion.displacements_m
     risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
     if float(np.linalg.norm(risen_m)) < LEAST_RISE_M:
@@ -374,8 +383,8 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
-    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
-    places may be in other axes than its attitudes."""
+    """Return what is wrong with the capture's world: it is tilted, mirrored, or has its axes
+    swapped. Its positions may have other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
         found, axis = (
@@ -422,7 +431,7 @@ def _body_finding(
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
-# --- What the hand found, written down for `fly` ---
+# --- The result of the comparison by hand, saved for `fly` ---
 
 COMPARED = "compared"
 

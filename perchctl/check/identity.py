@@ -1,5 +1,5 @@
-"""Whether vehicle, motion-capture body and camera are those of one home: rows of one vehicle of
-several, on the floor.
+"""Check that vehicle, motion-capture body and camera belong to the same home: rows on one of
+several vehicles on the floor.
 
 ```
 vehicle  its LEDs blink, and somebody sees them blink at this home
@@ -7,9 +7,9 @@ body     the motion capture sees its rigid body at this home
 target   its camera sees its target where it must be from this home
 ```
 
-Each is compared with the home, so that no two of them can be another vehicle's. What if another
-vehicle's camera would show the same, or the target is not in view? Then somebody covers the lens,
-and the camera is proven by a picture that goes blind. Nothing is armed, and no motor turns.
+Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
+camera would show the same, or if the target is not in view, perchctl asks somebody to cover the
+lens: a picture that goes blind identifies the camera. Nothing is armed, and no motor turns.
 """
 
 from __future__ import annotations
@@ -38,16 +38,17 @@ from perchctl.vehicle import DISARM_IT, FLYING, Telemetry
 from perchctl.vision import CameraModel, make_pipeline
 
 BODY_AT_HOME_M = 0.25
-"""A body within this distance of a home stands there: half the least distance between a home and
-another vehicle's corridor. Larger: neighbours that have changed places may pass. Smaller: homes
+"""Distance from a home within which a body stands there, m: half the least distance between a home
+and another vehicle's corridor. Larger: neighbours that have swapped places may pass. Smaller: homes
 measured by tape fail."""
 DARK_SHARE = 0.5
-"""Share of dark or blank pictures from which on a camera sees nothing. Larger: a hand that does not
-cover the whole lens does not count. Smaller: a camera with a bad signal counts as covered."""
+"""Share of dark or blank pictures above which a camera counts as covered. Larger: a hand that does
+not cover the whole lens is not recognised. Smaller: a camera with a bad signal counts as
+covered."""
 _DARK = ("dark", "uniform")
 
 Ask = Callable[[str], bool]
-"""Asks somebody a question; True for yes."""
+"""Asks a person a question; True for yes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +75,9 @@ class Stand:
 
 def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask) -> Iterator[Row]:
     """Yield a vehicle's rows as they are known: address, vehicle, body (with motion capture),
-    camera and target. A row that fails has proven nothing. The errors of `perchctl.check.check`.
+    camera and target. A failed row proves nothing. Errors: those of `perchctl.check.check`.
 
-    A simulated vehicle has its simulator and camera to itself: nobody is asked.
+    A simulated vehicle has its own simulator and camera, so nobody is asked.
     """
     calibrated = profile_camera(options.profile.camera)
     with contextlib.ExitStack() as stack:
@@ -173,12 +174,12 @@ def _body_finding(
     return failed(found, "put each vehicle at its own home, or correct body and home_m")
 
 
-# --- The camera, by the target that it sees ---
+# --- The camera, identified by the target that it sees ---
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What the camera sees while the vehicle counts as standing at its home."""
+    """What the camera sees, assuming that the vehicle stands at its home."""
 
     link: ProbeLink
     source: FrameSource
@@ -188,14 +189,15 @@ class View:
     scope: CheckScope
 
     def rehearse(self, profile: Profile | None = None) -> Rehearsal:
-        """A few seconds of pictures; `profile`: to look for another target."""
+        """Process a few seconds of pictures. With `profile`, look for another target."""
         flown = profile or self.profile
         pipeline = make_pipeline(flown, self.calibrated)
         seconds = self.scope.rehearse_s
         return rehearse(self._telemetry, self.source, pipeline, flown, WallClock(), seconds)
 
     def _telemetry(self) -> list[Telemetry]:
-        """Roll and pitch are the vehicle's; before a flight, its position and yaw need not be."""
+        """Roll and pitch are the vehicle's own. Before a flight, its position and yaw need not be
+        right."""
         place_m = (*self.stand.home_m, self.profile.safety.ground_z_m)
         return [
             replace(
@@ -217,7 +219,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     own = view.rehearse()
     place_m = _target_place(own)
     away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
-    # Single pictures may be within, while the target is not.
+    # Single pictures may be within the limit although the target is not.
     if away_m <= target.expected_within_m:
         found = f"its camera sees its target {away_m:.2f} m from its place"
         if ask is None or not stand.lookalikes:
@@ -240,7 +242,8 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
 
 
 def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:
-    """Whether the camera goes blind as somebody covers the lens of the vehicle at this home."""
+    """Judge whether the camera goes blind while somebody covers the lens of the vehicle at this
+    home."""
     name = view.stand.name
     if _is_dark(before) or not before.pictures:
         return failed(f"{why}, and its pictures are dark", "add light, or see perchctl check")
@@ -259,7 +262,7 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
 
 
 def _target_place(rehearsal: Rehearsal) -> Point | None:
-    """Where the target was measured; None if it was not."""
+    """Return where the target was measured; None if it was not."""
     places = [place_m[:2] for _, place_m in rehearsal.target_places]
     if not places:
         return None
@@ -273,7 +276,7 @@ def _is_dark(rehearsal: Rehearsal) -> bool:
 
 
 def _nearest(place_m: Point, places: Mapping[str, Point], within_m: float) -> str | None:
-    """The name of the place that is nearest and within `within_m`."""
+    """Return the name of the nearest place within `within_m`."""
     near = {name: math.dist(place_m, other_m) for name, other_m in places.items()}
     name = min(near, key=near.__getitem__, default=None)
     return name if name is not None and near[name] <= within_m else None

@@ -1,4 +1,4 @@
-"""What a profile shows about a flight before anything is opened: the check's rows of it."""
+"""Rows on a profile and the computer's disk, which need no connection."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
 
 LOOKS_UP = math.cos(math.radians(45.0))
-"""Of the view's upward part: with less the camera does not look at the ceiling."""
+"""Vertical component of the view's direction below which the camera does not look at the
+ceiling."""
 
 
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
@@ -57,7 +58,7 @@ def offline_rows(options: FlyOptions) -> list[Row]:
 
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
-    """A sentence for each offline row that warns.
+    """Return a sentence for each offline row that warns.
 
     Errors: SafetyAbort for the first row that fails; InvalidValue, NotFound (calibration file);
     InvalidValue (log folder).
@@ -116,7 +117,7 @@ def _camera_turn(plan: _Plan) -> Finding:
 
 
 def _standoff(plan: _Plan) -> Finding:
-    """Settled counts only what shows the small marker."""
+    """`settled` counts only pictures with the small marker."""
     standoff_m = plan.profile.planner.ascend.standoff_m
     shown = f"at {mm_text(standoff_m)} mm below the target the small marker is"
     if sees_small_marker(plan.camera, plan.profile, standoff_m):
@@ -146,7 +147,7 @@ def _limits(name: str, profile: Profile) -> Finding:
     return warned(sentences, f"change {' or '.join(keys)}")
 
 
-# --- Where the target is the positioning system ---
+# --- If the target is the positioning system ---
 
 
 def _latency(plan: _Plan) -> Finding:
@@ -164,7 +165,8 @@ def _latency(plan: _Plan) -> Finding:
 
 
 def log_finding(folder: Path) -> Finding:
-    """Judge the folder's free space, and whether it is writable, without creating it."""
+    """Judge the free space of the folder's disk, and whether the folder is writable, without
+    creating it."""
     whole = folder.absolute()
     try:
         check_writable(folder / "flight.jsonl", force=True)

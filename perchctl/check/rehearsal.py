@@ -1,6 +1,7 @@
-"""The flight loop's senses on live pictures for a few seconds: what they see, how long it takes.
+"""Run the flight loop's perception on live pictures for a few seconds, to find out what it sees and
+how long it takes.
 
-The vehicle stays as it is: a rehearsal has only the telemetry of a link, and can send nothing.
+A rehearsal cannot send anything to the vehicle: it has only the telemetry of its link.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from perchctl.vision import (
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
-"""The first frames load libraries: how long they took says nothing."""
+"""Number of first frames that are not timed, because libraries are loaded meanwhile."""
 KEPT_FRAMES = 12
 TRACK_SETTLES_S = 0.5
 
 TakeTelemetry = Callable[[], list[Telemetry]]
-"""Gives what came since the last time."""
+"""Returns the samples that arrived since the last call."""
 
 
 @dataclass(frozen=True)
 class PictureProblem:
-    """What is wrong with a picture. `kind`: what `FrameHealth` calls it, or ``mirrored``; None for
-    any other problem."""
+    """A problem of a picture. `kind` is its name in `FrameHealth`, or ``mirrored``; None for any
+    other problem."""
 
     text: str
     kind: str | None = None
@@ -86,14 +87,15 @@ class Rehearsal:
 
     @property
     def target_moved_m(self) -> float:
-        """How far the target has moved by the sights, once its track had settled; 0 if unknown."""
+        """Distance by which the target has moved according to the detections since its track
+        settled; 0 if unknown."""
         places = self.target_places
         settled_m = [m for t_s, m in places if t_s - places[0][0] >= TRACK_SETTLES_S]
         return float(np.linalg.norm(settled_m[-1] - settled_m[0])) if settled_m else 0.0
 
     @property
     def frame_period_s(self) -> float | None:
-        """Mean time between pictures; None for fewer than two, or for a recording."""
+        """Mean time between pictures; None for fewer than two pictures, or for a recording."""
         if not self.live or len(self.arrivals) < 2:
             return None
         (first, begin_s), (last, end_s) = self.arrivals[0], self.arrivals[-1]
@@ -102,7 +104,7 @@ class Rehearsal:
 
 @dataclass(frozen=True)
 class _TelemetryOnly:
-    """With `feet_m` the vehicle stands there, since without positions its estimate runs away."""
+    """With `feet_m`, the vehicle stands there: without positions, its own estimate runs away."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None
@@ -115,7 +117,7 @@ class _TelemetryOnly:
 
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """A stand-in for the link, whose telemetry for a rehearsal is what `take` returns."""
+    """A stand-in for the link, which passes a rehearsal the telemetry that `take` returns."""
     by_target = profile.positioning.source.is_target
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
@@ -134,7 +136,7 @@ def rehearse(
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """
-    polled: list[Frame] = []  # in this turn: one at most
+    polled: list[Frame] = []  # in this turn; at most one
     telemetry = rehearsal_telemetry(take, profile)
     senses = FlightInputs(telemetry, source, pipeline, profile, on_frame=polled.append)
     done = Rehearsal(source.live)
@@ -151,7 +153,7 @@ def rehearse(
             _note(done, frame, senses, prints, work_s, began_s)
         due_s += period_s
         if due_s < clock.now():
-            due_s = clock.now()  # as the loop: no burst of old turns
+            due_s = clock.now()  # as in the loop, missed turns are not made up for in a burst
         clock.wait_until(due_s)
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""
@@ -200,7 +202,7 @@ def _note(
 def _blur_px(
     newest_outputs: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline
 ) -> float | None:
-    """None where the target was not seen."""
+    """None if the target was not seen."""
     found_px = []
     for frame, output in newest_outputs:
         for name in MARKERS:
@@ -212,5 +214,5 @@ def _blur_px(
             (refined,) = refine_corners_by_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:
                 found_px.append(refined.sharpest_side_blur_px)
-                break  # the large one, where there is one
+                break  # the large marker if it was seen
     return float(np.median(found_px)) if found_px else None

@@ -15,11 +15,11 @@ class Verdict(StrEnum):
 
     PASS = "pass"
     WARN = "warn"
-    """Flies, but worse than it could."""
+    """Can fly, but not as well as it could."""
     FAIL = "fail"
-    """Do not fly like this."""
+    """Must not fly like this."""
     SKIPPED = "skipped"
-    """Could not be known; `found` says why. Never taken for a pass."""
+    """Could not be checked; `found` says why. This never counts as a pass."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Row:
     name: str
     verdict: Verdict
     found: str
-    """What was seen, with units; for a skipped row, why nothing was."""
+    """What was observed, with units; for a skipped row, the reason."""
     advice: str = ""
-    """What to do; empty on a pass."""
+    """What to do; empty if the row passes."""
 
 
 class Finding(NamedTuple):
@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Unanswerable(Exception):
-    """A check could not be made; `finding` is the skipped finding to report."""
+    """Raised if a check cannot be made; `finding` is the skipped finding to report."""
 
     def __init__(self, why: str, advice: str = "") -> None:
         super().__init__(why)
@@ -54,7 +54,7 @@ P = ParamSpec("P")
 
 
 def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
-    """The row with the finding of `judge`, skipped if it raises `Unanswerable`."""
+    """Return the row with the finding of `judge`, skipped if it raises `Unanswerable`."""
     try:
         return Row(name, *judge(*args, **kwargs))
     except Unanswerable as unknown:
@@ -94,7 +94,8 @@ def skipped(why: str, advice: str = "") -> Finding:
 
 
 def problem_finding(problem: Problem | None, found: str) -> Finding:
-    """A failing finding for `problem`, by `fly`'s criteria; if None, a passing finding."""
+    """Return a failing finding for `problem`, by the criteria of `fly`; a passing finding if it is
+    None."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 

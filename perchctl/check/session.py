@@ -1,4 +1,4 @@
-"""The whole check, row by row as they come: vehicle, camera, computer, profile."""
+"""The whole check, which yields each row as it is known: vehicle, camera, computer and profile."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """The rows of `--scan`: the vehicles that answer at the default address and at `uri`
-    (None: only the former). Errors: InvalidValue."""
+    """Return the rows of `--scan`: the vehicles that answer at the default address and at `uri`
+    (None: only at the default one). Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.radio_scan_rows(*find_uris_and_problem(uri or ""))
@@ -87,8 +87,8 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
 def start_if_simulated(
     options: FlyOptions, calibrated: CameraModel, scope: CheckScope, stack: contextlib.ExitStack
 ) -> tuple[str, str, Profile]:
-    """The URI, camera source and profile to connect with: those of the options, or of a simulated
-    vehicle that is started until `stack` closes."""
+    """Return the URI, camera source and profile to connect with: those of the options or, until
+    `stack` closes, those of a simulated vehicle that is started."""
     uri, spec, profile = options.uri, options.source, options.profile
     if options.simulated:
         scope.announce("starting the simulated vehicle")
@@ -103,7 +103,8 @@ def start_if_simulated(
 
 
 MocapOrError = CaptureSource | PerchError | None
-"""An open motion capture, or why it could not be opened; None where decks do it."""
+"""Return an open motion capture, or why it could not be opened; None if decks measure the
+position."""
 
 
 def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:
@@ -114,7 +115,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
     try:
         opened = scope.open_capture(config)
     except UsageError:
-        raise  # a library that does not load is the computer's fault, here as in `fly`
+        raise  # a library that cannot be loaded is a fault of the computer, as in `fly`
     except PerchError as error:
         return error
     stack.callback(opened.close)
@@ -218,7 +219,7 @@ def _camera_rows(
     scope: CheckScope,
     scheme: str,
 ) -> Generator[Row, None, Rehearsal | None]:
-    """Yields the rows; returns the rehearsal, None where there could be none."""
+    """Yield the rows; return the rehearsal, None if there could be none."""
     size = camera.size_finding(source.size_px, pipeline.camera.size_px)
     yield Row("size", *size)
     if size.verdict is not Verdict.PASS:

@@ -1,4 +1,5 @@
-"""The vehicle at the other end of the link: what it answers, holds and reports at rest."""
+"""Rows on the vehicle at the other end of the link: what it answers, contains and reports at
+rest."""
 
 from __future__ import annotations
 
@@ -37,11 +38,12 @@ from perchctl.vehicle import (
 
 LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
-"""At rest, while it is listened to: a flight's estimate drifts by a fifth of it."""
+"""Motion of the estimate at rest above which the check warns, m: a flight's estimate drifts by a
+fifth of it."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "fly sends the positions, and waits for the estimate to agree"
-"""By a motion capture, or by the target."""
+"""With positions from a motion capture or the target."""
 ARMED_BY_FLY = "fly arms it after you confirm"
 UNREPORTED = "link.unreported says that this vehicle reports none"
 
@@ -53,7 +55,7 @@ LINK_ADVICE = {
     "udp": "check the network between this computer and the vehicle",
     "sim": "close other programs: the simulated vehicle runs on this computer",
 }
-"""What helps against lost and slow packets, by the scheme of the vehicle's URI."""
+"""Advice against lost and slow packets, by the scheme of the vehicle's URI."""
 ADDRESS_ADVICE = {
     "radio": "switch it on; perchctl check --scan lists the vehicles that answer",
     "usb": "plug it in and switch it on; perchctl check --scan lists the vehicles that answer",
@@ -75,7 +77,7 @@ def unanswered_row(error: ConnectionFailed, uri: str) -> Row:
 BUSY_ADVICE = "close other programs, or use a faster computer"
 WAKE_PERIOD_S = 0.005
 BUSY_SHARE = 0.5
-"""A computer that is late by this part of a packet's way back may be why the packet is late."""
+"""Share of a packet's delay by which this computer must be late to be a possible cause of it."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class VehicleStatus:
 
     @property
     def known_telemetry(self) -> Telemetry:
-        """The newest telemetry. Raises Unanswerable if there is none."""
+        """Return the newest telemetry. Raises Unanswerable if there is none."""
         if self.telemetry is None:
             raise Unanswerable("no telemetry")
         return self.telemetry
@@ -153,7 +155,8 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
 
 @contextlib.contextmanager
 def wake_delays() -> Iterator[list[float]]:
-    """The delays, s, with which this computer wakes a thread that sleeps, while the block runs."""
+    """Measure the delays, s, with which this computer wakes a sleeping thread, while the block
+    runs."""
     delays_s: list[float] = []
     ended = threading.Event()
 
@@ -176,8 +179,8 @@ def wake_delays() -> Iterator[list[float]]:
 
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    """Judge the echoes, and a radio's quality, too. Where this computer itself was late, a slow
-    packet is no reason to look for the link's fault."""
+    """Judge the echoes and, for a radio, its quality. If this computer itself was late, a slow
+    packet says nothing about the link."""
     sent, quality = len(vehicle.round_trips_s), vehicle.link_quality
     back_s = sorted(filter(math.isfinite, vehicle.round_trips_s))
     advice = LINK_ADVICE.get(vehicle.link_scheme, BUSY_ADVICE)
@@ -196,7 +199,7 @@ def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     return worst_finding(
         limits_finding(lost, 0.01, 0.05, found, advice),
         limits_finding(p95_s, slow_s, limit_s, found, slow_advice),
-        # A radio sends again by itself: its losses show in its quality only.
+        # A radio repeats lost packets by itself, so losses show only in its quality.
         limits_finding(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
     )
 
@@ -347,19 +350,20 @@ LIFTED = "lifted"
 LIFT_S = 20.0
 HOW_TO_LIFT = "lift it by 30 cm, hold it level, and put it back"
 LIFT_CHECK_M = 0.15
-"""Rise of the estimate from which on a lift is judged. Larger: a short lift is skipped."""
+"""Rise of the estimate above which a lift is judged, m. Larger: a short lift is skipped."""
 FOLLOWED_M = 0.08
-"""Rise below which the estimate has not followed. Larger: a short lift counts as a positioning that
-does not see it. Smaller: an estimate that drifts counts as one that follows."""
+"""Rise below which the estimate has not followed the lift, m. Larger: with a short lift, the
+positioning counts as blind. Smaller: an estimate that drifts counts as one that follows."""
 BACK_M = 0.10
-"""Difference of the last height from the first beyond which the position may drift. Larger: a drift
+"""Difference between first and last height above which the position may drift, m. Larger: a drift
 passes."""
 MOVED_G = 0.05
-"""A hand that lifts shows in the accelerometer; its noise at rest is a tenth of it."""
+"""Deviation of the accelerometer from 1 g that shows a lift by hand; its noise at rest is a tenth
+of it."""
 
 
 def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:
-    """The vehicle's telemetry of `duration_s`, while it is lifted by hand."""
+    """Return the vehicle's telemetry over `duration_s`, while somebody lifts it by hand."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(duration_s / 0.1))):
         wait(0.1)
