@@ -1,7 +1,8 @@
-"""The AI-deck's camera over Wi-Fi: ``aideck://HOST[:PORT]``, read by a thread, newest frame wins.
+"""The AI-deck's camera over Wi-Fi: ``aideck://HOST[:PORT]``, read by a thread that keeps the newest
+frame.
 
-HOST is 192.168.4.1 where the deck is its own access point. Bitcraze's example `wifi-img-streamer`
-has to be in the deck's GAP8; it sends raw or JPEG pictures of 324x244.
+HOST is 192.168.4.1 if the deck is its own access point. The deck's GAP8 must run Bitcraze's example
+`wifi-img-streamer`, which sends raw or JPEG pictures of 324x244.
 
 The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
 one byte of routing, one of function, and the data. A picture is a packet with its header,
@@ -26,12 +27,13 @@ from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
 STALLED_S = 2.0
-"""A picture that takes longer from its first byte to its last is dropped."""
+"""Time from a picture's first to its last byte after which the picture is dropped, s."""
 MAX_PACKET_BYTES = 1022
 """Largest length of a packet: the deck's buffers hold no more (its MTU)."""
 MOST_SIDE_PX = 1024
 
-# What waits unread while the reader stalls is then given out one by one, dated when it is read.
+# Small, because data that waits while the reader stalls is later dated by the time at which it is
+# read.
 _RECEIVE_BYTES = 131072
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
@@ -42,9 +44,9 @@ _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 
 @dataclass
 class _Picture:
-    """A picture that is on its way: what its header announced, and the `data` so far.
+    """A picture that is arriving: the content of its header, and the `data` so far.
 
-    `began_s` is when its first byte came.
+    `began_s` is the time at which its first byte arrived.
     """
 
     began_s: float
@@ -55,8 +57,8 @@ class _Picture:
     data: bytearray
 
     def decode(self) -> tuple[NDArray[np.uint8], bytes | None] | str:
-        """The grey picture (h, w), and its JPEG if it came as one; or why it cannot be used. What
-        stands behind a JPEG's end is padding."""
+        """Return the grey picture (h, w), and its JPEG if it came as one; or why it cannot be used.
+        Bytes after the end of a JPEG are padding."""
         shape, data = (self.height, self.width), bytes(self.data)
         if not self.is_jpeg:
             if len(data) != self.size:
@@ -152,13 +154,13 @@ class AiDeckSource(LiveSource):
             return
         image, encoded = decoded
         grey = self._grey(image)
-        if grey is not image:  # a mosaic was taken out of it
+        if grey is not image:  # a colour mosaic was removed from it
             encoded = None
         self._put(grey, began_s=picture.began_s, encoded=encoded)
 
 
 def _header_of(data: bytes, came_s: float) -> _Picture | None:
-    """The picture whose header that packet is; None where it is none."""
+    """Return the picture whose header that packet is; None if it is no header."""
     if len(data) != _HEADER.size:
         return None
     magic, width, height, depth, kind, size = _HEADER.unpack(data)
@@ -172,13 +174,14 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
     return None
 
 
-# --- A colour camera's mosaic in what is delivered as a grey picture ---
-# Pixels look through colour filters, two by two, whose pattern is in raw and grey JPEG pictures.
+# --- The colour mosaic of a camera whose pictures are delivered as grey ---
+# The pixels have colour filters in blocks of two by two. Their pattern shows in raw and grey JPEG
+# pictures.
 
 
 LEAST_MOSAIC_SHARE = 0.04
-"""By which the filters' mean greys differ, over their mean: a grey sensor's by less than 1 %, a
-mosaic's by 20 % and more."""
+"""Least difference between the mean greys of the filters, relative to their mean. A grey sensor has
+less than 1 %, a mosaic 20 % and more."""
 LEAST_MOSAIC_LEVELS = 1.5
 PICTURES_IN_A_ROW = 3
 _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
@@ -191,7 +194,7 @@ def has_mosaic(image: NDArray[np.uint8]) -> bool:
 
 
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture smoothed to grey: a quarter red, half green, a quarter blue.
+    """Return the picture smoothed to grey: a quarter red, half green, a quarter blue.
 
     The weights 1 2 1 along rows and columns cancel any pattern with a period of two pixels, so this
     works for each order of the colour filters, and for a JPEG.
@@ -200,7 +203,7 @@ def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class MosaicFilter:
-    """Removes the colour mosaic from a stream's pictures, once a picture has shown one."""
+    """Removes the colour mosaic from a stream's pictures once a picture has shown one."""
 
     def __init__(self) -> None:
         self._in_a_row = 0

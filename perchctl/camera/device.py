@@ -20,14 +20,15 @@ PLUG_IN = "plug in the receiver or camera"
 LOST_AFTER_FAILURES = 25
 READ_RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
-"""Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
+"""Time between two attempts to reopen a lost camera, s: one attempt keeps a driver busy for 0.1
+s."""
 
 
 def open_video_capture(
     place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> Any:
-    """An opened cv2.VideoCapture of the camera named by `place`, set to `size_px` and to the
-    format and rate of `config`. Raises NotFound, which lists the existing cameras."""
+    """Return an opened cv2.VideoCapture of the camera that `place` names, set to `size_px` and to
+    the format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
         raise _not_found(str(number), _known_cameras(DEVICES, NAMES))
@@ -60,7 +61,7 @@ def configure_capture(
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size_px[1])
     if config is not None and config.rate_hz is not None:
         capture.set(cv2.CAP_PROP_FPS, config.rate_hz)
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old frames waiting would add latency
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # waiting old frames would add latency
 
 
 class DeviceSource(LiveSource):
@@ -96,7 +97,7 @@ class DeviceSource(LiveSource):
                         self._put(image)
                         failures = 0
                         continue
-                except Exception as error:  # whatever a damaged picture does to OpenCV
+                except Exception as error:  # any error that a damaged picture causes in OpenCV
                     why = f"delivers pictures that cannot be decoded ({describe_error(error)})"
                     self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1
@@ -110,7 +111,7 @@ class DeviceSource(LiveSource):
             capture.release()
 
 
-# --- The cameras of this computer: their numbers, names and lasting paths
+# --- The cameras of this computer: their numbers, names and permanent paths
 
 
 DEVICES = Path("/dev")
@@ -153,7 +154,7 @@ def _no_camera() -> NotFound:
 
 
 def _known_cameras(devices: Path, names: Path) -> list[ConnectedCamera]:
-    """Each camera with its first video node, as others often give no pictures."""
+    """List each camera once, with its first video node, since the others often give no pictures."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):
@@ -181,8 +182,8 @@ def _of_system(number: int, attribute: str, names: Path) -> str:
 
 
 def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> int:
-    """The number of the camera that the text after ``camera:`` names: a number, a name or
-    part of a name (quotes and case do not matter), or a device path.
+    """Return the number of the camera that the text after ``camera:`` names. The text is a number,
+    a name or part of a name (quotes and case do not matter), or a device path.
 
     Errors: InvalidValue if several cameras match; NotFound.
     """

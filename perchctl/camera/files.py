@@ -1,4 +1,5 @@
-"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame, none dropped."""
+"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame is returned, and none is
+dropped."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ class RecordedSource:
         self._name = name
         self._latency_s = latency_s
         self._index = 0
-        self._ahead = self._read()  # one picture ahead, so that size and end are known in time
+        # reads one picture ahead, so that size and end are known in time
+        self._ahead = self._read()
         if self._ahead is None:
             raise InvalidValue(
                 f"{name} holds no readable frame", "check that it is a picture or video file"
@@ -48,7 +50,7 @@ class RecordedSource:
         return self._ahead is None
 
     def poll(self, now_s: float) -> Frame | None:
-        """The next frame, with the recording's own time; None at the end."""
+        """Return the next frame, with the recording's own time; None at the end."""
         if self._ahead is None:
             return None
         image, t_s = self._ahead
@@ -76,9 +78,11 @@ class VideoSource(RecordedSource):
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
             raise NotFound(f"video file {without_password(str(path))} was not found")
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # one sentence is enough
+        # one sentence is enough, so OpenCV prints nothing
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the sensor's grid, as of pictures
+        # keeps the sensor's grid, as with pictures
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0
             for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT)
@@ -139,7 +143,8 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
     Raises ValueError for a picture that is cut off, or that OpenCV does not read.
     """
-    # Decoders fill the rest with grey, and say so on stderr without the file's name.
+    # OpenCV's decoders would fill in the rest with grey, and print a warning without the file's
+    # name.
     png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data
     jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_end_and_size(data) is not None
     if not (png_ends and jpeg_ends):

@@ -1,4 +1,5 @@
-"""Whether a frame is a measurement, or frozen, snow, uniform, dark or repeated."""
+"""Decides whether a frame can be used as a measurement, or is frozen, snow, uniform, dark or
+repeated."""
 
 from __future__ import annotations
 
@@ -22,20 +23,21 @@ VERDICT_TEXTS: dict[FrameKind, str] = {
 }
 
 
-# Grey levels are of 0..255.
+# Grey levels range from 0 to 255.
 FROZEN_AFTER_S = 0.4
-"""Time without a change after which repeated is frozen."""
+"""Time without a change after which a repeated picture counts as frozen, s."""
 UNIFORM_SIGMA = 1.5
-"""Spread below which a picture shows nothing: a blank screen has below 1."""
+"""Standard deviation below which a picture shows nothing: a blank screen has less than 1."""
 DARK_LEVEL = 30.0
-"""Mean plus two spreads below which a picture is dark."""
+"""Level below which a picture is dark: mean plus two standard deviations."""
 SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
-"""Snow has a spread above the first, and lines two rows apart that are as unlike as if unrelated
-(1 = unrelated); columns less so, because a receiver's bandwidth smooths along lines."""
+"""Thresholds for snow: its standard deviation, the difference of lines two rows apart relative to
+unrelated lines (1), and that of columns, which is smaller because a receiver's bandwidth smooths
+along lines."""
 
 
 class FrameHealth:
-    """Judges the frames of one source in their order; it remembers the last picture."""
+    """Judges the frames of one source in order; it remembers the last picture."""
 
     def __init__(self) -> None:
         self._picture: NDArray[np.uint8] | None = None
@@ -69,7 +71,7 @@ def picture_kind(image: NDArray[np.uint8]) -> FrameKind:
         return "uniform"
     if sigma > SNOW_SIGMA and height > 2:
         below = image[2::8][: len(first)]
-        unrelated = 2.0 * sigma**2  # mean square difference of unrelated pixels
+        unrelated = 2.0 * sigma**2  # mean square difference of two unrelated pixels
         roughness = _mean_square(below, first) / unrelated
         grain = _mean_square(first[:, 2:], first[:, :-2]) / unrelated
         if roughness > SNOW_ROUGHNESS and grain > SNOW_GRAIN:
@@ -81,9 +83,9 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
 
 
-# --- Pictures that a receiver gives out again because no new one has come ---
-# A receiver of 25 pictures a second in a stream of 60 gives each out two or three times. A second
-# time is no second measurement, and its time is the first one's.
+# --- Pictures that a receiver repeats because no new one has arrived ---
+# In a stream of 60 pictures a second, a receiver of 25 pictures a second repeats each two or three
+# times. The repetition is not another measurement, and its time is that of the first copy.
 
 
 Grey = NDArray[np.uint8]

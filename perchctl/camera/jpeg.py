@@ -1,7 +1,8 @@
-"""A JPEG's structure: where it ends, what size it says, and its pixels; any picture's pixels; pure.
+"""The structure of a JPEG: its end, its declared size and its pixels; and the pixels of any
+picture. Pure.
 
-What a radio delivers may be damaged anywhere. Two bytes that say a size of 32000x32000 cost a
-decoder gigabytes and minutes, so the size is read before anything of a stream is decoded.
+Data from a radio may be damaged anywhere. Two wrong bytes that declare a size of 32000x32000 cost a
+decoder gigabytes and minutes, so the size is checked before a picture of a stream is decoded.
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PICTURE_BYTES = 8_000_000
-"""Of a picture in a stream; one that does not end within them is dropped."""
+"""Size of a picture in a stream after which it is dropped if it has not ended, bytes."""
 MOST_STREAM_PX = 4096 * 4096
-"""Of a picture in a stream: more than any camera that flies gives, and decoded within 0.2 s."""
+"""Largest number of pixels of a picture in a stream: more than any flying camera has, and decoded
+within 0.2 s."""
 
 _SCAN_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
-"""The first marker behind entropy-coded bytes, in which FF is followed by 00 or a restart."""
+"""The first marker after entropy-coded bytes, in which FF is followed by 00 or a restart marker."""
 _START, _END = b"\xff\xd8\xff", b"\xff\xd9"
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 _FRAME_HEADER_CODES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Start of frame: behind its length and precision stand height and width."""
+"""Codes of a frame header: its length and precision are followed by height and width."""
 
 
 def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
@@ -76,7 +78,7 @@ class JpegSplitter:
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
             self._bound()
-            return pictures  # no picture ends in what is new
+            return pictures  # no picture ends in the new bytes
         while (start := self._buffer.find(_START)) >= 0:
             del self._buffer[:start]
             extent = jpeg_end_and_size(self._buffer)
@@ -85,29 +87,29 @@ class JpegSplitter:
             end, size_px = extent
             if all(size_px):
                 pictures.append((bytes(self._buffer[:end]), size_px))
-            # The start of the next picture may be what broke this one's structure.
+            # The beginning of the next picture may be what interrupted the structure of this one.
             del self._buffer[:end]
         else:
-            del self._buffer[:-2]  # the next start may stand half in this piece
+            del self._buffer[:-2]  # the next start marker may be cut in half here
         self._bound()
         return pictures
 
     def _bound(self) -> None:
-        """Give up a picture that never ends."""
+        """Drop a picture that never ends."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
 
 
 SENSOR_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-"""OpenCV's flags for a grey picture on the sensor's grid: an orientation that a camera notes for a
-viewer says how the camera was held, and turning by it would give each picture another lens."""
+"""OpenCV's flags for a grey picture on the sensor's grid. The orientation that a camera notes for
+viewers says how the camera was held; applying it would give each picture another lens."""
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
     """The grey picture of any bytes, on the sensor's grid whatever orientation they note; None if
     OpenCV cannot decode them; raises nothing."""
     if not data:
-        return None  # of an empty array OpenCV makes an error
+        return None  # OpenCV raises an error for an empty array
     try:
         image = cv2.imdecode(np.frombuffer(_as_stored(data), np.uint8), SENSOR_GREY)
     except cv2.error:
@@ -120,8 +122,8 @@ _TIFF_ORIENTATION = 274
 
 
 def _as_stored(data: bytes) -> bytes:
-    """A TIFF with the orientation tag 1, as its reader turns the picture in spite of the flag; any
-    other picture unchanged."""
+    """Return a TIFF with its orientation tag set to 1, since OpenCV's reader rotates it in spite of
+    the flag; return any other picture unchanged."""
     order = _TIFF_BYTE_ORDER.get(bytes(data[:4]))
     if order is None:
         return data

@@ -35,7 +35,7 @@ from perchctl.errors import NotFound
 READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _NOT_MENDED = (401, 403, 404, 410)
-"""What the server answers to another attempt, too."""
+"""Answers that the server would give to another attempt, too."""
 _NAME_AND_PASSWORD = "add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
 _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 
@@ -73,7 +73,8 @@ class MjpegSource(LiveSource):
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """The response; credentials go once, when asked, as cameras lock out repeaters."""
+        """Return the response. Credentials are sent once, when they are asked for, because cameras
+        lock out clients that repeat them."""
         opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
         response: HTTPResponse
         try:
@@ -89,8 +90,9 @@ class MjpegSource(LiveSource):
         return response
 
     def _answer(self, asked: str, request: Request) -> str | None:
-        """The Authorization header, by a digest where the camera takes one, since basic
-        shows the password; None if the library knows none of its digests."""
+        """Return the Authorization header, with a digest if the camera accepts one, since basic
+        authentication reveals the password; None if the library knows none of the camera's
+        digests."""
         digests = _DIGEST.split(asked)[1:]
         if not digests:
             return "Basic " + b64encode(":".join(self._name_and_password).encode()).decode()
@@ -98,7 +100,7 @@ class MjpegSource(LiveSource):
         passwords.add_password(None, request.full_url, *self._name_and_password)
         handler = HTTPDigestAuthHandler(passwords)
         for digest in digests:
-            with suppress(ValueError, URLError):  # of an algorithm that it does not know
+            with suppress(ValueError, URLError):  # an algorithm that the library does not know
                 challenge = parse_keqv_list(parse_http_list(digest))
                 return f"Digest {handler.get_authorization(request, challenge)}"
         return None
@@ -115,7 +117,7 @@ class MjpegSource(LiveSource):
                     f"it sends {kind}, but no complete JPEG",
                     "check that the address is that of the stream itself",
                 )
-            # If the network delivered several at once only the newest is worth decoding.
+            # If several pictures arrived at once, only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
                 if width * height > MOST_STREAM_PX:
                     self._drop(
@@ -134,10 +136,10 @@ class MjpegSource(LiveSource):
 
 
 MAX_DAMAGED = 100
-"""Packets in a row that cannot be decoded before it connects anew."""
+"""Number of successive packets that cannot be decoded before the source reconnects."""
 DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""By which a camera's clock may run slow before its pictures look older than they are."""
+"""Rate by which a camera's clock may run slow before its pictures seem to become older."""
 
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
@@ -161,7 +163,7 @@ class TransferDelay:
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
-        self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
+        self._ways: deque[tuple[float, float]] = deque()  # arrival times with their `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
         """The transfer time beyond the fastest picture's, s; 0 without `camera_s`, the camera's
@@ -173,7 +175,7 @@ class TransferDelay:
         self._camera_s = camera_s
         way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
-            self._ways.pop()  # a window's minimum: none of these will be it any more
+            self._ways.pop()  # minimum of a window: none of these can become it any more
         self._ways.append((arrival_s, way_s))
         while self._ways[0][0] < arrival_s - DELAY_WINDOW_S:
             self._ways.popleft()
@@ -197,7 +199,7 @@ class RtspSource(LiveSource):
         self._url = url
 
     def _connection(self) -> str:
-        import av  # late: most flights have another camera
+        import av  # imported late, since most flights have another camera
         import av.error
 
         try:
@@ -205,7 +207,7 @@ class RtspSource(LiveSource):
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            # Not the error's whole text, which holds the URL with its password.
+            # Not the whole text of the error, which contains the URL with its password.
             name = type(error).__name__
             reason = str(_REASONS.get(name) or getattr(error, "strerror", None) or name)
             if name in _FINAL:
@@ -224,7 +226,7 @@ class RtspSource(LiveSource):
             return "the stream carries no video"
         self._connected()
         video = stream.streams.video[0]
-        # A thread for each frame would hold back as many frames as there are threads.
+        # One thread per frame would delay the pictures by as many frames as there are threads.
         video.thread_type = "NONE"
         video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
         delay, damaged = TransferDelay(), 0
@@ -252,12 +254,12 @@ _FINAL = (
     "HTTPBadRequestError",
     "DecoderNotFoundError",
 )
-"""PyAV's errors that another attempt would not mend, by name."""
+"""PyAV's errors that another attempt would not solve, by name."""
 _REASONS = {
     "HTTPUnauthorizedError": "it rejects this user name and password (401)",
     "OSError": "the host cannot be reached, or its name cannot be resolved",
     "ExitError": "no answer in time, or no video in the stream",
     "InvalidDataError": "no answer in time, or not an RTSP answer",
 }
-"""In the place of FFmpeg's own, which say less."""
+"""Texts that replace FFmpeg's own, which say less."""
 _ADVICE = {"HTTPUnauthorizedError": "write them as in rtsp://NAME:PASSWORD@HOST/PATH"}

@@ -1,4 +1,4 @@
-"""From a source's text, as a profile or a command names it, to an open frame source."""
+"""Open a frame source from the text with which a profile or a command names it."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class SourceName:
 
     @property
     def device(self) -> str:
-        """The same text for all names of one camera of this computer: its number, its name, a path.
-        A camera that is not there keeps its own. Nothing is opened."""
+        """Return the same text for all names of one camera of this computer: its number, its name
+        or a path. A camera that is not connected keeps its own text. Nothing is opened."""
         if self.scheme != "camera":
             return str(self)
         try:
@@ -91,7 +91,7 @@ def parse_source(text: str) -> SourceName:
     if name.scheme in STREAMS:
         _check_address(name)
     if name.scheme in SCHEMES:
-        return name  # FFmpeg knows rtsp:// and not RTSP://
+        return name  # FFmpeg knows rtsp:// but not RTSP://
     path, shown = Path(text).expanduser(), without_password(text)
     if path.is_dir() or any(c in text for c in "*?["):
         return SourceName("images", text)

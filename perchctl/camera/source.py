@@ -1,4 +1,4 @@
-"""What every frame source offers, and what live and recorded ones share."""
+"""The interface of all frame sources, and what live and recorded sources share."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class NewestSlot:
 Clock = Callable[[], float]
 
 SILENT_AFTER_S = 1.0
-"""A live source without a new frame for so long counts as gone."""
+"""Time without a new frame after which a live source counts as gone, s."""
 CLOSE_WITHIN_S = 3.0
 _FRAME_POLL_S = 0.002
 _SILENT = "connected, but it sends no data"
@@ -141,9 +141,9 @@ class LiveSource:
     reconnect_wait_s = 0.3
     max_failures = 5.0
     unreached_advice = "check that the address is right and that the camera is on"
-    """What to do if no connection is made."""
+    """What to do if no connection can be made."""
     silent_advice = "switch the camera off and on again"
-    """What to do if a connection is made, and nothing comes."""
+    """What to do if a connection is made but nothing arrives."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = without_password(name)
@@ -155,11 +155,12 @@ class LiveSource:
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
-        self._arrived = 0  # pictures, a receiver's repetitions too
+        self._arrived = 0  # number of pictures, including a receiver's repetitions
         self._why_silent = ""
-        self._found = ("", "")  # by the newest connection, and what to do: until a picture comes
+        # finding of the newest connection, and advice, until a picture arrives
+        self._found = ("", "")
         self._is_connected = False
-        self._dropped = 0  # pictures that came since the last good one
+        self._dropped = 0  # number of pictures that arrived since the last good one
         self._why_dropped = ""
         self.connections = 0
         self.failure: PerchError | None = None
@@ -188,7 +189,7 @@ class LiveSource:
         return TimedOut(found, advice, separator=": ")
 
     def _finding_and_advice(self) -> tuple[str, str]:
-        """What has been seen since the last picture, and what to do about it."""
+        """Return what was observed since the last picture, and what to do about it."""
         if self._dropped:
             count = f"{self._dropped} so far"
             return f"pictures arrive but are dropped ({count}): {self._why_dropped}", ""
@@ -234,7 +235,8 @@ class LiveSource:
                     return
                 reason = str(error)
             except Exception as error:
-                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
+                # Any error that damaged bytes cause in a library: a new connection may bring intact
+                # ones.
                 reason = describe_error(error)
                 is_unreached = isinstance(error, OSError)
             self._why_silent = reason
@@ -250,16 +252,16 @@ class LiveSource:
             self._stop.wait(self.reconnect_wait_s)
 
     def _connected(self) -> None:
-        """Note that the camera answers: while nothing comes, that is what is known."""
+        """Note that the camera answers, for the case that nothing else arrives."""
         self._is_connected = True
         self._note(_SILENT, self.silent_advice)
 
     def _note(self, finding: str, advice: str = "") -> None:
-        """Note what this connection has shown instead of a picture, and what to do about it."""
+        """Note what this connection has delivered instead of a picture, and what to do about it."""
         self._found = (finding, advice)
 
     def _drop(self, why: str) -> None:
-        """Note that a picture came and cannot be used."""
+        """Note that a picture arrived but cannot be used."""
         self._why_dropped, self._dropped = why, self._dropped + 1
 
     def _put(
@@ -272,8 +274,8 @@ class LiveSource:
     ) -> None:
         """Keep a picture that has arrived now.
 
-        `waited_s`: its time under way beyond the usual. `began_s`: start of its arrival; the
-        latency counts from there. `encoded`: as in `Frame`.
+        `waited_s`: by how much its transfer took longer than usual. `began_s`: start of its
+        arrival; the latency counts from there. `encoded`: as in `Frame`.
         """
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
@@ -338,7 +340,7 @@ class GuardedSource:
         self._source, self._name, self._clock = source, name, clock
         self._first: Frame | None = None
         self._newest_s, self._count = -math.inf, 0
-        self._empty_since_s: float | None = None  # the first poll without a frame since the last
+        self._empty_since_s: float | None = None  # first poll without a frame since the last frame
         self._failure: str | None = None
         self.live, self.size_px = bool(source.live), source.size_px
 
@@ -408,7 +410,7 @@ class GuardedSource:
 
 
 def mirrored_problem(config: CameraConfig) -> Problem:
-    """The problem that the picture is mirrored, and how to correct the profile with `config`."""
+    """Return the problem that the picture is mirrored, with advice on the profile's `config`."""
     advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror it, so remove camera.mirrored from the profile"
@@ -420,7 +422,7 @@ def unmirror_frame(frame: Frame) -> Frame:
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
 
 
-# --- Name and password of a stream's URL: shown nowhere ---
+# --- User name and password in a stream's URL, which are never shown ---
 
 
 _START = r"(?:[a-z][a-z0-9+.-]*://|(?:https?|rtsps?):/?)"
@@ -434,7 +436,7 @@ _SECRET = re.compile(
 def without_password(text: str) -> str:
     """The text without user names and passwords in URLs, and without the values of
     ``password=`` and similar keys. In doubt too much is removed."""
-    if start := _URL.match(text):  # all of it is one URL, spaces in the password too
+    if start := _URL.match(text):  # treat all of it as one URL, including spaces in the password
         text = start.group() + _without_name(text[start.end() :])
     else:
         text = _URL_AMID.sub(lambda found: found.group(1) + _without_name(found.group(2)), text)
