@@ -1,4 +1,4 @@
-"""What people see during a flight: panel and live page."""
+"""The displays for people during a flight: terminal panel and live page."""
 
 import lazy_loader
 

@@ -20,14 +20,14 @@ from perchctl.display.serve import Page
 from perchctl.mission import Phase
 
 EVENTS_SHOWN = 200
-"""Lines of events. More: each answer to a browser is larger. Fewer: what began a long flight is
-missing from a page that is opened later."""
+"""Number of lines of events. More: each answer to a browser is larger. Fewer: a page that is opened
+late does not show the beginning of a long flight."""
 PICTURE_TIMEOUT_S = 0.5
-"""For a vehicle's process to give a picture. Longer, and one that hangs holds up the other tiles;
-shorter, and pictures of a busy computer are missing."""
+"""Time for a vehicle's process to deliver a picture, s. Longer: a process that hangs delays the
+other tiles. Shorter: pictures from a busy computer are missing."""
 LARGEST_PICTURE_BYTES = 2_000_000
-"""Of a JPEG. Larger, and what is no picture fills the memory; smaller, and large cameras have no
-picture."""
+"""Largest JPEG, bytes. Larger: data that is no picture fills the memory. Smaller: large cameras
+show no picture."""
 
 
 class FleetPage(Page):
@@ -71,7 +71,7 @@ class FleetPage(Page):
         self.set_state(self._tiles, live=live and not all(row.has_ended for row in rows))
 
     def event(self, line: str) -> None:
-        """Add a line to the events; whoever opens the page later sees it too."""
+        """Add a line to the events, which is also shown to those who open the page later."""
         self._events.append(line)
 
     def picture(self, name: str) -> bytes | None:
@@ -106,7 +106,7 @@ class FleetPage(Page):
 
 
 def _fetch_picture(port: int) -> bytes | None:
-    """The newest picture that the page on this port of this computer has; None without one."""
+    """Return the newest picture of the page on this port of this computer; None if it has none."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PICTURE_TIMEOUT_S)
     with contextlib.closing(connection):
         try:

@@ -20,7 +20,7 @@ from perchctl.display.terminal import (
 
 _WIDTHS = {"": 2, "name": 10, "phase": 8, "height": 7, "error": 8, "battery": 7, "link": 6}
 _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
-"""What the frame and the other fields, with a blank after each, leave."""
+"""Columns that remain after the frame and the other fields, each followed by a blank."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class FleetPanel(TerminalDisplay):
         super().__init__(stream)
 
     def show(self, rows: Sequence[FleetRow]) -> None:
-        """Show these lines in place of those before."""
+        """Show these lines instead of the previous ones."""
         self._rows = tuple(rows)
         self._wake.set()
 
@@ -87,7 +87,8 @@ class FleetPanel(TerminalDisplay):
 
 
 def fleet_table(rows: Sequence[FleetRow], below: str = "", above: str = "") -> Panel:
-    """The panel of these vehicles, `PANEL_COLUMNS` wide: a heading, and one line for each."""
+    """Return the panel of these vehicles, `PANEL_COLUMNS` wide: a heading, and one line per
+    vehicle."""
     table = Table.grid(padding=(0, 1))
     for name, width in _WIDTHS.items():
         is_text = name in ("name", "phase")

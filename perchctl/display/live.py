@@ -1,7 +1,7 @@
 """The live page of one camera: newest picture and numbers.
 
-The loop only leaves references in a newest-value slot; drawing, JPEG and HTTP happen in
-the page's threads, and what fails there is remembered in `problem`, never raised.
+The loop only stores references to the newest values. Drawing, JPEG encoding and HTTP happen in the
+page's threads; an error there is stored in `problem` and never raised.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class LivePage(Page):
         self._jpeg: tuple[int, bytes] | None = None
         super().__init__(title, {"land": on_land, "cut": on_cut}, clock)
 
-    # --- for the loop: neither waits nor raises ---
+    # --- For the loop: these methods neither wait nor raise ---
 
     def show(self, sketch: Sketch) -> None:
         """Show `sketch` until the next call."""
@@ -65,15 +65,15 @@ class LivePage(Page):
             self._number += 1
             self._changed.notify_all()
 
-    # --- for the server's threads ---
+    # --- For the server's threads ---
 
     @property
     def _is_fresh(self) -> bool:
-        """True while pictures come."""
+        """True while pictures arrive."""
         return self._clock() - self._picture_s < _PICTURE_STALE_S
 
     def state(self) -> dict[str, Any]:
-        """As `Page.state`, with ``fresh``: whether pictures come."""
+        """The state of `Page.state`, with ``fresh``: whether pictures arrive."""
         return super().state() | {"fresh": self._is_fresh}
 
     def picture(self, name: str) -> bytes | None:
@@ -89,7 +89,7 @@ class LivePage(Page):
             newest, sketch = self._number, self._sketch
             if sketch is None or newest <= number:
                 return None
-        with self._drawing:  # once, for all readers
+        with self._drawing:  # drawn once for all readers
             if self._jpeg is None or self._jpeg[0] < newest:
                 picture = draw_sketch(sketch, self.camera)
                 quality = [cv2.IMWRITE_JPEG_QUALITY, LIVE_JPEG_QUALITY]
@@ -126,7 +126,7 @@ def live_page(
             report(f"the live page failed: {page.problem}")
 
 
-# --- The picture with what was found in it: outlines and the target's axes ---
+# --- The picture with the detections drawn on it: outlines and the target's axes ---
 
 
 # Blue, green, red.
@@ -136,7 +136,7 @@ _OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, in sides of the large marker."""
-_DRAWABLE_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
+_DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +190,6 @@ def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
 def _draw_line(
     picture: NDArray[np.uint8], points_px: Array, colour: tuple[int, int, int], width: int
 ) -> None:
-    if np.abs(points_px).max() < _DRAWABLE_PX:  # and so no number is missing
+    if np.abs(points_px).max() < _DRAWABLE_PX:  # also False for NaN
         fixed = np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -18,10 +18,10 @@ from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
 TRACE_S = 20.0
-"""Span of the page's trace of the error, s; `page.html` has the same."""
+"""Span of the page's trace of the error, s; `page.html` uses the same value."""
 PAST_PERIOD_S = 0.5
-"""Between two points of the trace that a page opened in mid-flight gets, s. Smaller: a finer trace,
-and larger messages."""
+"""Time between two points of the trace that a page opened in mid-flight receives, s. Smaller: a
+finer trace, but larger messages."""
 Past = tuple[float, float | None, float | None]
 """The time of a tick in s, and the target's lateral offset and distance above in m."""
 PERCH_STEPS = [phase.value for phase in tuple(Phase)[:7]]
@@ -42,7 +42,7 @@ class FlightPage:
     def __init__(self, page: LivePage, large_side_m: float, gear_up_m: float) -> None:
         self.page = page
         self._side_m = large_side_m
-        self._drawn = {"large_m": large_side_m, "gear_m": gear_up_m}  # to scale
+        self._drawn = {"large_m": large_side_m, "gear_m": gear_up_m}  # m, for the page's drawings
         self._frame: Frame | None = None
         self._flying = False
         self._rescue = ""
@@ -58,7 +58,7 @@ class FlightPage:
     def frame(self, frame: Frame) -> None:
         self._frame = frame
         try:
-            if not self._flying:  # no ticks yet that would show it
+            if not self._flying:  # no ticks that would show it yet
                 self.page.show(Sketch(frame.image))
         except Exception as error:
             self.page.store_error(error)

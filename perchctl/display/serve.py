@@ -1,7 +1,7 @@
-"""A page on 127.0.0.1: what it shows, its buttons and its HTTP, from threads of its own.
+"""A page on 127.0.0.1, with its content, buttons and HTTP server in threads of its own.
 
-Whoever flies only leaves values here; what fails in the page's threads is remembered in `problem`,
-never raised.
+The flight only stores values here. An error in the page's threads is stored in `problem` and never
+raised.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 READS_S, LAST_READ_S = 2.5, 1.0
-"""A reader that asked so recently is given so long at the end to read the last state."""
+"""A reader that has asked within the first time, s, is given the second time, s, to read the last
+state before the page closes."""
 
 
 class Page:
@@ -34,7 +35,7 @@ class Page:
     """
 
     HTML: ClassVar[str]
-    """The page's file. Its places for style and script take those that all pages share."""
+    """The page's file, with placeholders for the style and script that all pages share."""
     HAS_STREAM: ClassVar[bool] = False
     """True if `jpeg_after` gives pictures."""
 
@@ -53,7 +54,7 @@ class Page:
         self._clock = clock
         self._changed = threading.Condition()
         self._describe: Callable[[], dict[str, Any]] = dict
-        self._state_s: float | None = None  # None: nothing is due
+        self._state_s: float | None = None  # None: no update is due
         self._read_s: float | None = None
         self._card: dict[str, Any] | None = None
         self._server = PageServer(self)
@@ -71,7 +72,7 @@ class Page:
         """The port on which it is served."""
         return int(self._server.server_address[1])
 
-    # --- for whoever flies: neither waits nor raises ---
+    # --- For the flight: these methods neither wait nor raise ---
 
     def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
         """Show the values that `describe` returns; it is called when a browser polls.
@@ -90,7 +91,7 @@ class Page:
             if read_s is not None and self._clock() - read_s < READS_S:
                 self._changed.wait_for(lambda: self.closed, LAST_READ_S)
 
-    # --- for the server's threads ---
+    # --- For the server's threads ---
 
     def state(self) -> dict[str, Any]:
         """The values that the page polls: the keys of `describe` (rows of name, text and
@@ -159,7 +160,7 @@ class Page:
         self._thread.join(2.0)
 
 
-# --- HTTP of the live page: on loopback only, and only under loopback's names ---
+# --- HTTP of the live page: only on loopback, and only under the names of loopback ---
 # A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
 # name this machine (a rebound DNS name does not), a button needs the token of the printed
 # address, in a header that a foreign site may not send, and nothing allows its reading.
@@ -168,7 +169,7 @@ class Page:
 HOSTS = ("127.0.0.1", "localhost", "::1")
 TOKEN_HEADER = "X-Perchctl-Token"
 LEAST_PERIOD_S = 0.04
-"""Between two pictures to one reader: 25 a second are enough for eyes."""
+"""Time between two pictures to one reader, s: the eye needs no more than 25 a second."""
 _CLIENT_TIMEOUT_S = 5.0
 _BOUNDARY = "perchctlpicture"
 
@@ -221,7 +222,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send_page()
             case ["state"]:
                 state = json.dumps(self.server.page.state())
-                # A browser reads no NaN and no Infinity.
+                # Browsers do not read NaN and Infinity.
                 readable = json.loads(state, parse_constant=lambda _name: None)
                 self._send(200, "application/json", json.dumps(readable).encode())
             case ["stream"] if self.server.page.HAS_STREAM:
@@ -280,7 +281,8 @@ class _Handler(BaseHTTPRequestHandler):
                 continue
             number, jpeg = newest
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-            # The next boundary goes out with the picture, or a browser shows it one late.
+            # The next boundary is sent with the picture; otherwise a browser shows it one picture
+            # late.
             self.wfile.write(head.encode() + jpeg + f"\r\n--{_BOUNDARY}\r\n".encode())
             time.sleep(LEAST_PERIOD_S)
 

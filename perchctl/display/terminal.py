@@ -1,7 +1,8 @@
-"""What the panels of a flight and of a fleet share: lines, and on a terminal a panel below them.
+"""The common part of the panels of a flight and of a fleet: lines and, on a terminal, a panel below
+them.
 
-Whoever flies only leaves what is new here; a thread of the display's own draws it. So neither an
-exception nor a terminal that stands still (Ctrl-S, a stalled ssh) reaches the flight.
+The flight only stores new values here, and the display draws them in a thread of its own. Neither
+an exception nor a stopped terminal (Ctrl-S, a stalled ssh) can therefore affect the flight.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ PANEL_PERIOD_S = 0.1
 PANEL_CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
 PANEL_COLUMNS = 78
-"""Of 80: a terminal echoes ^C behind the panel, which must not wrap."""
+"""Columns, of 80: a terminal echoes ^C after the panel, which must not wrap."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 
@@ -56,7 +57,7 @@ class TerminalDisplay:
         self._wake.set()
 
     def _new_panel(self) -> Panel | None:
-        """The panel, if it shows what the one before did not; called in the display's thread."""
+        """Return the panel if its content has changed; called in the display's thread."""
         return None
 
     def _draw(self) -> None:
@@ -66,7 +67,8 @@ class TerminalDisplay:
                     self._wake.wait()
                     self._wake.clear()
                     self._draw_once()
-                    self._closing.wait(PANEL_PERIOD_S)  # in lockstep the loop's time runs faster
+                    # in lockstep, the loop's time runs faster than real time
+                    self._closing.wait(PANEL_PERIOD_S)
                 self._draw_once()
         except Exception as error:
             self.failure = f"the display failed: {error.__class__.__name__}: {error}"
@@ -85,7 +87,7 @@ class TerminalDisplay:
 
 
 def new_live(stream: TextIO) -> Live:
-    """A live display on a terminal, drawn by `update` only."""
+    """A live display on a terminal that is drawn only by `update`."""
     console = Console(
         file=stream,
         force_terminal=True,
@@ -93,7 +95,7 @@ def new_live(stream: TextIO) -> Live:
         markup=False,
         emoji=False,
     )
-    # stdout is for data and is left alone; what others write on stderr goes above the panel.
+    # stdout is for data and is left alone; other output on stderr appears above the panel.
     return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
 
 
