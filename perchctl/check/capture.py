@@ -57,7 +57,7 @@ NOISE_FAIL = 4.0
 """Noise above which the row fails, in units of the `positioning.position_sigma_m` that the vehicle
 assumes."""
 WILD_M = 0.1
-"""Spread above any capture's noise, m: the body moves."""
+"""Spread above which positions are taken for millimetres, m: no capture is that noisy."""
 
 
 @dataclass(frozen=True)
