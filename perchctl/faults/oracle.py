@@ -355,7 +355,7 @@ def _airborne(s: Sample) -> bool:
     return not s.on_floor and s.height_m > LEAST_FALL_HEIGHT_M
 
 
-# What the program says at its end, as claims about the vehicle that are true or false ---
+# --- What the program says at its end, as claims about the vehicle that are true or false ---
 
 
 Claims = set[Claim]

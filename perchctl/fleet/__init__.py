@@ -2,7 +2,7 @@
 and the flight.
 
 The plan is a pure function of the fleet file and the profiles that it names: nothing is connected,
-opened or armed. For those who fly, simulate or show a fleet:
+opened or armed. To fly, simulate or draw a fleet:
 
     fleet = load_fleet("atrium.yaml")   # Fleet; raises NotFound, InvalidValue, one sentence each
     fleet.vehicles                      # FleetVehicle: name, home_m, target_m, and an ordinary
@@ -18,7 +18,7 @@ opened or armed. For those who fly, simulate or show a fleet:
     fly_fleet(plan, faults, seed)       # FleetResult of one seed, in lockstep: a unit of work
     fleet_summary(results), fleet_table(results)
 
-A flight is a process for each vehicle, and a parent that orders them:
+A flight consists of one process per vehicle, and a parent process that sends them orders:
 
     options = flight_options(plan, folder, seed, record)
     with open_radios(plan) as radios:   # a RadioHub for each dongle that several vehicles share

@@ -1,4 +1,4 @@
-"""Which vehicle flies to which target where the targets are interchangeable."""
+"""Decide which vehicle flies to which target if the targets are interchangeable."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from perchctl.fleet.fleet import Fleet
 
 
 def assign_nearest(fleet: Fleet) -> Fleet:
-    """The fleet with its targets handed out so that the sum of squared distances from home to
-    target is least.
+    """Return the fleet with its targets assigned so that the sum of the squared distances from home
+    to target is smallest.
 
-    By squared distances, straight ways between starts and goals do not meet when starts and goals
-    lie 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). Of equal sums, scipy's choice
-    counts, which is the same each time. A target's markers go with it.
+    With squared distances, straight paths between starts and goals do not meet if starts and goals
+    are 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). Among equal sums, scipy's choice
+    is used, which is always the same. A target's markers move with it.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -1,4 +1,4 @@
-"""The processes of a fleet's vehicles, as the parent holds them."""
+"""The processes of a fleet's vehicles, as the parent sees them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from perchctl.fleet.messages import Order, Result, Status, find_fault
 from perchctl.flight import FlyOptions
 
 PROCESS_END_TIMEOUT_S = 5.0
-"""For a process to end after its result. Longer, and the fleet ends later; shorter, and one that is
-only slow is killed."""
-# The parent hears that it is up before the libraries are loaded.
+"""Time for a process to end after its result, s. Longer: the fleet ends later. Shorter: a process
+that is only slow is killed."""
+# The child reports that it is running before it loads the libraries.
 VEHICLE_PROGRAM = (
     "from perchctl.children import connect_to_parent; channel = connect_to_parent(); "
     "from perchctl.fleet.vehicle_process import main; main(channel)"
@@ -25,16 +25,16 @@ VEHICLE_PROGRAM = (
 
 
 class VehicleProcess:
-    """One vehicle's process: in a session of its own, so that the terminal's Ctrl-C does not reach
-    it, with what it prints in a file of the flight's folder.
+    """The process of one vehicle. It has a session of its own, so that the terminal's Ctrl-C does
+    not reach it, and its output goes to a file in the flight's folder.
 
-    A thread takes its messages in. One that is stopped in the middle of a message holds up that
-    thread only. A message that cannot be used is left out, and `fault` says why.
+    A thread receives its messages. A process that is stopped in the middle of a message blocks only
+    this thread. An invalid message is dropped, and `fault` says why.
     """
 
     def __init__(self, name: str, options: FlyOptions) -> None:
-        """Start it. Raises InvalidValue if the folder cannot be written, OSError without
-        processes."""
+        """Start the process. Raises InvalidValue if the folder cannot be written, OSError if no
+        process can be started."""
         self._status: Status | None = None
         self._result: Result | None = None
         self._heard_s = time.monotonic()
@@ -51,14 +51,15 @@ class VehicleProcess:
             ) from None
         self._process, self._channel = spawn(VEHICLE_PROGRAM, self._output)
         self.pid = self._process.pid
-        with contextlib.suppress(OSError):  # it is gone already, which its end will tell
+        # the process has ended already, which is noticed elsewhere
+        with contextlib.suppress(OSError):
             self._channel.send(options)
         self._reader = threading.Thread(target=self._read, name=f"fleet-{name}", daemon=True)
         self._reader.start()
 
     def send(self, order: Order) -> None:
-        """Send an order, or leave it if there is no room: a stopped process reads nothing, and must
-        not hold up the others."""
+        """Send an order, or drop it if there is no room: a stopped process reads nothing, and must
+        not block the parent's work for the others."""
         with contextlib.suppress(OSError, ValueError):
             if select.select([], [self._channel], [], 0.0)[1]:
                 self._channel.send(order)
@@ -75,7 +76,8 @@ class VehicleProcess:
     def end_of_process(self) -> str | None:
         if self._reader.is_alive() or self._result is not None:
             return None
-        # One that runs without a line to the fleet lands its vehicle: it must not be ended yet.
+        # A process without a connection to the fleet lands its vehicle, so it must not be ended
+        # yet.
         code = self._process.poll()
         if code is None:
             return None
@@ -86,7 +88,8 @@ class VehicleProcess:
         self._process.kill()
 
     def close(self) -> None:
-        """End the process, bounded, and drop its output if there is none. May be called twice."""
+        """End the process within bounded time, and delete its output file if it is empty. May be
+        called twice."""
         if self._closed:
             return
         self._closed = True
@@ -105,16 +108,16 @@ class VehicleProcess:
                 self._take_message()
 
     def _take_message(self) -> None:
-        """Take the next message in. Raises EOFError or OSError if the process is gone."""
+        """Receive the next message. Raises EOFError or OSError if the process is gone."""
         try:
             message = self._channel.receive()
         except (EOFError, OSError):
             raise
-        except Exception as error:  # whatever unpickling it raises
+        except Exception as error:  # any error that unpickling raises
             self._fault = f"it sent what is unreadable ({error_at(error)})"
             return
         self._heard_s = time.monotonic()
-        fault = None if message is None else find_fault(message)  # None: it is up
+        fault = None if message is None else find_fault(message)  # None: the process is running
         if fault is not None:
             self._fault = f"it sent {fault}"
         elif isinstance(message, Status):

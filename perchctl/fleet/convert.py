@@ -1,9 +1,9 @@
-"""Fleet files from lists of Crazyflies that other programs keep.
+"""Convert lists of Crazyflies from other programs to fleet files.
 
-Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config) and
-the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither knows
-targets or cameras, and cfcli's knows no places: `missing` says what you have to add, and perchctl
-refuses the file until it is there.
+Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config), and
+the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither
+contains targets or cameras, and cfcli's contains no positions. `missing` says what you have to add;
+until then, perchctl refuses the file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _CAPTURE = (
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedVehicle:
-    """A vehicle of another program's list: name, URI, and what else is known of it."""
+    """A vehicle in another program's list: its name, its URI, and what else the list says about
+    it."""
 
     name: str
     uri: str
@@ -38,8 +39,8 @@ class ConvertedVehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedFleet:
-    """Another program's list. `skipped`: vehicles that it has switched off. `in_room_axes`: it says
-    that a Lighthouse measures the positions."""
+    """Another program's list. `skipped` are the vehicles that it has disabled. `in_room_axes`: it
+    says that a Lighthouse measures the positions."""
 
     name: str
     vehicles: tuple[ConvertedVehicle, ...]
@@ -48,12 +49,12 @@ class ConvertedFleet:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What the list does not know and a fleet file needs."""
+        """Return what a fleet file needs and the list does not contain."""
         homes = any(vehicle.home_m is None for vehicle in self.vehicles)
         return (*(("home_m",) if homes else ()), "target_m", "source")
 
     def text(self) -> str:
-        """The fleet file."""
+        """Return the text of the fleet file."""
         mocap = any(vehicle.body is not None for vehicle in self.vehicles)
         frame = ", frame: room" if self.in_room_axes and not mocap else ""
         positioning = ", positioning: {by: mocap}" if mocap else ""
@@ -78,7 +79,7 @@ class ConvertedFleet:
 
 
 def convert_fleet(path: Path) -> ConvertedFleet:
-    """The vehicles in a file of Crazyswarm2, cfcli or Swarmkeeper.
+    """Read the vehicles in a file of Crazyswarm2, cfcli or Swarmkeeper.
 
     Errors: NotFound, InvalidValue.
     """
@@ -122,7 +123,7 @@ def _from_crazyswarm2(path: Path, robots: Mapping[Any, Any], types: Any) -> Conv
                 name=_file_name(str(name)),
                 uri=_uri(where, entry),
                 home_m=_place(f"{where}.initial_position", entry.get("initial_position")),
-                body=str(name) if tracked else None,  # Crazyswarm2 calls the body so, too
+                body=str(name) if tracked else None,  # Crazyswarm2 uses the same name for the body
             )
         )
     return ConvertedFleet(name=path.stem, vehicles=tuple(vehicles), skipped=tuple(skipped))
@@ -174,7 +175,7 @@ def _is_number(value: Any) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # of an integer that is no float
+    except OverflowError:  # error for an integer that is too large for a float
         return False
 
 
@@ -183,6 +184,6 @@ def _text(value: Any, default: str) -> str:
 
 
 def _file_name(name: str) -> str:
-    """The name as a fleet file allows it."""
+    """Return the name in the form that a fleet file allows."""
     fit = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-_.")[:32]
     return fit or "vehicle"

@@ -1,12 +1,13 @@
-"""The parent of a fleet: hears its vehicles, orders, and ends what hangs. No flight logic.
+"""The parent of a fleet: it receives the vehicles' messages, sends orders, and ends processes that
+hang. It has no flight logic.
 
-`Coordinator.step` does one round and waits for nobody; `run` repeats it in a thread of its own. So
-neither a screen that stands still nor a question that nobody answers holds up a stop, and a parent
-whose rounds hang sends no more orders, upon which every vehicle lands by itself.
+`Coordinator.step` does one round without waiting; `run` repeats it in a thread of its own.
+Therefore neither a blocked terminal nor an unanswered question can delay a stop. If the rounds
+hang, no more orders are sent, and every vehicle lands by itself.
 
-What if a round raises? Then no judgement can be relied on, and `Coordinator.step_stopping` takes
-the place of `step` for good: it orders all to land, and to cut their motors if the operator says
-so. It needs neither the plan nor what the vehicles report.
+If a round raises an exception, its decisions can no longer be trusted, and
+`Coordinator.step_stopping` permanently replaces `step`. It orders all vehicles to land or, on the
+operator's command, to cut their motors. It needs neither the plan nor the vehicles' reports.
 """
 
 from __future__ import annotations
@@ -35,38 +36,40 @@ from perchctl.flight import OperatorSwitch
 from perchctl.mission import OperatorRequest
 
 ROUND_S = 0.02
-"""Between two rounds. Longer, and a stop waits longer; shorter, and the rounds cost more computing
-time than they are worth."""
+"""Time between two rounds, s. Longer: a stop is delayed for longer. Shorter: the rounds use too
+much computing time."""
 HUNG_S = 10.0
-"""A process that has sent nothing for so long is ended. Its vehicle is down by then, since the
-firmware stops the motors 2 s after the last packet. Longer, and the fleet waits for nothing;
-shorter, and a computer that pauses loses its flights."""
+"""Time without a message after which a process is ended, s. Its vehicle is down by then, since the
+firmware stops the motors 2 s after the last packet. Longer: the fleet waits for nothing. Shorter:
+flights are lost when a computer pauses."""
 START_HUNG_S = 60.0
-"""The same for a process that has sent nothing at all yet, s: on a busy computer its libraries take
-half a minute to load, and nothing is armed before all are ready. Longer: the operator waits for a
-process that hangs at its start. Shorter: a busy computer cannot start a fleet."""
+"""The same time for a process that has not sent anything yet, s. On a busy computer, loading its
+libraries takes half a minute, and nothing is armed before all vehicles are ready. Longer: the
+operator waits for a process that hangs while it starts. Shorter: a busy computer cannot start a
+fleet."""
 LOOP_HUNG_S = 60.0
-"""A process whose flight loop has not turned for so long is ended. Longer than any landing by its
-watchdog and the closing of link and log take. Longer, and the fleet waits for nothing."""
+"""Time without a turn of its flight loop after which a process is ended, s. It is longer than a
+landing by the watchdog takes, including closing the link and the log. Longer: the fleet waits for
+nothing."""
 
 
 class Child(Protocol):
     """The process of one vehicle, as the parent sees it. No method waits."""
 
     def send(self, order: Order) -> None:
-        """Send an order, or leave it if there is no room: the next one says the same."""
+        """Send an order, or drop it if there is no room: the next one has the same content."""
 
     def newest(self) -> tuple[Status | None, float]:
-        """The newest status, and when the last message came, on `time.monotonic`."""
+        """Return the newest status, and the time of the last message on `time.monotonic`."""
 
     def result(self) -> Result | None:
-        """Its result, once it has sent one and ended."""
+        """Return the process's result once it has sent one and ended."""
 
     def fault(self) -> str | None:
-        """What it has sent that cannot be used, in words; None if there is nothing."""
+        """Return what is wrong with a message that it has sent, in words; None if nothing is."""
 
     def end_of_process(self) -> str | None:
-        """How the process has ended without a result, in words; None if it runs."""
+        """Return how the process has ended without a result, in words; None while it runs."""
 
     def kill(self) -> None:
         """End the process at once."""
@@ -78,10 +81,11 @@ class Coordinator:
     Attributes:
         started: permission to take off has been given to the first group.
         reasons: why vehicles were ordered to land, other than by the operator.
-        near_pairs: pairs that were ordered to land, as they came too near each other.
-        unwatched: vehicles in the air whose distance to another one is not known now.
-        rounds: how many rounds there were; it stands still while the thread hangs.
-        failure: the error that a round has raised, since when all are ordered to land; else None.
+        near_pairs: pairs that were ordered to land because they came too close to each other.
+        unwatched: vehicles in the air whose distance to another one is unknown at present.
+        rounds: the number of rounds so far, which does not change while the thread hangs.
+        failure: the error that a round has raised, after which all are ordered to land; otherwise
+            None.
     """
 
     def __init__(
@@ -99,7 +103,8 @@ class Coordinator:
         self.failure: str | None = None
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
-        # Its order is that of `land`. One step each: the keys and the page call it at a time.
+        # Vehicles in the order of `land` calls. Each call adds one in a single step, because the
+        # keys and the page may call it at the same time.
         self._landed: dict[str, None] = {}
         self._were_near: frozenset[str] = frozenset()
         self._garbled: frozenset[str] = frozenset()
@@ -110,11 +115,11 @@ class Coordinator:
         self._begun_s = clock()
         self._may_have_flown: set[str] = set()
 
-    # --- what others ask and order ---
+    # --- Queries and orders of others ---
 
     @property
     def views(self) -> tuple[VehicleView, ...]:
-        """What is known of each vehicle, in the order of the file."""
+        """What is known about each vehicle, in the order of the file."""
         return self._views
 
     @property
@@ -128,26 +133,28 @@ class Coordinator:
         return all(view.result is not None for view in self._views)
 
     def confirm(self) -> None:
-        """The operator's yes: flights begin as soon as all are ready at once."""
+        """Confirm on the operator's behalf: the flights begin as soon as all vehicles are ready at
+        the same time."""
         self._confirmed = True
 
     def land(self, name: str) -> None:
-        """Land one vehicle; one on the floor does not take off any more. Raises InvalidValue if
-        the fleet has no vehicle of this name."""
+        """Land one vehicle; a vehicle on the floor does not take off any more. Raises InvalidValue
+        if no vehicle of the fleet has this name."""
         if name not in self._children:
             known = ", ".join(self._children)
             raise InvalidValue(f"the fleet has no vehicle {name!r}; it has {known}")
         self._landed[name] = None
 
-    # --- one round ---
+    # --- One round ---
 
     def step(self) -> None:
-        """Hear all, decide, and send each order that is new or due."""
+        """Receive all messages, decide, and send each order that is new or due."""
         now_s = self._clock()
         self._views = tuple(
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
-        word = self._switch.read()  # once: what lands all must not come after the permission
+        # read once: an order to land all must not arrive after the permission
+        word = self._switch.read()
         if self._confirmed and are_all_ready(self._views) and word is OperatorRequest.NONE:
             self.started = True
         self._watch_distances()
@@ -161,7 +168,8 @@ class Coordinator:
         self.rounds += 1
 
     def run(self, until: threading.Event) -> None:
-        """Repeat `step` until `until` is set; after a round that raised, `step_stopping`."""
+        """Repeat `step` until `until` is set; after a round that raised an exception, repeat
+        `step_stopping`."""
         while not until.wait(ROUND_S):
             if self.failure is None:
                 try:
@@ -172,8 +180,9 @@ class Coordinator:
                 self.step_stopping()
 
     def step_stopping(self) -> None:
-        """Order all to land, or to cut their motors by the operator's word, and hear whom still can
-        be heard. What failed in one vehicle's place does not keep the others from their orders."""
+        """Order all to land, or to cut their motors on the operator's command, and receive what can
+        still be received. An error with one vehicle does not keep the others from getting their
+        orders."""
         now_s, word = self._clock(), self._switch.read()
         order = Order(
             word=OperatorRequest.STOP if word is OperatorRequest.STOP else OperatorRequest.LAND
@@ -192,7 +201,8 @@ class Coordinator:
         self.rounds += 1
 
     def _watch_distances(self) -> None:
-        """Land both of two that are too near each other; they do not go on once they are apart."""
+        """Land both vehicles of a pair that came too close; they do not continue once they are
+        apart again."""
         self.unwatched = find_unwatched(self._plan, self._views)
         for pair in find_near_pairs(self._plan, self._views):
             both = {pair.first, pair.second}
@@ -203,7 +213,7 @@ class Coordinator:
             self._were_near |= both
 
     def _watch_messages(self) -> None:
-        """Land whoever has sent what cannot be used: what it reports is not known then."""
+        """Land each vehicle that has sent an invalid message, since its state is then unknown."""
         for name, child in self._children.items():
             fault = child.fault()
             if fault is not None and name not in self._garbled:
@@ -229,7 +239,8 @@ class Coordinator:
     def _lost(
         self, name: str, child: Child, status: Status | None, silent_s: float
     ) -> Result | None:
-        """The result of a process that has ended without one, or hangs and is ended now."""
+        """Return the result of a process that has ended without one, or that hangs and is ended
+        now."""
         problem = child.end_of_process()
         loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
         if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):
@@ -255,13 +266,14 @@ class Coordinator:
         due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
         if name not in self._results and (due or order != self._sent.get(name)):
             self._sent[name], self._sent_s[name] = order, now_s
-            if order.may_take_off:  # it need not have told of its take-off before it is lost
+            if order.may_take_off:  # it may be lost before it has reported its take-off
                 self._may_have_flown.add(name)
             self._children[name].send(order)
 
 
 def _explained(result: Result, why: str | None) -> Result:
-    """The result of a vehicle that the parent has kept from flying or has landed, and `why`."""
+    """Return the result of a vehicle that the parent has kept from flying or has landed, with the
+    reason `why`."""
     if why is None or result.exit_code == 0:
         return result
     return replace(result, reason=f"{why}: {result.reason}")

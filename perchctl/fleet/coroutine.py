@@ -1,7 +1,7 @@
-"""A function that runs in a thread of its own, but only while its owner lets it.
+"""A function that runs in a thread of its own, but only when its owner lets it.
 
-A flight in lockstep is one long call, whose simulated time passes deep inside. To advance several
-flights together, each one runs in a thread that gives the baton back at each step:
+A flight in lockstep is one long call, and its simulated time advances deep inside it. To advance
+several flights together, each runs in a thread that returns the baton after each step:
 
     owner                       thread
     resume()  --- baton --->    runs on
@@ -21,14 +21,14 @@ R = TypeVar("R")
 
 
 class CoroutineClosed(BaseException):
-    """Ends a function whose owner has gone; its `except Exception` clauses do not catch it."""
+    """Ends a function whose owner is gone; its `except Exception` clauses do not catch it."""
 
 
 class ThreadCoroutine(Generic[R]):
     """Runs `function` from one `pause` to the next; the function itself calls `pause`.
 
-    `result` is what it has returned, None before. Close it in the end: a thread that waits for ever
-    keeps all that its function refers to.
+    `result` is its return value, None before it has returned. Close the object at the end: a thread
+    that waits forever keeps alive everything that its function refers to.
     """
 
     def __init__(self, function: Callable[[], R], name: str) -> None:
@@ -41,8 +41,8 @@ class ThreadCoroutine(Generic[R]):
         self._thread.start()
 
     def resume(self) -> bool:
-        """Let the function run until it pauses or ends; True if it has ended. What it raises is
-        raised here."""
+        """Let the function run until it pauses or ends; return True if it has ended. An exception
+        in the function is raised here."""
         if not self._ended:
             self._baton.release()
             self._returned.acquire()
@@ -59,7 +59,7 @@ class ThreadCoroutine(Generic[R]):
             raise CoroutineClosed
 
     def close(self) -> None:
-        """End the function where it waits, if it has not ended by itself."""
+        """End the function at its present `pause`, unless it has already ended."""
         self._closed = True
         self._baton.release()
         self._thread.join()
@@ -71,7 +71,7 @@ class ThreadCoroutine(Generic[R]):
                 self.result = self._function()
         except CoroutineClosed:
             pass
-        except BaseException as error:  # for the owner, in its own thread
+        except BaseException as error:  # raised for the owner, in its own thread
             self._error = error
         self._ended = True
         self._returned.release()

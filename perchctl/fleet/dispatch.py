@@ -1,4 +1,4 @@
-"""Who may take off, who lands, and why: the parent's whole judgement, as pure functions.
+"""Who may take off, who lands, and why: all decisions of the parent, as pure functions.
 
     nothing is permitted until all are ready at the same time and the operator has confirmed
     groups fly in the order of the schedule, each once all of the group before have ended
@@ -6,13 +6,13 @@
     a failure before the first take-off ends all; later it ends all with ``on_failure: land-all``
     two in the air that are known to be too near each other land
 
-Only a vehicle that measures its position in the room's axes (``frame: room``) is believed where it
-says it is. For all others, the places are those of the plan.
+The reported position is used only for a vehicle that measures it in the room's axes (``frame:
+room``). For all others, the places of the plan are used.
 
-What if a position is old, or cannot be trusted? Then a distance is unknown, and unknown lands
-nobody: one vehicle's lost link would end its neighbours' flights. Nor does it count as far enough:
-`find_unwatched` names it for people. What keeps two such vehicles apart is the corridor that each
-enforces by itself, for which no message has to arrive.
+If a position is old or cannot be trusted, the distances to it are unknown. An unknown distance
+lands nobody; otherwise a lost link of one vehicle would end its neighbours' flights. It does not
+count as safe either: `find_unwatched` lists such vehicles for people. Two of them are kept apart by
+the corridor that each vehicle enforces by itself, without any message.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, gap_text
 from perchctl.mission import OperatorRequest
 
 FRESH_STATUS_S = 1.0
-"""A vehicle whose process has sent nothing for so long is not ready. Longer, and one that hangs
-counts as ready; shorter, and a busy computer puts off the start."""
+"""Time without a message after which a vehicle is not ready, s. Longer: a process that hangs counts
+as ready. Shorter: a busy computer delays the start."""
 
 NEAR_MARGIN_M = 2.0 * ROOM_ERROR_M
-"""Two vehicles that are so much nearer to each other than the plan promises land, m: both positions
-may be wrong by `ROOM_ERROR_M`. Larger, and two that approach each other are noticed later; smaller,
-and such errors land vehicles that keep apart."""
+"""Two vehicles land if they are closer than the plan promises by this distance, m; the positions of
+both may be wrong by `ROOM_ERROR_M`. Larger: two vehicles that approach each other are noticed
+later. Smaller: such errors land vehicles that are far enough apart."""
 FRESH_PLACE_S = 0.5
-"""A position older than this is unknown, s. Longer, and two that fly 0.4 m/s towards each other
-come 0.4 m nearer unnoticed; shorter, and with slow telemetry, and a status ten times a second,
-distances are unknown all the time."""
+"""Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
+other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
+second, distances are unknown all the time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleView:
-    """What the parent knows of one vehicle.
+    """What the parent knows about one vehicle.
 
     Attributes:
-        status: its newest one; None before the first.
-        silent_s: since its last message.
+        status: the newest status; None before the first.
+        silent_s: time since its last message.
         result: how it ended; None until then.
     """
 
@@ -70,8 +70,8 @@ class VehicleView:
 
     @property
     def place_age_s(self) -> float:
-        """Age of the position in its newest status, by all parts that may hang: telemetry, flight
-        loop and process. Infinite if one is unknown."""
+        """Age of the position in the newest status, including all parts that may hang: telemetry,
+        flight loop and process. Infinite if one of them is unknown."""
         status = self.status
         if status is None or status.telemetry_age_s is None or status.loop_age_s is None:
             return math.inf
@@ -84,13 +84,14 @@ class VehicleView:
 
     @property
     def is_ready(self) -> bool:
-        """True if nothing but permission keeps it on the floor."""
+        """True if only the permission to take off is missing."""
         return self.result is None and self.stage is Stage.READY and not self.is_silent
 
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """An order for each vehicle, and the reason for each order that the operator did not give."""
+    """An order for each vehicle, and the reason for each order that does not come from the
+    operator."""
 
     orders: Mapping[str, Order]
     reasons: Mapping[str, str]
@@ -109,15 +110,15 @@ def decide(
     word: OperatorRequest = OperatorRequest.NONE,
     landed: Collection[str] = (),
 ) -> Decision:
-    """The orders of this moment.
+    """Return the orders at this moment.
 
     Args:
         started: all were ready, and the operator has confirmed; never taken back.
-        word: the operator's, for all.
-        landed: vehicles that the operator lands one by one.
+        word: the operator's command for all vehicles.
+        landed: vehicles that the operator has landed individually.
     """
     ended = {view.name: view.result for view in views if view.result is not None}
-    # Whom the operator has landed alone has not failed, once the fleet flies.
+    # Once the fleet flies, a vehicle that the operator has landed individually has not failed.
     by_key = {
         name
         for name, result in ended.items()
@@ -146,7 +147,7 @@ def decide(
 
 @dataclass(frozen=True, kw_only=True)
 class NearPair:
-    """Two vehicles in the air that are nearer to each other than the plan allows."""
+    """Two vehicles in the air that are closer to each other than the plan allows."""
 
     first: str
     second: str
@@ -156,14 +157,14 @@ class NearPair:
         return f"{self.first} and {self.second} were {self.distance_m:.2f} m apart in the air"
 
     def why(self, name: str) -> str:
-        """The reason why the vehicle called `name`, one of the two, lands."""
+        """Return the reason why the vehicle called `name`, one of the two, lands."""
         other = self.second if name == self.first else self.first
         return f"{self.distance_m:.2f} m from {other} in the air"
 
 
 def find_near_pairs(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[NearPair, ...]:
-    """All pairs in the air that are known to be nearer to each other, level, than the plan's
-    separation less `NEAR_MARGIN_M`."""
+    """Return all pairs in the air whose known horizontal distance is below the plan's separation
+    minus `NEAR_MARGIN_M`."""
     least_m = plan.separation_m - NEAR_MARGIN_M
     known = [(name, place) for name, place in air_places(plan, views).items() if place is not None]
     return tuple(
@@ -174,14 +175,14 @@ def find_near_pairs(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[Near
 
 
 def find_unwatched(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[str, ...]:
-    """Those in the air whose distance to another one should be known, and is not."""
+    """Return the vehicles in the air whose distance to another one should be known but is not."""
     places = air_places(plan, views)
     return tuple(name for name, place in places.items() if place is None and len(places) > 1)
 
 
 def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point | None]:
-    """The places, in the room's axes, of all in the air that measure their position there; None if
-    it is unknown now."""
+    """Return the positions, in the room's axes, of all vehicles in the air that measure their
+    position there; None if it is unknown at present."""
     places: dict[str, Point | None] = {}
     for view in views:
         vehicle = plan.fleet.vehicle(view.name)
@@ -196,8 +197,8 @@ def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point
 
 
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:
-    """Why this vehicle must not take off any more: who has ended in the way of its corridor. Those
-    that have ended do not move again, so it is for good."""
+    """Return why this vehicle must not take off any more: another one has ended in its corridor.
+    Vehicles that have ended do not move again, so this is permanent."""
     corridor = plan.corridors[name]
     for other, result in ended.items():
         vehicle = plan.fleet.vehicle(other)
@@ -219,7 +220,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
 
 def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
     """True if a vehicle that has ended is known to stand where it took off. An estimate that begins
-    at zero drifts, so it does not show it."""
+    at zero drifts, so it cannot show this."""
     if not result.has_flown:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:

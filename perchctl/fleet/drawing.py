@@ -1,7 +1,7 @@
 """The room from above: homes, corridors, targets and order, as text and as SVG.
 
 Both show the room's axes, x to the right and y up. A plan that is refused is drawn as well, without
-its order: it shows what is in whose way.
+its order, to show which vehicles are in each other's way.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from perchctl.fleet.schedule import vehicle_corridor
 
 DRAWING_COLUMNS = 80
 DRAWING_ROWS = 34
-"""Of the map; with more of them it does not fit on a screen together with its legend."""
+"""Rows of the map. With more, it does not fit on a screen together with its legend."""
 CELL_ASPECT = 2.0
-"""Height of a character over its width, in usual terminals."""
+"""Ratio of height to width of a character in usual terminals."""
 MARGIN_M = 0.2
-"""Around the corridors."""
+"""Margin around the corridors, m."""
 OVERLAP = "#"
 INSIDE = "."
 
 _SVG_WIDTH_PX = 800
 _LEGEND_ROW_PX = 22
 _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind people can tell apart, as in perchctl's plots."""
+"""The colours of Okabe and Ito, as in perchctl's plots: colour-blind people can tell them apart."""
 
 
 def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
@@ -41,7 +41,7 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     low, high = _bounds(corridors)
     width_m, height_m = high[0] - low[0], high[1] - low[1]
     cell_m = max(width_m / DRAWING_COLUMNS, height_m / (DRAWING_ROWS * CELL_ASPECT))
-    label = len(f"{len(fleet.vehicles)}*")  # fits also into a room that is long and narrow
+    label = len(f"{len(fleet.vehicles)}*")  # also fits a room that is long and narrow
     columns = min(DRAWING_COLUMNS, max(label, math.ceil(width_m / cell_m)))
     rows = min(DRAWING_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
     cells = [
@@ -99,8 +99,8 @@ def _ordinal(number: int) -> str:
 
 
 def draw_svg(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
-    """The room as an SVG picture; corridors as wide lines with round ends, homes as squares,
-    targets as crosses."""
+    """Return the room as an SVG picture: corridors as wide lines with round ends, homes as squares,
+    and targets as crosses."""
     corridors = _corridors(fleet)
     low, high = _bounds(corridors)
     scale = _SVG_WIDTH_PX / (high[0] - low[0])
@@ -148,7 +148,7 @@ def _corridors(fleet: Fleet) -> dict[str, Corridor]:
 
 
 def _bounds(corridors: Mapping[str, Corridor]) -> tuple[Point, Point]:
-    """The lower left and the upper right corner of what is drawn."""
+    """Return the lower left and the upper right corner of the drawing."""
     edges = [
         (place[0] + sign * reach, place[1] + sign * reach)
         for corridor in corridors.values()

@@ -1,4 +1,4 @@
-"""Several vehicles in one room, as frozen values: who flies from where to which target."""
+"""Several vehicles in one room, as frozen values: their homes, their targets and how they fly."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Assign = Literal["fixed", "nearest"]
 ONE_AT_A_TIME = "one-at-a-time"
 TOGETHER = "together"
 MOST_VEHICLES = 32
-"""In one fleet; with more of them a plan would take longer to work out than anyone waits."""
+"""Largest number of vehicles in a fleet. With more, computing a plan would take too long."""
 
 
 def vehicle_seed(fleet_seed: int, number: int) -> int:
-    """The seed of the vehicle with this number, from 0 on: no two vehicles of any two fleets have
-    the same."""
+    """Return the seed of the vehicle with this number, counted from 0. No two vehicles of any
+    fleets have the same seed."""
     return MOST_VEHICLES * fleet_seed + number
 
 
@@ -53,7 +53,7 @@ class FleetVehicle:
 
     @property
     def uri(self) -> str:
-        """The vehicle's URI; one without a dongle (``radio:///80``) has been given one."""
+        """The vehicle's URI. A URI without a dongle (``radio:///80``) has been given one."""
         return self.profile.link.uri
 
     @property
@@ -73,26 +73,26 @@ class FleetVehicle:
 
     @property
     def as_flown(self) -> FleetVehicle:
-        """The vehicle as a process of its own flies it. The axes of a simulated one begin where it
-        stands, also if its position comes from a simulated motion capture."""
+        """The vehicle as its own process flies it. The axes of a simulated vehicle begin where it
+        stands, even if its position comes from a simulated motion capture."""
         if not self.simulated or self.frame == "home":
             return self
         return replace(self, frame="home").with_target(self.target_m)
 
     def flown_to_room(self, estimate_m: Point) -> Point:
-        """A place in the axes in which `as_flown` flies, in those of the room."""
+        """Convert a place from the axes in which `as_flown` flies to those of the room."""
         axes = replace(self, frame="home") if self.simulated else self
         return axes.to_room(estimate_m)
 
     def to_room(self, estimate_m: Point) -> Point:
-        """A place in the axes of the vehicle's state estimate, in those of the room."""
+        """Convert a place from the axes of the vehicle's state estimate to those of the room."""
         if self.frame == "room":
             return estimate_m
         x, y = _rotated(estimate_m, math.radians(self.heading_deg))
         return self.home_m[0] + x, self.home_m[1] + y
 
     def to_estimate(self, room_m: Point) -> Point:
-        """A place in the room's axes, in those of the vehicle's state estimate."""
+        """Convert a place from the room's axes to those of the vehicle's state estimate."""
         if self.frame == "room":
             return room_m
         away = room_m[0] - self.home_m[0], room_m[1] - self.home_m[1]
@@ -102,8 +102,8 @@ class FleetVehicle:
         """The vehicle with a target at this place of the room; `target`: its markers, by default
         those of the vehicle's profile.
 
-        By the target alone the vehicle gets no point to approach: it stands below its target,
-        and turned by a few degrees it would begin by flying away from it.
+        A vehicle that flies with the target alone gets no point to approach. It stands below its
+        target, and a heading error of a few degrees would make it fly away from it first.
         """
         expected_m = self.to_estimate(target_m)
         planner = self.profile.planner
@@ -144,7 +144,7 @@ class Fleet:
 
     @property
     def most_at_once(self) -> int:
-        """How many vehicles may be in the air at a time."""
+        """The largest number of vehicles in the air at the same time."""
         if self.order == ONE_AT_A_TIME:
             return 1
         if self.order == TOGETHER:
@@ -152,7 +152,7 @@ class Fleet:
         return int(self.order.split()[0])
 
     def vehicle(self, name: str) -> FleetVehicle:
-        """The vehicle of this name. Raises KeyError."""
+        """Return the vehicle of this name. Raises KeyError."""
         for vehicle in self.vehicles:
             if vehicle.name == name:
                 return vehicle

@@ -1,4 +1,4 @@
-"""The folder of a fleet's flight, read again: ``fleet.json`` and the logs that it names."""
+"""Read the folder of a fleet's flight: ``fleet.json`` and the logs that it names."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetFolder:
-    """A fleet's flight, as its record has it.
+    """A fleet's flight, as recorded in ``fleet.json``.
 
     Attributes:
         logs: the logs that exist, by the vehicle's name, in the order of the record.
-        lines: how each vehicle ended, by its name; also of those without a log.
+        lines: how each vehicle ended, by its name, including those without a log.
     """
 
     record: dict[str, Any]
@@ -32,8 +32,8 @@ class FleetFolder:
     lines: dict[str, str]
 
     def filmed(self) -> list[FilmedVehicle]:
-        """Each vehicle with a log, for `perchctl.analysis.write_fleet_film`. Errors: those of
-        reading a log, and InvalidValue for a record without the plan."""
+        """Return each vehicle with a log, for `perchctl.analysis.write_fleet_film`. Errors: those
+        of reading a log, and InvalidValue for a record without the plan."""
         from perchctl.analysis import FlightAnalysis
 
         flights = {}
@@ -54,12 +54,12 @@ class FleetFolder:
 def _filmed(
     name: str, flight: FlightAnalysis, plan: Mapping[str, Any], end: Mapping[str, Any]
 ) -> FilmedVehicle:
-    from perchctl.analysis import FilmedVehicle  # loads matplotlib; a report does without it
+    from perchctl.analysis import FilmedVehicle  # loads matplotlib, which a report does not need
 
     log = Path(flight.log.path)
     pace = (end.get("pace") or {}).get("ratio") or 1.0
     lasts_s = flight.log.end_s / pace
-    # A simulated vehicle's estimate begins where it stands, also with a motion capture.
+    # The estimate of a simulated vehicle begins where it stands, even with a motion capture.
     is_simulated = str(plan["uri"]).startswith("sim://")
     return FilmedVehicle(
         name=name,
@@ -81,9 +81,9 @@ def _point(values: Sequence[float]) -> Point:
 
 
 def read_fleet_folder(folder: Path) -> FleetFolder | None:
-    """The fleet's flight in this folder; None without a ``fleet.json``.
+    """Return the fleet's flight in this folder; None without a ``fleet.json``.
 
-    Raises InvalidValue if that is no record of a fleet.
+    Raises InvalidValue if that file is no record of a fleet.
     """
     path = folder / RECORD_NAME
     if not path.is_file():
@@ -96,7 +96,7 @@ def read_fleet_folder(folder: Path) -> FleetFolder | None:
             lines[name] = vehicle_line(
                 name, vehicle["hangs"], vehicle["outcome"], vehicle["miss_m"], vehicle["reason"]
             )
-            # Its name only: a folder may have been moved.
+            # Only the file's name, because the folder may have been moved.
             log = None if vehicle["log"] is None else folder / Path(vehicle["log"]).name
             if log is not None and log.is_file():
                 logs[name] = log

@@ -1,5 +1,5 @@
-"""`perchctl fleet check --identify`: whether address, body, camera and home of each vehicle belong
-together, one vehicle after the other."""
+"""`perchctl fleet check --identify`: check one vehicle after another that its address, body, camera
+and home belong together."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def identify_fleet(
     plan: FleetPlan, scope: CheckScope, ask: Callable[[str], bool]
 ) -> Iterator[tuple[str, Row]]:
     """Yield the rows of each vehicle with its name, as they are known. Connects to one vehicle at a
-    time, so that vehicles that share a dongle need no radio hub.
+    time, so vehicles that share a dongle need no radio hub.
 
-    Errors: those of `flight_options`, and of `perchctl.check.check`.
+    Errors: those of `flight_options` and of `perchctl.check.check`.
     """
     options = flight_options(plan, Path(plan.fleet.name), 0, False)
     for vehicle in plan.fleet.vehicles:
@@ -32,7 +32,7 @@ def identify_fleet(
 
 
 def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
-    """Where this vehicle stands, and what the others would look like in its place."""
+    """Return where this vehicle stands, and what the others would observe in its place."""
     flown = vehicle.as_flown
     others = [other for other in fleet.vehicles if other.name != vehicle.name]
     own_m, within_m = _seen_m(vehicle, vehicle.target_m), vehicle.profile.target.expected_within_m
@@ -59,7 +59,7 @@ def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
 
 
 def _seen_m(vehicle: FleetVehicle, place_m: Point) -> Point:
-    """A place of the room as a vehicle at its home sees it: forward, left."""
+    """Convert a place of the room to how a vehicle at its home sees it: forward, left."""
     return replace(vehicle, frame="home").to_estimate(place_m)
 
 

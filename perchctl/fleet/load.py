@@ -1,4 +1,4 @@
-"""From a fleet file to a checked, frozen `Fleet`.
+"""Load a fleet file and check it; the result is a frozen `Fleet`.
 
 Every fault is one sentence of the form ``file: vehicle NAME: key: what is wrong``. Nothing is
 connected or opened.
@@ -34,20 +34,21 @@ from perchctl.profile import (
 )
 
 EXAMPLE_FLEET = "four"
-"""The shipped fleet that is used where none is named."""
+"""The fleet in the package that is used if none is named."""
 FARTHEST_M = 50.0
-"""Of a home or target from the room's origin: farther off, millimetres were meant."""
+"""Largest distance of a home or target from the room's origin, m. Farther off, the numbers are
+probably millimetres."""
 _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
 _NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
 _PROFILE_KEYS = tuple(name for name in Profile.model_fields if name not in ("name", "description"))
 _SECTIONS = tuple(name for name in _PROFILE_KEYS if name != "date")
 _ALSO_TEXT = ("target", "positioning")
-"""Sections whose value may be text instead: a file's name, what measures positions."""
+"""Sections whose value may be text instead: a file's name, or the positioning method."""
 
 
 class _Common(Section):
-    """Keys that a vehicle may have from `defaults`, beside those of the profile."""
+    """Keys that a vehicle may get from `defaults` in addition to those of the profile."""
 
     profile: str | None = key(None, "profile, by name or path")
     uri: str | None = key(None, "URI of the vehicle")
@@ -78,7 +79,7 @@ class _File(Section):
 
 
 def find_fleet(name: str) -> Path:
-    """The file of a fleet given by path or name. NotFound names the choices."""
+    """Return the file of a fleet given by path or name. NotFound names the choices."""
     path = Path(name).expanduser()
     if path.is_file():
         return path
@@ -92,7 +93,8 @@ def find_fleet(name: str) -> Path:
 
 
 def load_fleet(name: str | Path = EXAMPLE_FLEET) -> Fleet:
-    """The fleet with path or name `name`, checked, each vehicle with its profile and target.
+    """Return the checked fleet with the path or name `name`, each vehicle with its profile and
+    target.
 
     Errors: NotFound, InvalidValue.
     """
@@ -159,16 +161,17 @@ def _vehicle(
 
 
 def default_frame(profile: Profile) -> Frame:
-    """The frame of a vehicle whose fleet file names none: motion capture measures in the room's
-    axes. A deck may be a Lighthouse, but as a profile does not say so, it counts as a Flow deck,
-    whose drift needs more room."""
+    """Return the frame of a vehicle whose fleet file names none. Motion capture measures in the
+    room's axes. A deck may be a Lighthouse but, since a profile does not say so, it counts as a
+    Flow deck, whose drift needs more room."""
     return "room" if profile.positioning.source.is_mocap else "home"
 
 
 def _layers(
     path: Path, where: str, keys: _Common, sections: dict[str, Any]
 ) -> Iterable[dict[str, Any]]:
-    """The profile's keys that `defaults` or a vehicle give, the stronger ones last."""
+    """Return the profile's keys from `defaults` and from a vehicle; later ones override earlier
+    ones."""
     sections = dict(sections)
     if isinstance(file := sections.get("target"), str):
         target_path = path.parent / Path(file).expanduser()
@@ -184,7 +187,7 @@ def _layers(
 
 
 def _with_own_body(profile: Profile, name: str) -> Profile:
-    """By motion capture a body that nobody has named is called as the vehicle is."""
+    """With motion capture, a body without a name gets the vehicle's name."""
     positioning = profile.positioning
     if not positioning.source.is_mocap or "body" in positioning.model_fields_set:
         return profile
@@ -192,7 +195,7 @@ def _with_own_body(profile: Profile, name: str) -> Profile:
 
 
 def _check(where: str, vehicle: FleetVehicle) -> None:
-    """Refuse a frame, a URI or a camera source that could not be flown."""
+    """Refuse a frame, a URI or a camera source with which the vehicle could not be flown."""
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
@@ -203,7 +206,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
         )
     try:
         if not is_own_uri(uri):
-            # Any dongle, as cfcli writes it, gets a number later.
+            # A URI for any dongle, as cfcli writes it, gets a number later.
             check_uri(uri.replace("radio:///", "radio://0/", 1))
         source = parse_source(vehicle.source)
     except PerchError as error:
@@ -216,7 +219,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
 
 
 def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> Point:
-    """Where the vehicle's target is in the room. Raises InvalidValue if nothing says it."""
+    """Return where the vehicle's target is in the room. Raises InvalidValue if nothing says so."""
     if target_m is not None:
         return target_m
     expected_m = vehicle.profile.target.expected_xy_m
@@ -228,7 +231,7 @@ def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> 
     return vehicle.to_room(expected_m)
 
 
-# --- Two vehicles that share what they must not ---
+# --- Resources that two vehicles must not share ---
 
 
 def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
@@ -253,12 +256,12 @@ def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
 
 
 def _address(vehicle: FleetVehicle) -> str | None:
-    """None for a simulated vehicle: each flight starts a simulator of its own."""
+    """Return None for a simulated vehicle: each flight starts its own simulator."""
     return None if vehicle.simulated else vehicle.address
 
 
 def _camera(vehicle: FleetVehicle) -> str | None:
-    """None for what is no device: the simulated camera, and recordings."""
+    """Return None for a source that is no device: the simulated camera, and recordings."""
     source = parse_source(vehicle.source)
     return source.device if source.live and source.scheme != "sim" else None
 
@@ -274,7 +277,8 @@ def _body(vehicle: FleetVehicle) -> str | None:
 def _split(
     where: str, model: type[Section], values: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys of `model`, and those of the profile. Raises InvalidValue for any other."""
+    """Return the keys of `model` and those of the profile. Raises InvalidValue for any other
+    key."""
     own = {name: value for name, value in values.items() if name in model.model_fields}
     sections = {name: value for name, value in values.items() if name in _PROFILE_KEYS}
     for name in values:
@@ -285,7 +289,7 @@ def _split(
                 f"{nearest_names(str(name), allowed)}"
             )
     for name, value in sections.items():
-        # The same section of another layer would replace it unnoticed.
+        # The same section in another layer would replace this one unnoticed.
         is_text = name in _ALSO_TEXT and isinstance(value, str)
         if name in _SECTIONS and not is_text and not isinstance(value, dict):
             raise InvalidValue(
@@ -304,7 +308,7 @@ def _validated(where: object, model: type[Section], values: dict[str, Any]) -> A
 
 
 def _in_words(key: str, reason: str) -> str:
-    """The reason with what is allowed, where pydantic shows a regular expression."""
+    """Return the reason with the allowed values, where pydantic shows a regular expression."""
     found = reason.rpartition(", found ")[2]
     if reason.startswith("string should match") and key == "order":
         return f"found {found}; allowed are one-at-a-time, together, or as in 2 at a time"

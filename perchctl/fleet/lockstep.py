@@ -1,7 +1,8 @@
-"""A whole fleet's flight in lockstep: one room, one clock, the same result for a seed.
+"""The flight of a whole fleet in lockstep: one room, one clock, and the same result for the same
+seed.
 
-Each vehicle is one flight in lockstep, as `perchctl simulate --faults` flies and judges it. It runs
-in a `ThreadCoroutine` that pauses at each tick of the room's clock:
+Each vehicle's flight is a flight in lockstep, flown and judged as by `perchctl simulate --faults`.
+It runs in a `ThreadCoroutine` that pauses at each tick of the room's clock:
 
     for each group of the schedule:
         until all of its flights have ended:
@@ -9,9 +10,8 @@ in a `ThreadCoroutine` that pauses at each tick of the room's clock:
             each flight runs until its own clock has reached the room's     (in the fleet's order)
             the room measures distances, and says who feels whose downwash
 
-A vehicle of a later group stands at its home meanwhile. What has ended stays where it is: it hangs,
-stands or lies. The next group is started only past what the schedule allows: who lies away from its
-home may be in somebody's way.
+Meanwhile, the vehicles of later groups stand at their homes. A vehicle that has ended stays where
+it hangs, stands or lies. A vehicle of the next group starts only if none of them is in its way.
 """
 
 from __future__ import annotations
@@ -46,22 +46,25 @@ from perchctl.fleet.room import PlacedVehicle, Room, body_name, place_fleet
 from perchctl.fleet.schedule import OBSTACLE_M, gap_text
 
 TICK_S = 0.02
-"""Of the room's clock: two vehicles that fly 0.4 m/s are 8 mm nearer by then. Larger: a collision
-between two ticks is missed, and downwash is late; smaller: more waiting for each other."""
+"""Period of the room's clock, s; two vehicles that fly at 0.4 m/s come 8 mm closer in it. Larger: a
+collision between two ticks is missed, and the downwash is late. Smaller: the flights wait for each
+other more often."""
 AT_HOME_M = 0.12
-"""A vehicle that has landed this near its home stands where the plan expects it: the radius that
-Crazyswarm takes for a vehicle. Larger: a plan is trusted whose obstacles have moved."""
+"""Distance from its home within which a landed vehicle stands where the plan expects it, m; it is
+the radius of a vehicle according to Crazyswarm. Larger: a plan is trusted although its obstacles
+have moved."""
 CAUSE_S = (1.0, 25.0)
-"""When a common cause befalls a group, after its begin: nearly all vehicles hang after 25 s."""
+"""Times after the start of a group within which a common cause begins, s: after 25 s nearly all
+vehicles hang."""
 FOR_GOOD_S = 1e3
-"""A common cause that lasts longer than any flight is over for no later group."""
+"""Duration above which a common cause is permanent, longer than any flight, s."""
 _FAULT_STREAM = 32
 _FAULT_BY_NAME = {fault.name: fault for fault in FAULTS}
 _CAUSE_BY_NAME = {cause.name: cause for cause in COMMON_CAUSES}
 
 
 def fleet_faults() -> dict[str, str]:
-    """All faults of one vehicle and all common causes: name and description."""
+    """Name and description of all faults of one vehicle and all common causes."""
     causes = {
         name: f"in several vehicles: {c.fault.description}" for name, c in _CAUSE_BY_NAME.items()
     }
@@ -69,15 +72,15 @@ def fleet_faults() -> dict[str, str]:
 
 
 def plan_sha256(plan: FleetPlan) -> str:
-    """The SHA-256 of all that may change a fleet's flight, for a file of results."""
+    """Return the SHA-256 of everything that may change a fleet's flight, for a file of results."""
     profiles = [vehicle.profile.model_dump(mode="json") for vehicle in plan.fleet.vehicles]
     text = json.dumps([plan.record(), profiles], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def select_fleet_faults(names: str) -> tuple[str, ...]:
-    """The names of faults and common causes that stand in `names` between commas; ``all``: every
-    fault and every cause. Errors: InvalidValue."""
+    """Return the faults and common causes whose names are listed in `names`, separated by commas;
+    ``all`` selects all of them. Errors: InvalidValue."""
     if names == "all":
         return (*_FAULT_BY_NAME, *_CAUSE_BY_NAME)
     found = [part.strip() for part in names.split(",")]
@@ -89,13 +92,13 @@ def select_fleet_faults(names: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Trouble:
-    """What befalls the fleet of one seed.
+    """The faults of the fleet with one seed.
 
     Attributes:
-        name: of a fault or of a common cause; "none" without.
-        cases: by vehicle; who is not named has none.
-        group, at_s: when a common cause begins: so long after the begin of a group (from 0).
-            None: each case begins by itself.
+        name: the name of a fault or common cause; "none" without one.
+        cases: the case of each affected vehicle.
+        group, at_s: when a common cause begins: this time after the start of a group (counted from
+            0). None: each case begins by itself.
     """
 
     name: str = HEALTHY.fault.name
@@ -107,7 +110,8 @@ class Trouble:
 def draw_trouble(
     plan: FleetPlan, placed: Sequence[PlacedVehicle], faults: Sequence[str], seed: int
 ) -> Trouble:
-    """The fault or common cause of a seed, drawn from the names `faults`; none of no names."""
+    """Return the fault or common cause that a seed draws from the names `faults`; none if there are
+    no names."""
     if not faults:
         return Trouble(cases={})
     rng = np.random.default_rng([seed, _FAULT_STREAM])
@@ -129,7 +133,7 @@ def draw_trouble(
 
 
 def swapped_cases(case: Case, first: str, second: str) -> dict[str, Case]:
-    """The cases of two vehicles that each get the other one's body, from the case of one."""
+    """Return the cases of two vehicles that each get the other one's body, from the case of one."""
     return {
         name: replace(
             case, effects=tuple(partial(e, swapped_with=body_name(other)) for e in case.effects)
@@ -174,18 +178,19 @@ class _Seat:
                 on_sample=self._wait,
                 others=self._room.others_of(self.name) or None,
             )
-        except ConnectionFailed as error:  # such as no motion capture that sees it
+        except ConnectionFailed as error:  # such as a motion capture that does not see the vehicle
             return refused_vehicle(str(error))
         self._room.bodies[self.name].follow(flight.vehicle)
         return flight.fly()
 
     def _wait(self, t_s: float) -> None:
-        """Wait for the room's clock where this flight's own has reached it."""
+        """Wait for the room's clock when this flight's own clock has reached it."""
         while self._begin_s + t_s >= self._clock.t_s - 1e-6:
             self.coroutine.pause()
 
     def note_place(self) -> None:
-        """Note where the vehicle's estimate has it, in its own axes: all that its parent knows."""
+        """Note the position that the vehicle estimates, in its own axes: this is all that its
+        parent knows."""
         if self.flight is not None:
             read = self.flight.vehicle.firmware.log_value
             self.known_m = read("stateEstimate.x"), read("stateEstimate.y")
@@ -206,21 +211,22 @@ class _Clock:
 
 
 class FleetFlight:
-    """One fleet's flight, ready for a single call of `fly`."""
+    """One flight of a fleet, ready for a single call of `fly`."""
 
     def __init__(self, plan: FleetPlan, placed: Sequence[PlacedVehicle], trouble: Trouble) -> None:
         self._plan, self._trouble = plan, trouble
         self._placed = {each.name: each for each in placed}
         self._room, self._clock = Room(placed), _Clock()
         self._results: dict[str, FaultResult] = {}
-        self._known_m: dict[str, Point] = {}  # where who has ended is, in the room, as known
-        self._landed_all = ""  # who has failed, and all land for it
+        # known positions in the room of the vehicles that have ended
+        self._known_m: dict[str, Point] = {}
+        self._landed_all = ""  # the vehicle whose failure makes all the others land
         self._cause_has_begun = False
 
     def fly(self, seed: int) -> FleetResult:
-        """Fly group by group, and return what became of all."""
+        """Fly one group after another, and return how all vehicles ended."""
         for number, group in enumerate(self._plan.schedule.groups):
-            self._land_after_failure([])  # also after a group of which nobody has started
+            self._land_after_failure([])  # even if no vehicle of the group has started
             starters = [name for name in group if not self._refuse(name)]
             self._fly_group(starters, number)
         room, results = self._room, [self._results[name] for name in self._placed]
@@ -279,14 +285,15 @@ class FleetFlight:
         self._results[seat.name] = result
         body.rest()
         vehicle = self._plan.fleet.vehicle(seat.name)
-        # An estimate in the room's axes knows where they are; the simulated one begins at the true
-        # start. Of any other one, the parent takes the start from the file.
+        # An estimate in the room's axes contains the true positions; the simulated one begins at
+        # the true start. For any other estimate, the parent takes the start from the file.
         axes = self._placed[seat.name].true if vehicle.frame == "room" else vehicle
         hangs = result.outcome == "perched"
         self._known_m[seat.name] = vehicle.target_m if hangs else axes.to_room(seat.known_m)
 
     def _land_after_failure(self, seats: Sequence[_Seat]) -> None:
-        """By ``on_failure: land-all``, land all others once one has ended without perching."""
+        """With ``on_failure: land-all``, land all others once one vehicle has ended without
+        perching."""
         if self._plan.fleet.on_failure != "land-all" or self._landed_all:
             return
         ended = {name: result.outcome for name, result in self._results.items()}
@@ -299,7 +306,7 @@ class FleetFlight:
             if seat.flight is not None and seat.flight.end is None:
                 seat.flight.land()
 
-    # --- Who must not start ---
+    # --- Vehicles that must not start ---
 
     def _refuse(self, name: str) -> bool:
         """Note a vehicle that must not start as refused, standing at its home."""
@@ -318,8 +325,8 @@ class FleetFlight:
         return next(filter(None, (self._in_the_way(other, name) for other in self._known_m)), "")
 
     def _in_the_way(self, other: str, name: str) -> str:
-        """Why a vehicle that has ended is in the way of `name`; empty if it is not. A place that
-        nobody knows (NaN) is."""
+        """Return why a vehicle that has ended is in the way of `name`; empty if it is not. An
+        unknown position (NaN) always is."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
         does = "hangs" if hangs else "lies"
@@ -335,8 +342,8 @@ class FleetFlight:
         return ""
 
     def _is_lasting(self, name: str) -> bool:
-        """True if a common cause has begun that concerns this vehicle and lasts for good. One whose
-        group ended before its moment never begins."""
+        """True if a common cause that concerns this vehicle has begun and is permanent. A cause
+        whose group ended before its moment never begins."""
         case = self._trouble.cases.get(name)
         return self._cause_has_begun and case is not None and case.lasts_s > FOR_GOOD_S
 
@@ -348,7 +355,8 @@ def _finite(value: float) -> float | None:
 def fly_fleet(plan: FleetPlan, faults: tuple[str, ...], seed: int) -> FleetResult:
     """Fly one seed of a fleet to its end; any executor can send this function to a worker.
 
-    `faults`: names of `select_fleet_faults`, one of which the seed draws; none: no fault.
+    `faults`: names from `select_fleet_faults`, of which the seed draws one; without any, there is
+    no fault.
     """
 
     def fly() -> FleetResult:

@@ -1,13 +1,13 @@
-"""What a fleet's parent and the process of one vehicle say to each other.
+"""The messages between a fleet's parent and the process of one vehicle.
 
     parent  --- Order, ten times a second and when it changes --->  vehicle
     parent  <-- Status, ten times a second, and one Result -------  vehicle
 
-Every message is a whole state, never a step: one that is lost, late or doubled is made good by the
-next, and none has to be answered. What if an `Order` is the last one that arrives? Its word holds,
-and the vehicle lands after `perchctl.fleet.parent_watch.PARENT_SILENCE_S` without another. What if
-it is late? Permission to take off counts in the turn in which it is read, and a word to land or to
-cut the motors comes before it.
+Every message contains a whole state, never a change. If one is lost, late or duplicated, the next
+one corrects it, and none has to be answered. The command in the last `Order` that arrives stays
+valid, and without another order the vehicle lands after
+`perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off counts only in the turn in
+which it is read, and a command to land or to cut the motors takes precedence.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from perchctl.corridor import Point
 from perchctl.mission import OperatorRequest, Phase
 
 BEAT_S = 0.1
-"""Between two messages in each direction. Longer, and few of them are left within the second after
-which a silent parent counts as dead; shorter, and they cost computing time."""
+"""Time between two messages in each direction, s. Longer: only few arrive within the second after
+which a silent parent counts as dead. Shorter: they cost computing time."""
 
 
 class Stage(Enum):
-    """How far a vehicle's process has come."""
+    """The stages of a vehicle's process."""
 
     STARTING = "starting"  # vehicle and camera have not answered yet
     CHECKING = "checking"  # on the floor, its checks not yet passed
@@ -58,11 +58,12 @@ class VehicleOutcome(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """All that the parent wants of one vehicle. Also a sign of life, so it is sent again and again.
+    """Everything that the parent wants from one vehicle. It is also a sign of life, so it is sent
+    repeatedly.
 
     Attributes:
-        may_take_off: permission to take off; of no meaning in the air.
-        word: the operator's; a vehicle never takes back one that it has heard.
+        may_take_off: permission to take off; without meaning in the air.
+        word: the operator's command; a vehicle never takes back one that it has received.
     """
 
     may_take_off: bool = False
@@ -102,11 +103,11 @@ class Status:
 
 @dataclass(frozen=True, kw_only=True)
 class Pace:
-    """How well the computer kept up with one flight, from its first tick to its last.
+    """How well the computer kept up with one flight, from the first tick to the last.
 
     Attributes:
-        flown_s, wall_s: on the loop's clock, which is a simulator's where there is one, and on the
-            wall's.
+        flown_s, wall_s: duration on the loop's clock, which a simulator may provide, and on the
+            wall clock.
         gap_p50_s, gap_p99_s, gap_max_s: between two setpoints, on the wall clock.
         cores: computing time of the vehicle's process without its simulator, per second.
     """
@@ -120,7 +121,7 @@ class Pace:
 
     @property
     def ratio(self) -> float:
-        """Time of the flight over time on the wall: 1 in real time."""
+        """Ratio of flight time to wall-clock time: 1 in real time."""
         return self.flown_s / self.wall_s
 
 
@@ -129,7 +130,7 @@ class Result:
     """How one vehicle ended; its process sends nothing after it.
 
     Attributes:
-        has_flown: False if it has never left the floor by its own doing.
+        has_flown: False if it has never left the floor by itself.
         ended_s: `time.monotonic` at its last tick, None without one; one clock for all processes.
         place_m: its last place, in the axes of its estimate; None if the estimate could not be
             trusted then, or was old.
@@ -154,8 +155,8 @@ class Result:
 
 
 def find_fault(message: object) -> str | None:
-    """What is wrong with a message of a vehicle; None of a `Status` or `Result` whose parts that
-    decide something are of their types."""
+    """Return what is wrong with a message from a vehicle; None for a `Status` or `Result` whose
+    decisive fields have the right types."""
     match message:
         case Status():
             numbers = (message.telemetry_age_s, message.loop_age_s)

@@ -31,7 +31,7 @@ from perchctl.flight import FlyOptions
 
 RECORD_NAME = "fleet.json"
 LOOK_FIRST = "look where the vehicle is before you reach for it"
-"""Advice on a vehicle of which nobody knows how it ended."""
+"""Advice for a vehicle of which nobody knows how it ended."""
 _WORST_FIRST: tuple[type[PerchError], ...] = (
     EmergencyStopped,
     SafetyAbort,
@@ -45,7 +45,7 @@ _WORST_FIRST: tuple[type[PerchError], ...] = (
     UsageError,
     LogIncomplete,
     ReplayDiffers,
-    Interrupted,  # the last: vehicles are landed because of what another one has met
+    Interrupted,  # last: vehicles are landed because another one has failed
 )
 
 
@@ -53,44 +53,45 @@ _CODES_WORST_FIRST = (*(cls.exit_code for cls in _WORST_FIRST), 0)
 
 
 def worst_code(codes: Iterable[int]) -> int:
-    """The most severe of these exit codes; 0 of none. A code that perchctl does not know counts as
-    `PerchError`."""
+    """Return the most severe of these exit codes; 0 if there are none. A code that perchctl does
+    not know counts as `PerchError`."""
     known = (code if code in EXIT_CODES else PerchError.exit_code for code in codes)
     return min(known, key=_CODES_WORST_FIRST.index, default=0)
 
 
 def fleet_exit_code(results: Sequence[Result]) -> int:
-    """0 if all hang and their logs are complete; else the code of whoever fared worst."""
+    """Return 0 if all vehicles hang and their logs are complete, otherwise the code of the vehicle
+    that fared worst."""
     return worst_code(result.exit_code for result in results)
 
 
 def worst_of(results: Mapping[str, Result]) -> str:
-    """The name of the vehicle whose exit code is the fleet's."""
+    """Return the name of the vehicle whose exit code is the fleet's."""
     code = fleet_exit_code([*results.values()])
     return next(name for name, result in results.items() if worst_code([result.exit_code]) == code)
 
 
 def as_error(name: str, result: Result) -> PerchError:
-    """A vehicle's failure as an error of the tree, with its exit code."""
+    """Return a vehicle's failure as an error with its exit code."""
     kinds = {cls.exit_code: cls for cls in _WORST_FIRST}
     return kinds.get(result.exit_code, PerchError)(f"{name}: {result.reason}")
 
 
 def vehicle_line(name: str, hangs: bool, outcome: str, miss_m: float | None, reason: str) -> str:
-    """How one vehicle ended, for people."""
+    """Return how one vehicle ended, in words."""
     miss = "" if miss_m is None else f", {1e3 * miss_m:.1f} mm from centre"
     return f"{name:<12}{'hangs' if hangs else outcome}{miss}: {reason}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetOutcome:
-    """A fleet's flight that has ended, or has come so far.
+    """A fleet's flight that has ended, or its present state.
 
     Attributes:
         started, started_s: when it began, as a date, and on `time.monotonic`.
         results: of the vehicles that have ended, by name.
-        problems: what has befallen several of them, such as a dead dongle, a sentence each.
-        failed: the parent itself has failed, and landed all.
+        problems: problems of several vehicles, such as a dead dongle, in one sentence each.
+        failed: the parent itself has failed and landed all vehicles.
     """
 
     plan: FleetPlan
@@ -103,26 +104,26 @@ class FleetOutcome:
 
     @property
     def unfinished(self) -> tuple[str, ...]:
-        """The vehicles without a result: they still fly, or nobody knows how they ended."""
+        """The vehicles without a result: they are still flying, or nobody knows how they ended."""
         names = (vehicle.name for vehicle in self.plan.fleet.vehicles)
         return tuple(name for name in names if name not in self.results)
 
     @property
     def exit_code(self) -> int:
-        """That of whoever fared worst; a vehicle without a result counts as a failure, and so does
-        the parent's own."""
+        """The exit code of the vehicle that fared worst. A vehicle without a result counts as a
+        failure, and so does a failure of the parent."""
         codes = [result.exit_code for result in self.results.values()]
         failures = len(self.unfinished) + int(self.failed)
         return worst_code(codes + [PerchError.exit_code] * failures)
 
     @property
     def hanging(self) -> int:
-        """How many hang."""
+        """The number of vehicles that hang."""
         return sum(result.hangs for result in self.results.values())
 
     @property
     def ratio(self) -> float | None:
-        """Time of the flights over time on the wall: below 1 where simulated time ran slower."""
+        """Ratio of flight time to wall-clock time: below 1 if simulated time ran slower."""
         paces = [result.pace for result in self.results.values() if result.pace is not None]
         wall_s = sum(pace.wall_s for pace in paces)
         return sum(pace.flown_s for pace in paces) / wall_s if wall_s > 0.0 else None
@@ -173,7 +174,7 @@ class FleetOutcome:
         }
 
     def text(self) -> str:
-        """The outcome for people, a line for each vehicle."""
+        """The outcome in words, with a line for each vehicle."""
         lines = [f"{'problem':<12}{problem}" for problem in self.problems]
         for name, result in self.results.items():
             outcome = result.outcome.value

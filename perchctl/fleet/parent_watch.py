@@ -1,8 +1,8 @@
-"""The operator's word in a vehicle's own process, and what it does without a parent.
+"""The operator's commands in a vehicle's own process, and its behaviour without a parent.
 
-The flight loop and the link's watchdog both read the word many times a second. Neither waits for
-the parent: a thread of its own takes the orders in, and a parent that is dead or silent is a word
-to land. So a vehicle lands too if its loop hangs, and the parent is gone.
+The flight loop and the link's watchdog both read the command many times a second. Neither waits for
+the parent: a separate thread receives the orders, and a parent that is dead or silent counts as a
+command to land. A vehicle therefore also lands if its loop hangs and the parent is gone.
 """
 
 from __future__ import annotations
@@ -15,44 +15,45 @@ from perchctl.flight import OperatorSwitch
 from perchctl.mission import OperatorRequest
 
 PARENT_SILENCE_S = 1.0
-"""Without a message for so long, the parent hangs and the vehicle lands. Longer, and nobody can
-stop it for longer; shorter, and a busy computer ends flights."""
+"""Time without a message after which the parent counts as hanging and the vehicle lands, s. Longer:
+nobody can stop the vehicle for longer. Shorter: a busy computer ends flights."""
 LONGEST_WATCH_STEP_S = 0.25
-"""What one reading of the word may add to the parent's silence. A process that was itself suspended
-finds messages waiting once it runs again, but has not taken them in yet. Longer, and its own pause
-passes for the parent's; shorter, and a parent's silence is noticed late on a busy computer."""
+"""Largest time by which one reading of the command may increase the parent's silence, s. After a
+suspension, this process has not yet read the messages that are waiting for it. Longer: its own
+pause is taken for the parent's silence. Shorter: on a busy computer, a parent's silence is noticed
+late."""
 
 
 @dataclass
 class ParentSwitch(OperatorSwitch):
     """An `OperatorSwitch` that is operated by the parent's orders.
 
-    `take` and `lose_parent` are called by the thread that reads the orders. Silence is counted from
-    the first reading on, by `read`, on `clock`.
+    `take` and `lose_parent` are called by the thread that reads the orders. The silence is measured
+    on `clock` by `read`, from its first call on.
     """
 
     may_take_off: bool = False
     lost: str | None = None
-    """Why the vehicle lands without the parent's word, else None."""
+    """Why the vehicle lands without the parent's order; otherwise None."""
     _heard: bool = False
     _silent_s: float = 0.0
     _read_s: float | None = None
     _counting: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def take(self, order: Order) -> None:
-        """Take an order in. Its word only adds to what was ordered before; a lost parent that is
-        heard again can still cut the motors, but permits nothing."""
+        """Process an order. Its command can only add to what was ordered before. A lost parent
+        whose orders arrive again can still cut the motors, but cannot give permission."""
         self._heard = True
         if order.word is not OperatorRequest.NONE:
             self.land()
         if order.word is OperatorRequest.STOP:
             self.cut()
-        # After the word: permission must not be read before it.
+        # Set after the command, so that the permission is not read before it.
         permitted = order.may_take_off and order.word is OperatorRequest.NONE
         self.may_take_off = permitted and self.lost is None
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:
-        """Land, and never take off: nobody can stop this vehicle any more."""
+        """Land and never take off, since nobody can stop this vehicle any more."""
         self.lost = self.lost or why
         self.may_take_off = False
         self.land()

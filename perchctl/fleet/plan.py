@@ -21,8 +21,8 @@ from perchctl.fleet.schedule import (
 
 @dataclass(frozen=True, kw_only=True)
 class FleetPlan:
-    """A fleet that can be flown: `fleet` with the telemetry periods that its dongles carry, the
-    corridor of each vehicle in the room's axes, and who flies when.
+    """A fleet that can be flown: `fleet` with telemetry periods that its dongles can carry, the
+    corridor of each vehicle in the room's axes, and the schedule.
 
     Attributes:
         separation_m: least distance between the edges of two corridors that are flown at a time.
@@ -89,8 +89,8 @@ class FleetPlan:
 
 
 def make_plan(fleet: Fleet) -> FleetPlan:
-    """The plan of a fleet's flight. Raises InvalidValue with one sentence, naming the vehicles or
-    the dongle, if it cannot be flown."""
+    """Return the plan of a fleet's flight. If it cannot be flown, raises InvalidValue with one
+    sentence that names the vehicles or the dongle."""
     budgeted, dongles = budget_radio(fleet)
     return FleetPlan(
         fleet=budgeted,

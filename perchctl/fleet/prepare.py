@@ -1,4 +1,5 @@
-"""What each vehicle's process is given, and what is refused before any of them starts."""
+"""Prepare the options of each vehicle's process, and refuse what cannot be flown before any of them
+starts."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from perchctl.link import RadioHub
 
 
 def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
-    """The path of a new folder for one fleet flight: ``fleet_<UTC yyyymmdd_hhmmss>_<fleet>``. It is
-    made with the first log."""
+    """Return the path of a new folder for one fleet flight: ``fleet_<UTC
+    yyyymmdd_hhmmss>_<fleet>``. The first log creates it."""
     stem = f"fleet_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{plan.fleet.name}"
     path, number = parent / stem, 1
     while path.exists():
@@ -29,34 +30,35 @@ def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
 
 
 IDLE_PER_S = 10
-"""Packets a second for a vehicle whose flight has ended, the least that a hub allows. Larger, and
-it takes more from those that fly; smaller is not possible."""
+"""Packets per second for a vehicle whose flight has ended, the lowest limit of a hub. Larger: it
+takes more from those that fly. Smaller is not possible."""
 
 
 class Radios:
     """The radio hubs of the dongles that several vehicles share, by dongle.
 
-    The vehicles' own processes notice by themselves if their hub or dongle is of no use any more;
-    `problems` is for people.
+    The vehicles' own processes notice by themselves if their hub or dongle fails; `problems` is for
+    people.
     """
 
     def __init__(self, hubs: Mapping[str, RadioHub]) -> None:
         self._hubs = hubs
 
     def route(self, options: Mapping[str, FlyOptions]) -> dict[str, FlyOptions]:
-        """The options of each flight, through its hub if it has one. Its `uri` stays the vehicle's:
-        log, lock and the comparison with the motion capture go by it."""
+        """Return the options of each flight, through its hub if it has one. `uri` remains the
+        vehicle's own URI, which identifies its log, its lock and its comparison with the motion
+        capture."""
         ways = {uri: way for hub in self._hubs.values() for uri, way in hub.uris.items()}
         return {name: replace(each, link_uri=ways.get(each.uri)) for name, each in options.items()}
 
     def slow_down(self, uri: str) -> None:
-        """Leave the share of a vehicle whose flight has ended to those that still fly."""
+        """Give the share of a vehicle whose flight has ended to those that are still flying."""
         for hub in self._hubs.values():
             if uri in hub.uris:
                 hub.limit(uri, IDLE_PER_S)
 
     def problems(self) -> dict[str, str]:
-        """Why a dongle is of no use now, by dongle. Never waits."""
+        """Return why a dongle has failed, by dongle. Never waits."""
         found = {}
         for dongle, hub in self._hubs.items():
             reported = (report.problem for report in hub.reports.values())
@@ -71,7 +73,8 @@ def open_radios(plan: FleetPlan) -> Iterator[Radios]:
     """Open a radio hub for each dongle that several vehicles share, until the block ends. A vehicle
     alone on its dongle needs none.
 
-    Raises the errors of `RadioHub`, with the dongle's name. No packet was sent to a vehicle then.
+    Raises the errors of `RadioHub`, with the dongle's name. In that case, no packet was sent to any
+    vehicle.
     """
     with contextlib.ExitStack() as stack:
         hubs = {}
@@ -86,10 +89,10 @@ def open_radios(plan: FleetPlan) -> Iterator[Radios]:
 def flight_options(
     plan: FleetPlan, folder: Path, seed: int, record: bool | None
 ) -> dict[str, FlyOptions]:
-    """The options of each vehicle's flight, its corridor as a safety row, checked as `perchctl fly`
-    checks them. The errors of `check_options`, with the vehicle's name.
+    """Return the options of each vehicle's flight, with its corridor as a safety row, checked as by
+    `perchctl fly`. Errors: those of `check_options`, with the vehicle's name.
 
-    `record`: keep the pictures; None: those of real vehicles.
+    `record`: keep the pictures; None: keep those of real vehicles.
     """
     options = {}
     for number, vehicle in enumerate(plan.fleet.vehicles):
@@ -119,7 +122,7 @@ def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
     names: dict[str, list[str]] = {}
     for name, each in options.items():
         with naming(name):
-            # The folder of the flight does not exist yet; the one around it is checked.
+            # The flight's folder does not exist yet, so the folder that will contain it is checked.
             found = warnings_before_flight(replace(each, log_dir=each.log_dir.parent))
             each.require_lift_check()
         for warning in found:
@@ -129,7 +132,7 @@ def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
 
 @contextlib.contextmanager
 def naming(name: str) -> Iterator[None]:
-    """Begin the sentence of each failure of the block with the name of what it concerns."""
+    """Prefix each error of the block with the name of the vehicle or dongle."""
     try:
         yield
     except PerchError as error:

@@ -1,13 +1,13 @@
 """The radio budget: what each Crazyradio can carry, and what the flights on it need.
 
-A Crazyradio sends one packet at a time and gets one in its answer, so that a vehicle can send only
-as often as it is asked. cflib asks the vehicles of a dongle one after the other, whether they have
-anything to say or not, and sets the dongle's address before each packet, and its channel if that
-differs. So each of n vehicles gets an equal share, and a share is enough if it is larger than both
-what the vehicle sends (telemetry) and what it is sent (setpoints and positions).
+A Crazyradio sends one packet at a time and receives one in its answer, so a vehicle can send only
+as often as it is polled. cflib polls the vehicles of a dongle in turn, whether or not they have
+anything to send. Before each packet it sets the dongle's address, and its channel if that differs.
+Each of n vehicles therefore gets an equal share, and a share is enough if it exceeds both what the
+vehicle sends (telemetry) and what it receives (setpoints and positions).
 
-The figures are measured, with cflib's threads over a simulated dongle (0.7 ms a packet, 1.25 ms a
-setting); with a real dongle they are not proven.
+The figures were measured with cflib's threads over a simulated dongle (0.7 ms per packet, 1.25 ms
+per setting). They have not been confirmed with a real dongle.
 """
 
 from __future__ import annotations
@@ -23,42 +23,46 @@ from perchctl.link import LOG_STEP_S, telemetry_packets_per_s
 from perchctl.profile import Profile, SafetyConfig
 
 ANY = "radio:///"
-"""Beginning of a URI on whichever dongle is there, as Bitcraze's cfcli and Swarmkeeper write it
+"""Prefix of a URI for any dongle that is plugged in, as Bitcraze's cfcli and Swarmkeeper write it
 (bitcraze/cfcli, docs/swarm.md)."""
 RADIO = "radio://"
 
 ALONE_PER_S = 1000.0
-"""Packets a second to a vehicle alone on its dongle, whose address and channel stay set."""
+"""Packets per second for a vehicle that is alone on its dongle, whose address and channel never
+change."""
 SAME_CHANNEL_PER_S = {2: 245.0, 3: 162.0, 4: 123.0}
-"""Packets a second to each of so many vehicles on one channel of one dongle, measured. Too
-large, and telemetry comes late in flight; too small, and fleets that could fly are refused."""
+"""Measured packets per second for each of this many vehicles on one channel of one dongle. Too
+large: telemetry comes late in flight. Too small: fleets that could fly are refused."""
 OTHER_CHANNELS_PER_S = {2: 151.0, 4: 73.0}
-"""The same, on different channels of one dongle, measured: why that is refused."""
+"""The same on different channels of one dongle, measured, which is why perchctl refuses this."""
 PACKET_S = 0.00206
-"""Time that a packet of a shared dongle takes, the longest of `SAME_CHANNEL_PER_S` (3 vehicles):
-0.7 ms on the air, 1.25 ms for the address, the rest Python's threads. For more vehicles than were
-measured."""
+"""Duration of a packet on a shared dongle, s, the longest of `SAME_CHANNEL_PER_S` (3 vehicles): 0.7
+ms on the air, 1.25 ms for the address, and the rest for Python's threads. It is used for larger
+numbers of vehicles than were measured."""
 USABLE_SHARE = 0.8
-"""Of a share; the rest is for lost packets, for a neighbour that does not answer, which costs
-2 ms a turn (measured), and for a busy computer: there, a hub over the same simulated dongle carried
-207 packets a second for each of two vehicles and 111 for each of four, 0.85 and 0.9 of the shares.
-Larger, and telemetry comes late: at 0.9, in one run, two simulated flights with telemetry every
-10 ms were aborted; smaller, and telemetry is slower than it needs to be."""
+"""Usable part of a share. The rest is for lost packets, for a neighbour that does not answer, which
+costs 2 ms per turn (measured), and for a busy computer. There, a hub over the same simulated dongle
+carried 207 packets per second for each of two vehicles and 111 for each of four, 0.85 and 0.9 of
+the shares. Larger: telemetry comes late; at 0.9, in one run, two simulated flights with telemetry
+every 10 ms were aborted. Smaller: telemetry is slower than necessary."""
 MOST_ON_A_DONGLE = 5
-"""Vehicles on one dongle: users of cflib report three to five."""
+"""Largest number of vehicles on one dongle: users of cflib report three to five."""
 LEAST_APART = 2
-"""Channels between two dongles: at 2M a channel is 2 MHz wide, two channels (bitcraze/cfcli)."""
+"""Least number of channels between two dongles: at 2M, a channel is 2 MHz wide, which is two
+channels (bitcraze/cfcli)."""
 SLOWEST_PERIOD_S = SafetyConfig.proof_age_s / 2
-"""Of telemetry that is chosen: with one slower, a single lost packet proves nothing."""
+"""Slowest telemetry period that is chosen, s. With a slower one, the telemetry could prove nothing
+after a single lost packet."""
 LEAST_RATE_HZ = 10
-"""Of positions that are sent, the least that `positioning.rate_hz` allows."""
+"""Lowest rate of sent positions, Hz, which `positioning.rate_hz` allows."""
 MEASURED_RATE = "2M"
-"""Data rate of all figures above; at 1M and 250K nobody has measured what a dongle carries."""
+"""Data rate to which all figures above apply; nobody has measured what a dongle carries at 1M and
+250K."""
 
 
 @dataclass(frozen=True)
 class RadioPlace:
-    """Where a vehicle is on the air. `dongle`: number or serial number of the Crazyradio; empty:
+    """The radio settings of a vehicle. `dongle`: number or serial number of the Crazyradio; empty:
     any. `rate`: ``250K``, ``1M`` or ``2M``."""
 
     dongle: str
@@ -68,8 +72,8 @@ class RadioPlace:
 
 @dataclass(frozen=True, kw_only=True)
 class DongleLoad:
-    """One dongle with its vehicles: packets a second that it carries for each of them, and the most
-    that one of them needs."""
+    """One dongle with its vehicles: the packets per second that it carries for each of them, and
+    the largest number that one of them needs."""
 
     dongle: str
     channel: int
@@ -79,7 +83,8 @@ class DongleLoad:
 
 
 def radio_place(vehicle: FleetVehicle) -> RadioPlace | None:
-    """The vehicle's dongle, channel and rate; None without a radio (sim, USB, UDP, own link)."""
+    """Return the vehicle's dongle, channel and rate; None without a radio (sim, USB, UDP, your own
+    link)."""
     if not vehicle.uri.startswith(RADIO):
         return None
     _, channel, rate, _ = vehicle.address.split("/")
@@ -92,7 +97,7 @@ def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
     """The vehicles, each ``radio:///`` with a dongle.
 
     Vehicles on one channel share a dongle, since two dongles on a channel disturb each other. A
-    channel on which no other vehicle names a dongle gets the next number that nobody has named.
+    channel without any vehicle that names a dongle gets the next unused number.
     """
     places = [radio_place(vehicle) for vehicle in vehicles]
     named = {p.channel: p.dongle for p in reversed(places) if p is not None and p.dongle}
@@ -112,24 +117,27 @@ def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
 
 
 def carried_per_s(vehicles: int) -> float:
-    """Packets a second that a dongle carries for each of so many vehicles on one channel."""
+    """Return the packets per second that a dongle carries for each of this many vehicles on one
+    channel."""
     if vehicles <= 1:
         return ALONE_PER_S
     return SAME_CHANNEL_PER_S.get(vehicles, 1.0 / (vehicles * PACKET_S))
 
 
 def uplink_per_s(profile: Profile) -> float:
-    """Packets a second that perchctl sends to a vehicle: a setpoint each turn of the loop, and the
-    positions of a motion capture or of the target."""
+    """Return the packets per second that perchctl sends to a vehicle: a setpoint in each turn of
+    the loop, and the positions of a motion capture or of the target."""
     positioning = profile.positioning
     sent_hz = 0.0 if positioning.source.is_deck else positioning.rate_hz
     return profile.link.loop_hz + sent_hz
 
 
 def needed_per_s(profile: Profile, period_s: float | None = None) -> float:
-    """Packets a second that a flight needs, at `period_s` or at the profile's own telemetry period.
+    """Return the packets per second that a flight needs, at `period_s` or at the profile's own
+    telemetry period.
 
-    Each packet goes there and back, so it is the larger of both ways."""
+    Each exchange carries one packet in each direction, so the larger of both numbers counts.
+    """
     period_s = profile.link.telemetry_period_s if period_s is None else period_s
     return max(telemetry_packets_per_s(period_s), uplink_per_s(profile))
 
@@ -230,7 +238,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
 
 
 def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
-    """What to slow down so that the flight fits, if that is enough; ends in ``, or``."""
+    """Return what to slow down so that the flight fits, if that is enough; the text ends in ``,
+    or``."""
     if fits:
         need = needed_per_s(profile, fits[0])
         return (
@@ -246,14 +255,14 @@ def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
 
 
 def _periods_s(profile: Profile) -> list[float]:
-    """The periods that may be chosen, from the profile's own one on, shortest first."""
+    """Return the periods that may be chosen, from the profile's own on, shortest first."""
     first = round(profile.link.telemetry_period_s / LOG_STEP_S)
     last = round(SLOWEST_PERIOD_S / LOG_STEP_S)
     return [round(step * LOG_STEP_S, 3) for step in range(first, max(first, last) + 1)]
 
 
 def _most_that_fit(need_per_s: float) -> int:
-    """How many vehicles with this need one dongle carries, at least one."""
+    """Return how many vehicles with this need one dongle carries, at least one."""
     counts = range(1, MOST_ON_A_DONGLE + 1)
     fit = [count for count in counts if need_per_s <= USABLE_SHARE * carried_per_s(count)]
     return max(fit, default=1)

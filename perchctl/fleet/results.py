@@ -11,7 +11,7 @@ from perchctl.faults import ENDS, FLAGS, HEALTHY, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
-"""That are named."""
+"""Number of fleets that are named."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def fleet_outcome(results: Sequence[FaultResult]) -> str:
 
 
 def refused_vehicle(reason: str) -> FaultResult:
-    """The result of a vehicle that the fleet did not let start."""
+    """Return the result of a vehicle that was not allowed to start."""
     return FaultResult(
         seed=0,
         outcome="refused",
@@ -93,7 +93,7 @@ def _least(values_m: Sequence[float | None]) -> float | None:
 
 
 def worst_fleets(results: Sequence[FleetResult]) -> list[FleetResult]:
-    """The fleets in which something went wrong: collisions first, then flags that count."""
+    """Return the fleets in which something went wrong: first collisions, then flags that count."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-r.collisions, -sum(v.is_bad for v in r.vehicles), r.seed))
 

@@ -1,5 +1,5 @@
-"""One simulated room: where each vehicle of a fleet stands, hangs and flies, what they blow onto
-each other, and how near they come.
+"""One simulated room: where each vehicle of a fleet stands, hangs and flies, the downwash between
+them, and how close they come to each other.
 
 Each vehicle is simulated in axes of its own, whose origin is the floor below its start. An estimate
 in the room's axes is the same flight with other numbers, so it is simulated in those axes, too. The
@@ -30,18 +30,20 @@ from perchctl.sim import (
 )
 
 START_ERROR_M = 0.03
-"""Of a home from the fleet file, each axis, at most: measured with a tape, and set down by hand.
-Larger: flights that no plan allows for."""
+"""Largest error of a home in the fleet file on each axis, m: the homes are measured with a tape,
+and the vehicles are placed by hand. Larger: flights that no plan allows for."""
 START_TURN_DEG = 2.0
-"""Of a nose from `heading_deg`, at most. Larger: a way of 2 m ends farther off than drift leads."""
+"""Largest error of a vehicle's heading from `heading_deg`. Larger: over a flight of 2 m, it causes
+a larger error than the drift."""
 SEEN_M = 3.0
-"""A neighbour's target farther off is in no picture of a camera below another one. Larger: pictures
-take longer to compute."""
+"""Distance beyond which a neighbour's target is never in the picture of a camera below another
+target, m. Larger: pictures take longer to compute."""
 COLLISION_RADIUS_M = 0.12
-"""Half-width of the ellipsoid that one vehicle needs, by Crazyswarm (IMRCLab/crazyswarm). The
-centres of two vehicles keep twice as much. Larger: vehicles that pass count as collided."""
+"""Half-width of the ellipsoid that one vehicle needs according to Crazyswarm (IMRCLab/crazyswarm),
+m; the centres of two vehicles stay twice as far apart. Larger: vehicles that pass each other count
+as collided."""
 COLLISION_HALF_HEIGHT_M = 0.3
-"""Half-height of the same: a vehicle this far below flies in the other one's wake."""
+"""Half-height of the same ellipsoid, m: a vehicle this far below flies in the other one's wake."""
 _START_STREAM = 31
 _Place = tuple[float, float, float]
 
@@ -51,8 +53,8 @@ class PlacedVehicle:
     """A vehicle in the room of one seed.
 
     Attributes:
-        true: the vehicle where it really stands, its estimate in axes that begin there.
-        profile: what it flies by, its corridor included.
+        true: the vehicle at its true place, with an estimate whose axes begin there.
+        profile: the profile that it flies with, including its corridor.
     """
 
     name: str
@@ -62,8 +64,8 @@ class PlacedVehicle:
 
 
 def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
-    """The fleet in the room of a seed: its starts, one ceiling, and each vehicle's own scenario
-    with its own target, and its neighbours' as far as its camera may see them."""
+    """Return the fleet in the room of a seed: the true starts, one ceiling, and each vehicle's own
+    scenario with its target and those of the neighbours that its camera may see."""
     rng = np.random.default_rng([seed, _START_STREAM])
     drawn = []
     for number, vehicle in enumerate(fleet.vehicles):
@@ -100,8 +102,8 @@ def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
 def _neighbours(
     own: FleetVehicle, scenario: Scenario, drawn: Sequence[tuple[FleetVehicle, Scenario]]
 ) -> tuple[Neighbour, ...]:
-    """The other vehicles' targets in the axes of the own one. Their ids are named even where they
-    are the own ones: to fly to one of them is to stray."""
+    """Return the other vehicles' targets in the axes of this vehicle's own. Their ids are given
+    even if they are the same: flying to one of them counts as straying."""
     found = []
     heading_rad = math.radians(own.heading_deg) + scenario.target_yaw_rad
     c, s = math.cos(heading_rad), math.sin(heading_rad)
@@ -121,17 +123,17 @@ def _neighbours(
     return tuple(found)
 
 
-# --- All of them, as time passes ---
+# --- All vehicles as time passes ---
 
 
 def body_name(name: str) -> str:
-    """The name of the rigid body of the vehicle called `name` in the motion capture of another
-    one. In its own, its body has the name from its profile."""
+    """Return the name of the rigid body of the vehicle called `name` in the motion capture of
+    another one. In its own capture, its body has the name from its profile."""
     return f"body of {name}"
 
 
 class Body:
-    """One vehicle in the room: simulated, or where it stands, hangs or lies."""
+    """One vehicle in the room: simulated, or at the place where it stands, hangs or lies."""
 
     def __init__(self, placed: PlacedVehicle) -> None:
         self._true = placed.true
@@ -139,11 +141,11 @@ class Body:
         self._rest_m: _Place = (*placed.true.home_m, 0.0)
 
     def follow(self, vehicle: SimulatedVehicle) -> None:
-        """Take the place of a simulated vehicle from now on."""
+        """Use the position of a simulated vehicle from now on."""
         self._vehicle = vehicle
 
     def rest(self) -> None:
-        """Stay where it is, with its motors off."""
+        """Stay at this position with the motors off."""
         self._rest_m, self._vehicle = self.place_m, None
 
     @property
@@ -152,7 +154,7 @@ class Body:
 
     @property
     def place_m(self) -> _Place:
-        """Its true place, in the room's axes."""
+        """The vehicle's true position in the room's axes."""
         if self._vehicle is None:
             return self._rest_m
         world = self._vehicle.world
@@ -160,7 +162,7 @@ class Body:
 
     @property
     def thrust_n(self) -> float:
-        """Of all rotors together."""
+        """Total thrust of all rotors."""
         return 0.0 if self._vehicle is None else sum(self._vehicle.world.powertrain.forces_n)
 
     @property
@@ -169,7 +171,7 @@ class Body:
         return self._vehicle is not None and max(self._vehicle.firmware.motors) > 0.0
 
     def in_own_axes(self, place_m: _Place) -> _Place:
-        """A place of the room in the axes of this vehicle's simulation."""
+        """Convert a place of the room to the axes of this vehicle's simulation."""
         return (*self._true.to_estimate(place_m[:2]), place_m[2])
 
 
@@ -190,8 +192,8 @@ class Room:
         self.least_m = self.least_both_m = math.inf
 
     def others_of(self, name: str) -> tuple[tuple[str, _Place], ...]:
-        """The other vehicles with their places, as a motion capture sees them in the axes of the
-        vehicle called `name`. With none, a capture keeps the bodies that it has by itself."""
+        """Return the other vehicles with their positions as a motion capture sees them, in the axes
+        of the vehicle called `name`. If there are none, a capture keeps its own bodies."""
         own = self.bodies[name]
         return tuple(
             (body_name(other), own.in_own_axes(body.place_m))
@@ -200,8 +202,8 @@ class Room:
         )
 
     def update(self) -> None:
-        """Measure distances, and let each simulated vehicle feel and see the others where they are
-        now. To call when all of them have reached the same time."""
+        """Measure the distances, and update each simulated vehicle's downwash and view of the
+        others. Must be called when all vehicles have reached the same time."""
         places = {name: body.place_m for name, body in self.bodies.items()}
         turning = {name: body.turns for name, body in self.bodies.items()}
         for pair in itertools.combinations(self.bodies, 2):

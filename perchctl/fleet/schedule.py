@@ -1,6 +1,6 @@
-"""Vehicles that cannot meet: each one's corridor, and who flies when.
+"""Keep vehicles apart: each one's corridor, and the order in which they fly.
 
-The corridor's radius follows from what measures the position:
+The corridor's radius depends on the positioning:
 
     room axes (motion capture, Lighthouse, Loco)   WANDER_M + ROOM_ERROR_M
     Flow deck                                      WANDER_M + FLOW_DRIFT_MPS * time without target
@@ -12,7 +12,8 @@ near the other's. A vehicle that waits on the floor, or that hangs, is an obstac
     i waits in j's corridor  ->  i flies before j
     i hangs in j's corridor  ->  j flies before i
 
-An order that keeps all of these is found by sorting; where there is none, two vehicles are named.
+An order that satisfies all of these is found by sorting. If there is none, the error names two
+vehicles.
 """
 
 from __future__ import annotations
@@ -29,43 +30,46 @@ from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.profile import CorridorConfig, MarkerConfig, Profile
 
 WANDER_M = 0.3
-"""How far a draught carries a healthy vehicle from its setpoint, level; the profile's own limit for
-the least fence (`0.3 <= safety.fence_radius_m`). Smaller, and gusts end flights; larger, and fewer
-vehicles fit into a room."""
+"""Horizontal distance by which a draught may move a healthy vehicle from its setpoint, m. It is
+also the profile's lower limit of the fence (`0.3 <= safety.fence_radius_m`). Smaller: gusts end
+flights. Larger: fewer vehicles fit into a room."""
 ROOM_ERROR_M = 0.05
-"""Error of a position in the room's axes: perchctl takes off only if estimate and motion capture
+"""Error of a position in the room's axes, m. perchctl takes off only if estimate and motion capture
 agree within it (docs/positioning.md), and the Lighthouse geometries of two vehicles can differ by
-centimetres (bitcraze/cfcli). Smaller, and two estimates that differ let vehicles meet."""
+centimetres (bitcraze/cfcli). Smaller: two vehicles with different estimates may meet."""
 FLOW_DRIFT_MPS = 0.01
-"""Drift of a Flow deck's estimate, as in the simulation (`simulation.drift_mps`). Smaller, and a
-long search ends outside the corridor; larger, and Flow decks need more room."""
+"""Drift of a Flow deck's estimate, m/s, as in the simulation (`simulation.drift_mps`). Smaller: a
+long search ends outside the corridor. Larger: Flow decks need more room."""
 TARGET_ALONE_M = 1.0
-"""Radius for the target alone: a vehicle that loses sight may drift 1 m in all until it is down
-(seen in simulated flights). Smaller, and a blind vehicle leaves it; larger, and targets must hang
-farther apart."""
+"""Radius for the target alone, m: a vehicle that loses sight of it may drift by up to 1 m until it
+is down (observed in simulated flights). Smaller: a blind vehicle leaves the corridor. Larger:
+targets must hang farther apart."""
 HEIGHT_MARGIN_M = 0.3
-"""Above the highest search: a climb overshoots by 0.1 m (docs/firmware.md, "Position take-off"),
-and a height drifts. Smaller, and an overshoot ends a flight."""
+"""Height of the corridor above the highest search, m: a climb overshoots by 0.1 m
+(docs/firmware.md, "Position take-off"), and the height drifts. Smaller: an overshoot ends a
+flight."""
 
 SEPARATION_M = 0.4
-"""Between the edges of two corridors that are flown at a time. A jet 2 m below its vehicle still
-blows 0.24 m/s at 0.4 m aside (jet of Bauersfeld and others, 2024), less than the draughts in which
-perchctl perches. Distances in use between axes: 0.2 m in Bitcraze's demos, 0.24 m by Crazyswarm,
-0.6 m in the firmware's avoidance. Smaller, and neighbours blow each other about; larger, and fewer
-fit into a room."""
+"""Distance between the edges of two corridors that are flown at the same time, m. A jet 2 m below
+its vehicle still blows at 0.24 m/s at 0.4 m from its axis (jet of Bauersfeld and others, 2024),
+less than the draughts in which perchctl perches. Distances between axes used elsewhere: 0.2 m in
+Bitcraze's demos, 0.24 m by Crazyswarm, 0.6 m in the firmware's avoidance. Smaller: neighbours
+disturb each other. Larger: fewer vehicles fit into a room."""
 START_SEPARATION_M = 0.5
-"""Of a vehicle that takes off from the corridor of one that flies, as in Bitcraze's demos.
-Smaller, and a vehicle starts in another's jet; larger, and homes must be farther apart."""
+"""Distance of a vehicle that takes off from the corridor of another one that is flying, m, as in
+Bitcraze's demos. Smaller: a vehicle starts in another one's jet. Larger: homes must be farther
+apart."""
 OBSTACLE_M = 0.24
-"""Of a flown corridor from a vehicle that waits or hangs: twice the radius of 0.12 m that
-Crazyswarm takes for a vehicle. Smaller, and propellers touch; larger, and fewer targets fit."""
+"""Distance of a vehicle that waits or hangs from a corridor that is flown, m: twice the radius of
+0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch. Larger: fewer targets
+fit."""
 
 
 # --- Corridors ---
 
 
 def corridor_radius_m(vehicle: FleetVehicle) -> float:
-    """Radius of the vehicle's corridor, from what measures its position."""
+    """Return the radius of the vehicle's corridor, which depends on its positioning."""
     profile = vehicle.profile
     if profile.positioning.source.is_target:
         return TARGET_ALONE_M
@@ -78,8 +82,9 @@ def corridor_radius_m(vehicle: FleetVehicle) -> float:
 
 
 def _unseen_s(profile: Profile) -> float:
-    """Longest time in which nothing but the estimate says where the vehicle is: take-off and way,
-    the whole search, and the descent from the height limit. Under its target it flies by sight."""
+    """Return the longest time in which only the estimate says where the vehicle is: take-off and
+    flight to the target, the whole search, and the descent from the height limit. Under its target,
+    it flies by sight."""
     planner = profile.planner
     search_s = planner.search.attempts * planner.search.wait_s
     descent_s = profile.safety.max_height_m / planner.landing.speed_mps
@@ -87,7 +92,7 @@ def _unseen_s(profile: Profile) -> float:
 
 
 def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
-    """The vehicle's corridor in the room's axes."""
+    """Return the vehicle's corridor in the room's axes."""
     profile = vehicle.profile
     return Corridor(
         home_m=vehicle.home_m,
@@ -99,11 +104,11 @@ def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
 
 
 def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Corridor:
-    """The same corridor in the axes of the vehicle's own state estimate: its fence. `estimate`: the
-    same vehicle with other axes of its state estimate, which are taken.
+    """Return the same corridor in the axes of the vehicle's own state estimate: its fence.
+    `estimate`: the same vehicle with other axes of its state estimate, which are used instead.
 
-    Its radius is the same. A vehicle that flies by its setpoints keeps its estimate on the way
-    while its true place drifts; one under its target keeps its true place, while its estimate
+    The radius is the same. A vehicle that follows setpoints keeps its estimate on the path while
+    its true position drifts. A vehicle under its target keeps its true position while its estimate
     drifts.
     """
     corridor, axes = vehicle_corridor(vehicle), estimate or vehicle
@@ -115,10 +120,11 @@ def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = Non
 
 
 def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Profile:
-    """The profile that a vehicle of a fleet flies by: its own, with its corridor as a safety row
-    (`safety.corridor`), outside which it lands.
+    """Return the profile with which a vehicle of a fleet flies: its own, with its corridor as a
+    safety row (`safety.corridor`). Outside the corridor, the vehicle lands.
 
-    `estimate`: the same vehicle with other axes of its state estimate, whose profile is taken.
+    `estimate`: the same vehicle with other axes of its state estimate, whose profile is used
+    instead.
     """
     section = CorridorConfig(**asdict(estimate_corridor(vehicle, estimate)))
     profile = (estimate or vehicle).profile
@@ -126,12 +132,13 @@ def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -
     return profile.model_copy(update={"safety": safety})
 
 
-# --- Who may fly with whom ---
+# --- Which vehicles may fly together ---
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """Two vehicles that must not be in the air together, and `why`, with the distance."""
+    """Two vehicles that must not be in the air at the same time, with the reason `why` and the
+    distance."""
 
     first: str
     second: str
@@ -140,7 +147,7 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Precedence:
-    """`first` must have flown before `then` takes off, and `why`, with the distance."""
+    """`first` must have flown before `then` takes off, with the reason `why` and the distance."""
 
     first: str
     then: str
@@ -149,24 +156,25 @@ class Precedence:
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Groups of vehicles that fly together, in their order, and what it follows from."""
+    """Groups of vehicles that fly together, in order, and the constraints from which they
+    follow."""
 
     groups: tuple[tuple[str, ...], ...]
     conflicts: tuple[Conflict, ...]
     precedences: tuple[Precedence, ...]
 
     def may_fly_together(self, first: str, second: str) -> bool:
-        """True if the corridors of the two keep all separations.
+        """True if the corridors of both keep all separations.
 
-        Two that may not are also in each other's way on the floor: while one of them lies landed
-        away from its home, the other one must not take off.
+        Two vehicles that may not fly together are also in each other's way on the floor: if one has
+        landed away from its home, the other one must not take off.
         """
         return {first, second} not in ({c.first, c.second} for c in self.conflicts)
 
 
 def make_schedule(fleet: Fleet) -> Schedule:
-    """Who flies with whom, and in which order: as many at a time as `fleet.order` allows, in the
-    order of the file as far as nobody is in another's way.
+    """Decide who flies with whom, and in which order: as many at a time as `fleet.order` allows, in
+    the order of the file unless a vehicle is in the way of another.
 
     Raises InvalidValue, naming two vehicles and the distance, if no order exists, or if a target
     cannot be reached.
@@ -188,7 +196,7 @@ def make_schedule(fleet: Fleet) -> Schedule:
 def find_conflicts(
     corridors: dict[str, Corridor], separation_m: float = SEPARATION_M
 ) -> tuple[Conflict, ...]:
-    """Pairs whose corridors, or places of take-off, are too near each other."""
+    """Return the pairs whose corridors or homes are too close to each other."""
     found = []
     for (a, ours), (b, theirs) in itertools.combinations(corridors.items(), 2):
         if (gap_m := ours.distance_m(theirs)) < separation_m:
@@ -206,7 +214,7 @@ def find_conflicts(
 
 
 def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
-    """Who must fly before whom, since it waits or hangs in the other's corridor."""
+    """Return who must fly before whom, because it waits or hangs in the other one's corridor."""
     found = []
     for (name, own), (other, corridor) in itertools.permutations(corridors.items(), 2):
         waits_m, hangs_m = (corridor.distance_to_m(p) for p in (own.home_m, own.target_m))
@@ -227,7 +235,8 @@ def _from(gap_m: float, other: str) -> str:
 
 
 def gap_text(gap_m: float) -> str:
-    """The distance of a place from a corridor's edge, negative inside, before the words for it."""
+    """Return the distance of a place from a corridor's edge, negative inside, and the text for
+    it."""
     return f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
 
 
@@ -237,7 +246,8 @@ def _groups(
     conflicts: Sequence[Conflict],
     precedences: Sequence[Precedence],
 ) -> tuple[tuple[str, ...], ...]:
-    """The groups, each filled in the order of the names with whoever is free to fly."""
+    """Return the groups, each filled in the order of the names with vehicles that are free to
+    fly."""
     apart = {frozenset((c.first, c.second)) for c in conflicts}
     flown: set[str] = set()
     groups = []
@@ -257,7 +267,8 @@ def _groups(
 
 
 def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corridor]) -> None:
-    """Raise InvalidValue if no order keeps all precedences; of several circles for two vehicles."""
+    """Raise InvalidValue if no order keeps all precedences; of several cycles, for one of two
+    vehicles."""
     by_pair: dict[tuple[str, str], Precedence] = {}
     for each in precedences:
         by_pair.setdefault((each.first, each.then), each)
@@ -274,7 +285,7 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
     try:
         sorter.prepare()
     except CycleError as error:
-        circle = error.args[1]  # each is needed by the one after it
+        circle = error.args[1]  # each must precede the one after it
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
             f"{each.first} and {each.then} cannot fly in any order, as {' before '.join(circle)} "
@@ -307,7 +318,7 @@ def _check_fence(vehicle: FleetVehicle) -> None:
 
 
 def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
-    """Refuse two targets that one vehicle could take for its own."""
+    """Refuse two targets that a vehicle could confuse."""
     apart_m = math.dist(first.target_m, second.target_m)
     for one, other in ((first, second), (second, first)):
         within_m = one.profile.target.expected_within_m
@@ -320,7 +331,7 @@ def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
 
 
 def have_common_marker(one: FleetVehicle, other: FleetVehicle) -> bool:
-    """True if the targets of both have a marker in common."""
+    """True if both targets have a marker in common."""
     ours, theirs = one.profile.target, other.profile.target
     return not {_marker(ours.large), _marker(ours.small)}.isdisjoint(
         {_marker(theirs.large), _marker(theirs.small)}

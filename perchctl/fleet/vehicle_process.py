@@ -1,8 +1,8 @@
-"""The process of one vehicle in a fleet: one ordinary flight, and a line to the parent.
+"""The process of one vehicle in a fleet: one ordinary flight, and a connection to the parent.
 
 The flight is the one of `perchctl fly`, with its own link, watchdog, camera and log. Two things are
-added: it waits on the floor for permission to take off, and its operator is the parent. A thread of
-its own keeps the line, so that nothing in the flight ever waits for the parent.
+added: it waits on the floor for permission to take off, and its operator is the parent. A separate
+thread serves the connection, so that nothing in the flight ever waits for the parent.
 """
 
 from __future__ import annotations
@@ -30,38 +30,40 @@ from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
 
 OPTIONS_TIMEOUT_S = 60.0
-"""For the options of the flight, which the parent sends at once: nothing is connected before."""
+"""Time for the options of the flight, s, which the parent sends at once: nothing is connected
+before."""
 LAST_WORD_TIMEOUT_S = 2.0
-"""For the parent to take the result. Longer, and a process lingers whose parent hangs; shorter, and
-a busy parent may miss the result, and reports the process as failed."""
+"""Time for the parent to receive the result, s. Longer: a process lingers if its parent hangs.
+Shorter: a busy parent may miss the result and report the process as failed."""
 POLL_S = 0.05
-"""Between two looks of the line's thread at what there is to send."""
+"""Time between two checks for something to send, s."""
 
 
 def main(channel: Channel) -> None:
-    """Fly as the first message, `FlyOptions`, says; send one `Result`, and end the process."""
+    """Fly as the first message, `FlyOptions`, requests; send one `Result`, and end the process."""
     switch = ParentSwitch()
     with operator_signals(switch, _say):
         try:
             options: FlyOptions = channel.receive(OPTIONS_TIMEOUT_S)
             line = ParentLine(channel, switch)
-        except (EOFError, OSError, Interrupted):  # the parent is gone, or wants no flight any more
+        # the parent is gone, or does not want a flight any more
+        except (EOFError, OSError, Interrupted):
             return
         reporter = StatusReporter(line, switch)
         try:
             result = fly_vehicle(options, switch, line, reporter)
-        except BaseException as error:  # a signal while another failure was being dealt with
+        except BaseException as error:  # a signal while another failure was being handled
             result = reporter.failure or reporter.result_of_error(error)
         line.finish(result)
     sys.stdout.flush()
-    os._exit(0)  # a library's thread that hangs must not keep the process
+    os._exit(0)  # a hanging thread of a library must not keep the process alive
 
 
 def fly_vehicle(
     options: FlyOptions, switch: ParentSwitch, line: ParentLine, reporter: StatusReporter
 ) -> Result:
-    """Fly once; whatever happens becomes a `Result`. A second error, while the first is being dealt
-    with, is raised: `reporter` knows how far the flight has come."""
+    """Fly once; whatever happens becomes a `Result`. A second error while the first is being
+    handled is raised: `reporter` knows how far the flight has come."""
     log: LogWatcher | None = None
     try:
         line.may_interrupt = True
@@ -94,11 +96,11 @@ def fly_vehicle(
 
 
 class ParentLine:
-    """The line to the parent, kept by a thread of its own; no method waits but `finish`.
+    """The connection to the parent, served by a thread of its own; only `finish` waits.
 
-    If the parent is gone or sends what is no order, the vehicle lands; in the latter case the line
-    goes on, as the operator may still have the motors cut. Before the flight loop listens, a word
-    ends the process's start as a signal would.
+    If the parent is gone or sends an invalid message, the vehicle lands. In the latter case the
+    connection stays open, because the operator may still cut the motors. Before the flight loop
+    listens, a command ends the process's start as a signal would.
 
     Attributes:
         may_interrupt: the main thread can take an `Interrupted` now.
@@ -116,11 +118,11 @@ class ParentLine:
         self._thread.start()
 
     def note_turn(self) -> None:
-        """Note that the flight loop has turned."""
+        """Note that the flight loop has made a turn."""
         self._turned_s = time.monotonic()
 
     def tell(self, status: Status) -> None:
-        """Leave the newest status; one of a new stage or phase goes out at the next look."""
+        """Store the newest status. One with a new stage or phase is sent at the next check."""
         before, self._status = self._status, status
         self._soon = self._soon or (before.stage, before.phase) != (status.stage, status.phase)
 
@@ -158,8 +160,8 @@ class ParentLine:
             self._ended.set()
 
     def _take_orders(self) -> None:
-        """Take all waiting orders in. After a pause of this process there are many, and permission
-        counts only if the newest still gives it."""
+        """Process all waiting orders. After a pause of this process there may be many, and a
+        permission counts only if the newest one still gives it."""
         order = self._next_order()
         while self._channel.poll(0.0):
             if order is not None:
@@ -169,13 +171,13 @@ class ParentLine:
             self._switch.take(order)
 
     def _next_order(self) -> Order | None:
-        """The next message, if it is an order; else land, and return None. Raises EOFError or
-        OSError if the parent is gone."""
+        """Return the next message if it is an order; otherwise land, and return None. Raises
+        EOFError or OSError if the parent is gone."""
         try:
             message = self._channel.recv()
         except (EOFError, OSError):
             raise
-        except Exception as error:  # whatever unpickling it raises
+        except Exception as error:  # any error that unpickling raises
             self._switch.lose_parent(f"a message of the parent is unreadable ({error_at(error)})")
             return None
         if isinstance(message, Order) and isinstance(message.word, OperatorRequest):
@@ -184,26 +186,27 @@ class ParentLine:
         return None
 
     def _interrupt_start_alone(self) -> None:
-        """Without a parent: wait until the start can be interrupted, or the loop listens."""
+        """Without a parent, wait until the start can be interrupted or the loop listens."""
         while self._result is None and not (self._has_interrupted or self._switch.listening):
             self._interrupt_start()
             time.sleep(POLL_S)
 
     def _interrupt_start(self) -> None:
-        """While vehicle and camera are being connected, nobody reads the word. Once only: a second
-        signal would interrupt what the first one ends."""
+        """Interrupt the start once, because nobody reads the command while vehicle and camera are
+        being connected. A second signal would interrupt the clean-up after the first one."""
         starts = self.may_interrupt and not self._switch.listening
         if starts and self._switch.landing_requested and not self._has_interrupted:
             self._has_interrupted = True
-            os.kill(os.getpid(), signal.SIGTERM)  # `operator_signals` makes an Interrupted of it
+            os.kill(os.getpid(), signal.SIGTERM)  # `operator_signals` turns it into an Interrupted
 
 
 class StatusReporter(Watcher):
-    """A flight's watcher that tells the parent where it is, and remembers what the result needs.
+    """A watcher of the flight that reports its state to the parent, and stores what the result
+    needs.
 
     Attributes:
         log: the file of the flight's log, once it is open.
-        watchers: who also watches the flight: those who serve its pictures.
+        watchers: further watchers of the flight, which serve its pictures.
         failure: the result of a flight that has raised.
     """
 
@@ -220,14 +223,15 @@ class StatusReporter(Watcher):
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._setpoint_s: float | None = None
         self._gaps_s: list[float] = []
-        self._rest: str | None = None  # of a vehicle that was rescued
+        self._rest: str | None = None  # place of a vehicle that was rescued
         self._tick: Tick | None = None
 
     def serve_pictures(self, options: FlyOptions) -> None:
-        """Serve the flight's pictures to the fleet's page, without buttons. What fails is printed,
-        and is no reason not to fly."""
+        """Serve the flight's pictures for the fleet's page, without buttons. An error is printed,
+        but does not prevent the flight."""
         try:
-            from perchctl.display import FlightPage, LivePage  # a flight without a page needs none
+            # a flight without a page does not need this module
+            from perchctl.display import FlightPage, LivePage
 
             page = LivePage(profile_camera(options.profile.camera), f"perchctl fly {options.uri}")
             self.watchers = (FlightPage.of(page, options.profile),)
@@ -255,7 +259,7 @@ class StatusReporter(Watcher):
             self._setpoint_s = None
         try:
             status = flight_status(tick)
-        except Exception as error:  # a reporter that is detached looks like a loop that hangs
+        except Exception as error:  # a detached reporter looks like a loop that hangs
             status = Status(
                 stage=Stage.FLYING,
                 phase=tick.state.phase,
@@ -278,7 +282,8 @@ class StatusReporter(Watcher):
         )
 
     def result_of_error(self, error: BaseException) -> Result:
-        """The result of a flight that raised: refused on the ground, or rescued in the air."""
+        """Return the result of a flight that raised: refused on the ground, or rescued in the
+        air."""
         match error:
             case PerchError():
                 code, reason = error.exit_code, str(error)
@@ -296,7 +301,8 @@ class StatusReporter(Watcher):
         tick, lost = self._tick, self._switch.lost
         if lost is not None:
             reason = f"{lost}: {reason}"
-        # The first setpoint is sent before its tick is seen; what fails in between is rescued.
+        # The first setpoint is sent before its tick is observed; an error in between leads to a
+        # rescue.
         has_flown = tick is not None or self._rest is not None
         if has_flown and lost is not None and code == Interrupted.exit_code:
             code = SafetyAbort.exit_code  # no operator has landed it
@@ -328,7 +334,7 @@ class StatusReporter(Watcher):
 
 
 def flight_status(tick: Tick) -> Status:
-    """The status of a vehicle that flies, hangs or has landed."""
+    """Return the status of a vehicle that flies, hangs or has landed."""
     state, telemetry, target = tick.state, tick.telemetry, tick.target
     x_m, y_m, z_m = telemetry.position_m
     return Status(
@@ -344,7 +350,7 @@ def flight_status(tick: Tick) -> Status:
 
 
 def _valid_place_m(tick: Tick) -> Point | None:
-    """Where the vehicle is, in the axes of its estimate; None if nobody knows."""
+    """Return the vehicle's position in the axes of its estimate; None if nobody knows it."""
     place_m = tick.telemetry.position_m[:2]
     is_known = tick.state.belief.is_position_valid and all(map(math.isfinite, place_m))
     return place_m if is_known else None

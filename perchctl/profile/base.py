@@ -104,7 +104,7 @@ def key_unit(path: str) -> str:
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
 
 
-# Keys that have become constants of their section ---
+# --- Keys that have become constants of their section ---
 
 
 def split_constant_keys(
