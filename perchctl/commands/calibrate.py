@@ -1,4 +1,5 @@
-"""`perchctl calibrate`: a calibration file of pictures; a mask, a check, a converted file."""
+"""`perchctl calibrate`: make a calibration file or a mask from pictures, or check or convert a
+calibration."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""`perchctl calibrate mount`: how the camera is mounted, how late it is, and where the gear's tip
-is, measured with the vehicle in a hand.
+"""`perchctl calibrate mount`: measure the camera's mounting and latency and the position of the
+gear's tip, with the vehicle held by hand.
 
-The vehicle is read and nothing else: no packet that arms, sets or flies goes out.
+perchctl only reads from the vehicle. It sends no packet that arms it, sets a parameter or makes it
+fly.
 """
 
 from __future__ import annotations

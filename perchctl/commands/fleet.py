@@ -92,8 +92,8 @@ def check(
     vehicles, decides who flies together and in which order, and draws the room from above. It
     connects to nothing. A plan that cannot be flown is drawn too, and refused in one sentence.
 
-    With --identify, perchctl then connects to one vehicle after the other, each at its home.
-    Nothing is armed. The exit codes are those of perchctl check.
+    With --identify, perchctl then connects to the vehicles one at a time and checks that each
+    stands at its home. Nothing is armed. The exit codes are those of perchctl check.
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
@@ -175,7 +175,8 @@ def fly(
         typer.Option("--seed", min=0, help="Seed of the simulated fleet. Default: 11."),
     ] = None,
     log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder for the flight's own folder.")
+        Path | None,
+        typer.Option("--log-dir", help="Folder in which to create the folder of this flight."),
     ] = None,
     record: Annotated[
         bool | None,

@@ -117,7 +117,8 @@ def check_uris(uris: Sequence[str]) -> None:
     dongles = {dongle_of(uri): uri for uri in uris}
     if len(dongles) != 1:
         raise InvalidValue(
-            f"a radio hub serves the vehicles of one dongle, found {' and '.join(dongles.values())}"
+            "all vehicles of a radio hub must be on one dongle, found "
+            f"{' and '.join(dongles.values())}"
         )
     vehicles: dict[str, str] = {}
     for uri in uris:

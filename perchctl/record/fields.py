@@ -1,4 +1,4 @@
-"""What one loop tick leaves in the flight log: every key, its unit and its meaning.
+"""The keys that one tick of the loop writes to the flight log, with their units and meanings.
 
 Keys are flat and carry their unit; SI and radians, frames as in
 `perchctl.geometry`. A missing value is None (absent in the file, None again
@@ -29,9 +29,10 @@ from perchctl.vision import MARKERS, PipelineOutput, TargetEstimate
 FORMAT = "perchctl-flight-log"
 SCHEMA_VERSION = 5
 READABLE_VERSIONS = (1, 2, 3, 4, SCHEMA_VERSION)
-"""1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
-turns; 3 neither why a turn was decided so, nor what was sent in the loop's place. Up to 4 the
-variance of the velocity had the position's name, and that of the position was not known."""
+"""Version 1 had no `tracked`, and no events with several fields; its missing values read as None.
+Version 2 had no turns. Version 3 did not contain the reason for a turn's decision, nor the commands
+sent in the loop's place. Up to version 4, the variance of the velocity had the position's name, and
+that of the position was not recorded."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -67,7 +68,7 @@ FIELDS: dict[str, str] = {
     "battery_rest_v": "resting voltage according to the energy model",
     "battery_used_mah": "charge used, according to the summed thrust and the assumed battery",
     "battery_left_s": "hover time left until row `battery-low` lands, according to the model",
-    "battery_attempts": "further attempts that the battery allows, including a landing",
+    "battery_attempts": "further attempts for which the battery suffices, and then for a landing",
     "supervisor": "supervisor bits",
     "vel_var_m2ps2": "largest of the estimator's velocity variances",
     "pos_var_m2": "largest of the estimator's position variances; with a Flow deck always 100",
