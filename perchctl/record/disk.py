@@ -1,4 +1,4 @@
-"""Files that hold whole records only, and a thread for a disk that may hang."""
+"""Files that contain only whole records, and a thread that writes to a disk that may hang."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class DiskFile:
     """A file of whole records only: a failed write leaves no partial record."""
 
     def __init__(self, path: Path, sync: bool = True) -> None:
-        """Create the file; `sync`: what is flushed is on the disk, not only with the system.
-        Raises OSError, FileExistsError where there is one already."""
+        """Create the file. With `sync`, flushed data is on the disk, not only passed to the system.
+        Raises OSError, FileExistsError if the file exists."""
         self._path = path
         self._sync = sync
         self._good_bytes = 0
@@ -55,7 +55,7 @@ class DiskFile:
 
     def close(self) -> None:
         """Close the file; a second call does nothing. Raises OSError."""
-        fd, self._fd = self._fd, -1  # the number may be another file's by the second time
+        fd, self._fd = self._fd, -1  # by the second call, the number may belong to another file
         if fd >= 0:
             os.close(fd)
 
@@ -129,5 +129,5 @@ class BackgroundWriter:
 
 
 def _do(job: Job) -> None:
-    with suppress(Exception):  # the next one is done all the same
+    with suppress(Exception):  # the next job is done anyway
         job()

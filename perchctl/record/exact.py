@@ -1,9 +1,9 @@
-"""Values as JSON, and back to the same bits: what a replay rests on.
+"""Convert values to JSON and back to the same bits, which a replay requires.
 
-A float is written by its shortest text that reads back to the same one, infinities
-and NaN as ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its
-type and shape; an enum by its value; where a field takes one of several dataclasses, such as a
-command, the class's name stands before it. None is left out where it is the field's default.
+A float is written by its shortest text that reads back to the same one, infinities and NaN as
+``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its type and
+shape; an enum by its value; where a field takes one of several dataclasses, such as a command, the
+class's name stands before it. None is left out if it is the field's default.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _names_by_key(kind: type) -> dict[str, str]:
 
 @cache
 def _members(hint: Any) -> tuple[Any, ...]:
-    """The members of a union, but None; of any other type itself."""
+    """The members of a union except None; for any other type, the type itself."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return tuple(part for part in typing.get_args(hint) if part is not types.NoneType)
     return (hint,)
@@ -266,7 +266,7 @@ def encode_line(record: Mapping[str, Any]) -> bytes:
 _ENCODER = json.JSONEncoder(
     ensure_ascii=False,
     allow_nan=False,
-    check_circular=False,  # what holds itself has no exact form in the first place
+    check_circular=False,  # a value that contains itself has no exact form
     separators=(",", ":"),
 )
 """Made once: `json.dumps` makes one for each line."""

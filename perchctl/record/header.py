@@ -1,7 +1,8 @@
-"""The log's header: what a flight was set up with, enough to decide it again elsewhere.
+"""The log's header: the set-up of a flight, complete enough to replay it on another computer.
 
-The profile stands there with every key. The files that it names for the camera may be others
-by the time of a replay, so what was in them stands there, too; and how the computer calculates.
+It contains the profile with every key. The camera files that the profile names may have changed by
+the time of a replay, so their content is included, too, and so is a fingerprint of the computer's
+arithmetic.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def make_header(
 def turn_fields() -> dict[str, list[str]]:
     """Return the names of the fields that a turn is written with, by dataclass.
 
-    A later perchctl knows by them which of its fields a log cannot hold: a field that is None is
-    left out of a turn, as one that does not exist yet.
+    They tell a later perchctl which of its fields a log cannot contain: a turn leaves out a field
+    that is None, just like one that did not exist yet.
     """
     names: dict[str, list[str]] = {}
     for field in exact_fields(TickRecord):
@@ -106,8 +107,8 @@ def _packed(mask: NDArray[np.bool_]) -> str:
 
 
 # --- A fingerprint of how this computer calculates ---
-# Libraries choose their kernels by the processor: numpy's BLAS and vector functions, OpenCV's
-# filters, the sine of the C library. The last bits of a pose are a processor's own.
+# Libraries choose their code by the processor: numpy's BLAS and vector functions, OpenCV's filters,
+# the sine of the C library. The last bits of a pose therefore depend on the processor.
 
 
 _SIDES = (2, 3, 4, 6, 8, 12)

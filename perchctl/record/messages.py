@@ -1,8 +1,8 @@
-"""What the messages of a flight's recording are made of: the log's own records.
+"""Build the messages of a flight's recording from the records of its log.
 
-They are Foxglove's protobuf ones, with the definitions of Foxglove's own package.
-What is perchctl's own is JSON. Frames: `world` (of the state estimate), `body`, `gear`, `camera`
-(OpenCV's axes, which are Foxglove's), `target` and `setpoint`.
+They are Foxglove's protobuf messages, as defined in Foxglove's package. Values for which Foxglove
+has no message are JSON. Frames: `world` (of the state estimate), `body`, `gear`, `camera` (OpenCV's
+axes, which are Foxglove's), `target` and `setpoint`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TICK = "/tick"
 
 NS = 1_000_000_000
 PNG_LEVEL = 1
-"""Fast; the next levels cost twice the time for a twentieth of the size."""
+"""Compression level: fast; the next levels take twice the time and save a twentieth of the size."""
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")

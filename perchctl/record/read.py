@@ -1,4 +1,4 @@
-"""Reading a flight log back, whatever became of its last line."""
+"""Read a flight log, even if its last line is incomplete."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from perchctl.vision import CameraModel
 Times = TypeVar("Times", float, Array)
 Exact = TypeVar("Exact", TickRecord, SentCommand)
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
-"""Of a log's records behind its header."""
+"""Types of the records that follow a log's header."""
 SAME_S = 1e-3
-"""Times that differ by less are those of one tick."""
+"""Times that differ by less than this belong to one tick, s."""
 _GZIP = b"\x1f\x8b"
 
 
@@ -76,7 +76,7 @@ class FlightLog:
 
     Attributes:
         records: the ticks, each with all keys of `FIELDS` (None where missing).
-        truncated: the flight did not get to write its summary, or the tail is cut.
+        truncated: the summary is missing, or the end of the file is cut off.
         ignored_bytes: length of the unreadable tail.
     """
 
@@ -300,7 +300,7 @@ class FlightLog:
 
 
 TIMES = ("t_s", "frame_t_s")
-"""On the loop's clock in the log, from the flight's first turn in a table."""
+"""Times on the loop's clock in the log; in a table, they count from the flight's first turn."""
 
 
 # --- the file ---
@@ -362,8 +362,8 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Read the lines of a file; none of what cannot be a log, as it may be a video of gigabytes.
-    The end of a packed file that was cut is lost."""
+    """Read the lines of a file; none of a file that cannot be a log, since it may be a video of
+    gigabytes. The end of a packed file that was cut off is lost."""
     lines: list[bytes] = []
     try:
         with path.open("rb") as file:
@@ -414,13 +414,13 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
 
 
 NAMED_VERSION = 5
-"""From here on a log has the variances of velocity and position under their own names."""
+"""From this version on, a log has the variances of velocity and position under their own names."""
 _NAMES = {"position_variance_m2": "velocity_variance_m2ps2", "var_m2": "vel_var_m2ps2"}
 
 
 def _with_named_variance(value: Any) -> Any:
-    """A value of an older log with the velocity's variance under its own name, not under that of
-    the position's."""
+    """Return the value of an older log with the velocity's variance under its own name instead of
+    that of the position's variance."""
     if isinstance(value, list):
         return [_with_named_variance(part) for part in value]
     if isinstance(value, dict):

@@ -1,5 +1,5 @@
-"""The pictures of a flight, out of its recording: read from the beginning, as far as the file goes,
-as a killed flight's has no index."""
+"""Read the pictures of a flight from its recording. It is read from the beginning, because the
+recording of a killed flight has no index."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from perchctl.record.messages import FRAME, IMAGE
 from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
-"""A flight's chunk has 4 MB and one picture; a longer record is a damaged length."""
+"""A flight's chunk contains 4 MB and one picture; a longer record has a damaged length."""
 _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 """What the libraries raise for a record that is cut or damaged; lz4's errors among them."""
 

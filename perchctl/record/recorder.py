@@ -1,7 +1,7 @@
 """Records a flight while it flies: pictures, transforms and ticks.
 
-The flight hands over what it has and goes on: a thread of its own encodes and writes. The
-recording is not the log: what it loses is counted and said, and nothing lands for it.
+The flight passes on its data and continues; a separate thread encodes and writes it. The recording
+is less important than the log: losses are counted and reported, but never make the vehicle land.
 """
 
 from __future__ import annotations
@@ -46,12 +46,13 @@ from perchctl.vision import Frame
 CHUNK_BYTES = 4_000_000
 RECORDING_CLOSE_TIMEOUT_S = 5.0
 MOST_WAITING_BYTES = 64_000_000
-"""What may wait for the disk holds so much memory."""
+"""Largest amount of memory for data that waits for the disk, bytes."""
 TURN_BYTES = 10_000
-"""Of a turn without its picture."""
+"""Size of a turn without its picture, bytes."""
 FLUSH_PERIOD_S = 1.0
 RESERVE_BYTES = 200_000_000
-"""Left free on the disk: it is the flight log's, without which the vehicle would have to land."""
+"""Space that the recording leaves free on the disk, bytes. The flight log needs it, without which
+the vehicle may have to land."""
 
 
 class Recorder:
@@ -112,7 +113,7 @@ class Recorder:
         self._hand_over()  # before take-off no tick does
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
-        # A frame that repeats holds its picture too.
+        # A repeated frame contains its picture, too.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
     def write_tick(self, record: Mapping[str, Any]) -> None:
@@ -148,7 +149,7 @@ class Recorder:
         try:
             for job in jobs:
                 job()
-        except Exception as error:  # whatever it is, it is no matter of the flight's
+        except Exception as error:  # no error here may affect the flight
             why = f"{type(error).__name__}: {error}"
             if isinstance(error, OSError):
                 why = error.strerror or str(error)
@@ -168,7 +169,7 @@ class Recorder:
         if not frame.repeated:
             self._add(IMAGE, ns, image_message(self._ns(frame.t_s), frame), number)
             self._written_pictures += 1
-        # With all digits: a replay needs the very times.
+        # With all digits, because a replay needs exactly these times.
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def _write_tick(self, record: Mapping[str, Any]) -> None:
@@ -212,8 +213,8 @@ class Recorder:
         self._remember(f"the recording has ended ({why}): the flight and its log continue")
 
     def _ns(self, t_s: float) -> int:
-        """A time on the loop's clock as nanoseconds since 1970, where a flight in lockstep
-        begins; what was before that is at 0, which MCAP begins at."""
+        """Convert a time on the loop's clock to nanoseconds since 1970, where a flight in lockstep
+        begins. Earlier times become 0, the first time of MCAP."""
         return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:

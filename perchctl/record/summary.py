@@ -101,7 +101,7 @@ class FlightSummary:
         battery_min_v = float(np.min(known_v)) if known_v.size else None
         simulated = is_simulated(log.header)
         findings = _part_in(end, CameraFindings, _FINDINGS)
-        if simulated and findings is not None:  # logs by 0.3.0 have advice in spite of it
+        if simulated and findings is not None:  # logs written by 0.3.0 contain advice anyway
             findings = replace(findings, advice=())
         return cls(
             outcome=str(end.get("outcome", "unknown")),
@@ -214,7 +214,7 @@ def is_simulated(header: Mapping[str, Any]) -> bool:
     return str(header.get("uri", "")).startswith("sim://")
 
 
-# A part of the summary by the record's keys and its own fields, in their order.
+# The parts of the summary, by the record's keys, with their own fields in order.
 _CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {

@@ -1,8 +1,8 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
-Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one
-rounded, for people and plots, the other exact and whole), `event` and `sent` records between them,
-and one `summary` at the end. A flight is never troubled by its log.
+Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one rounded,
+for people and plots, the other exact and whole), `event` and `sent` records between them, and one
+`summary` at the end. An error of the log never disturbs the flight.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 FSYNC_PERIOD_S = 1.0
 LOG_CLOSE_TIMEOUT_S = 3.0
 MOST_WAITING = 3000
-"""Records that may wait for the disk, half a minute of a flight at 50 Hz; more are dropped."""
+"""Number of records that may wait for the disk, half a minute of a flight at 50 Hz; more are
+dropped."""
 NO_ANSWER = "the disk does not respond: the end of the flight log is missing"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
@@ -99,7 +100,7 @@ class LogWatcher:
         `live`: a background thread writes, and syncs about once a second; otherwise each record is
         written at once. Raises InvalidValue, before the flight.
         """
-        # A replay flies by the profile in the header, so no number of it is rounded.
+        # A replay flies with the profile in the header, so its numbers are not rounded.
         line = json_line(to_exact_json({k: v for k, v in header.items() if v is not None}))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +185,7 @@ class LogWatcher:
             position_m, miss_m = (None, None) if self.truth is None else self.truth()
             record = tick_record(tick, position_m, miss_m)
             self.write(record)
-        except Exception as error:  # whatever it is: only this record is lost
+        except Exception as error:  # any error: only this record is lost
             self._unmade += 1
             self._remember_unencodable(error)
         self.turn(tick.record)
@@ -208,12 +209,12 @@ class LogWatcher:
         try:
             line = partial(encode_line, {"kind": "event", **event_record(event)})
             self._put(line, event.t_s)
-        except Exception as error:  # whatever it is: only this record is lost
+        except Exception as error:  # any error: only this record is lost
             self._unmade += 1
             self._remember_unencodable(error)
 
     def note_detached(self, reason: str) -> None:
-        """Remember that the flight writes no more records, as writing one raised."""
+        """Note that the flight writes no more records because writing one raised an exception."""
         self._remember(reason)
 
     def close(
@@ -293,13 +294,13 @@ class LogWatcher:
         except OSError as error:
             self._failed += 1
             self._remember(_explain(error))
-        except Exception as error:  # whatever it is: the thread outlives its record
+        except Exception as error:  # any error: the thread must not end because of one record
             self._failed += 1
             self._remember_unencodable(error)
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # What was waited for in vain is in the file by now.
+            # The record that was waited for in vain is in the file by now.
             problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
@@ -334,7 +335,7 @@ def turn_line(turn: TickRecord) -> bytes:
     record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.inputs.late_samples or turn.inputs.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
-        del record["observation"]["telemetry"]  # it stands in the same line already
+        del record["observation"]["telemetry"]  # already contained in the same line
     return json_line(record)
 
 
