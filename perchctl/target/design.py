@@ -1,8 +1,8 @@
-"""What a target will do with a camera: from where to where each marker is seen.
+"""Predict how a target works with a camera: the range in which each marker is detected.
 
-z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the
-whole large one (paper, section III-B: 115, 25, 12 cm). They follow from the smallest side
-that is read through the blur, and from the picture's edge.
+z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the whole
+large one (paper, section III-B: 115, 25, 12 cm). They depend on the smallest side that can be read
+through the blur, and on the picture's edge.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def make_design(
     )
     large = target.large.side_m
     small = target.small.side_m
-    # Where the target is the positioning system, it has to be seen from the ground.
+    # A target that is the positioning system must be visible from the ground.
     ground = profile.positioning.source.is_target
     height_m = 0.0 if ground else profile.planner.search.max_height_m
     start_m = None

@@ -26,13 +26,15 @@ BORDER_BITS = 1
 """Width of a marker's black border in cells."""
 
 RING_MIN_PER_LARGE_SIDE = 1 / 150
-"""The white ring around the small marker is at least 1 mm on a 150 mm marker: without
-one the small marker is never found (measured for ids whose centre is black)."""
+"""Least width of the white ring around the small marker, relative to the large marker's side: 1 mm
+on a 150 mm marker. Without a ring, the small marker is never found (measured for ids whose centre
+is black)."""
 
 SAMPLED_MARGIN = 0.13
-"""Share of a cell, at each of its sides, that cv2.aruco does not sample."""
+"""Share of a cell at each of its sides that cv2.aruco does not sample."""
 MAX_WHITE_IN_BLACK_CELL = 0.3
-"""White that the small marker and its ring may bring into a black cell of the large one."""
+"""Largest share of white that the small marker and its ring may add to a black cell of the large
+one."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class TargetDrawing:
         """The share of black, 0..1, in each pixel's window, (size_px, size_px), with the
         parameters of `pixel_overlap`."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
-        # The grid is symmetric about 0, so the same weights serve rows from the top.
+        # The grid is symmetric about 0, so the same weights are valid for the rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:

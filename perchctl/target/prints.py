@@ -1,4 +1,5 @@
-"""The print: its sizes as measured on paper, and the small marker's proportion to the large one.
+"""The printed target: the sizes measured on paper, and the ratio of the small marker's size to the
+large one's.
 
 Seen together, both markers lie in one plane at one distance: the ratio of their apparent
 sizes is the ratio of their prints, whatever the distance and the focal length.
@@ -19,7 +20,7 @@ from perchctl.target.drawing import marker_corners_m, print_scale
 from perchctl.vision import CameraModel, PipelineOutput, undistort_to_normalised
 
 MEASURED_SIGMA = 0.001
-"""What measured sizes may be off by, relative: 0.15 mm of a large marker."""
+"""Relative error of measured sizes: 0.15 mm of a large marker."""
 
 
 def measured_target(
@@ -53,13 +54,13 @@ def measured_target(
 
 
 CORNER_BIAS_PX = 0.02
-"""What a refined corner errs inwards or outwards in all frames alike; no number of frames
-averages it away."""
+"""Error of a refined corner inwards or outwards that all frames share, px; averaging over frames
+does not reduce it."""
 MIN_ERROR = 0.003
-"""Errors smaller than this are not named: of a 25 mm marker a printer's dot."""
+"""Smallest relative error that is reported: a printer's dot on a 25 mm marker."""
 SIGMAS = 3.0
 MIN_FRAMES = 5
-_MEDIAN_TO_SIGMA = 1.2533  # the standard error of a median, in that of a mean
+_MEDIAN_TO_SIGMA = 1.2533  # ratio of the standard error of a median to that of a mean
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -86,7 +87,8 @@ def size_ratio(
 
 @dataclass(frozen=True)
 class PrintVerdict:
-    """What the ratio of both markers says about the print. `advice` is empty unless it is wrong."""
+    """The result of comparing the sizes of both markers. `advice` is empty unless the print is
+    wrong."""
 
     found: str
     advice: str = ""

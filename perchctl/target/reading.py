@@ -1,7 +1,7 @@
-"""The reading of a target by a plain detector: of its drawing, before ink is spent, and of small
-pictures through blur and noise.
+"""Read a target with a plain detector: its drawing before it is printed, and small pictures with
+blur and noise.
 
-The smallest side that is read is found by trial, which takes a second.
+The smallest readable side is found by trial, which takes a second.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def _single_marker_dictionary(marker: MarkerConfig) -> Any:
 
 FOUND_RATE = 0.9
 NOISE = 5.0
-"""Sigma of the grey levels (0..255)."""
+"""Standard deviation of the noise, grey levels (0..255)."""
 TRIALS = 24
 SIDE_STEP_RATIO = 1.04
-"""Ratio of neighbouring sides that are tried."""
+"""Ratio between successive sides that are tried."""
 SIDE_RANGE_PX = (6.0, 400.0)
 _READING_STREAM = 801
 _PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
@@ -130,11 +130,11 @@ def sample_pictures(
         yield np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-# --- What is checked before ink is spent ---
+# --- Checks before the target is printed ---
 
 
 MIN_DISTANCE = 3
-"""Cells in which two patterns of one size must differ: one more than the wrong bits that
+"""Number of cells in which two patterns of one size must differ: one more than the wrong bits that
 are corrected in both."""
 _READ_SIDE_PX = 480.0
 

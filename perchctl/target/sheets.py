@@ -1,8 +1,8 @@
 """The printed pages, true to size: the target's front and back, a board.
 
-The target's centre is the page's centre, so that the back's cross lies over the front's centre
-whichever way the sheet is turned. Page axes: origin at the top left corner of the paper, x right, y
-down, mm.
+The target's centre is the page's centre, so the cross on the back lies over the front's centre
+whichever way the sheet is turned over. Page axes: origin at the top left corner of the paper, x
+right, y down, mm.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ PAGES_MM: dict[str, tuple[float, float]] = {
 }
 """Named pages, portrait, in the order in which one that fits is proposed."""
 MOST_PAGE = 5000.0
-"""mm, the longest side: a PDF's pages end at 5.08 m."""
+"""Largest side of a page, mm: a PDF's pages end at 5.08 m."""
 UNPRINTABLE = 5.0
-"""mm at the paper's edges that many printers leave white."""
+"""Width of the paper's edges that many printers leave white, mm."""
 MIN_QUIET_CELLS = 0.5
-"""White around the large marker, in its cells. One cell is printed where the page has
-room; down to half a cell the range stays the same (found from 32 px on, at 0.3 from 36)."""
+"""Least white margin around the large marker, in its cells. One cell is printed if the page has
+room for it. Down to half a cell, the range stays the same (the marker is found from 32 px on; with
+0.3 cells, from 36 px on)."""
 
 _PT_PER_MM = 72.0 / 25.4
 RULER = 100.0
@@ -71,7 +72,7 @@ def target_pdf(
     """
     check_target(target, magnet_m)
     size = parse_page(page)
-    # Of Helvetica's letters alone.
+    # Only the letters of Helvetica.
     origin = origin.encode("latin-1", errors="replace").decode("latin-1")
     texts = _caption(target, origin, date)
     place = _layout_on(target, size, texts)
@@ -178,11 +179,11 @@ def _layout_on(
     """Return half the cut sheet's side, mm, and caption lines; None if the target does not fit."""
     side, cell = _side_and_cell(target)
     width, height = page
-    # Narrower than its rulers, a page may have no room for a word of the caption.
+    # On a page that is narrower than its rulers, there may be no room for a word of the caption.
     if min(page) / 2 - UNPRINTABLE < _ruler_half(side / 2):
         return None
     lines, below = _caption_room(texts, width)
-    # Where a small target's sheet ends inside of the rulers, the page has room for a cell.
+    # If a small target's sheet ends inside the rulers, the page has room for a whole cell.
     half = min(width / 2 - _RULER_DEPTH, height / 2 - below) - UNPRINTABLE
     quiet = math.floor(2.0 * min(cell, half - side / 2) + 1e-6) / 2.0
     if quiet < MIN_QUIET_CELLS * cell - 1e-9 or half < _ruler_half(side / 2 + quiet) - 1e-9:

@@ -90,13 +90,15 @@ def outline_points_3d(outline_m: Array, z_m: float) -> Array:
 
 
 SURE_PX = 18.0
-"""A search finds sides of 15 px in all rendered pictures: with a fifth to spare."""
+"""Side of a marker that the search finds reliably, px: it finds 15 px in all rendered pictures, and
+a fifth is added."""
 BLURRED = 1.15
-"""Times the least side that a plain search reads through a measured blur."""
+"""Factor on the least side that a plain search reads through a measured blur."""
 STRAIGHT_DEG = 2.0
-"""A lean below this is too small to be named."""
+"""Lean below which it is too small to be reported, deg."""
 LEAST_UP = 0.2
-"""Of the view's upward part: a camera that looks farther aside sees no target over it."""
+"""Least vertical component of the view's direction: a camera that looks farther to the side cannot
+see a target above it."""
 
 
 def reliable_side_px(detected_px: float | None = None) -> float:
@@ -193,7 +195,7 @@ def view_from(
         field.contains((square_corners(side_m) @ turn.T + centre) @ R)
         for side_m in (target.large.side_m, target.small.side_m)
     )
-    # The small marker by its size alone.
+    # The small marker is judged by its size alone.
     readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * height_m
     view = R[:, 2]
     aside = centre - height_m / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
@@ -213,13 +215,13 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
     )
 
 
-# --- Near the target: from where on a mounting is blind ---
+# --- Near the target: the range below which a mounting cannot see it ---
 # With the gear under the target's centre, the vehicle level and its heading the target's, as in
 # an ascent: so the outline of the markers is upright in body axes.
 
 
 FROM_M = 0.10
-"""The last stretch that is judged, from gear to target."""
+"""Distance from gear to target below which the view is judged, m."""
 _STEP_M = 0.0005
 
 
