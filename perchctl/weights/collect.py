@@ -1,7 +1,8 @@
-"""Collecting the data: a person places the camera, checked rows of the session's file come out.
+"""Collect the data for a fit: a person places the camera, and checked rows are added to the
+session's file.
 
-A session is a CSV (`perchctl.weights.data`) to which positions are appended in one write each: it
-can be stopped and continued at any time, less a line that a crash cut in two.
+A session is a CSV file (`perchctl.weights.data`) to which each position is appended in a single
+write. It can be stopped and continued at any time; a crash costs at most the last position.
 
 The actual pose of a position is given by a person or by motion capture. It is what the pipeline
 measures: the target relative to the gear's tip in the level frame, (x, y, z, yaw).
@@ -40,14 +41,14 @@ from perchctl.vision import (
 from perchctl.weights.data import HEADER, csv_row
 
 SEEN_SHARE = 0.9
-"""Of a position's frames both markers must be in so many."""
+"""Share of a position's frames that must show both markers."""
 MOST_WANDER_PX = 1.0
-"""The target's picture must not wander farther within a position, nor shake more."""
+"""Largest drift and largest jitter of the target's picture within a position, px."""
 MOST_MISMATCH_M = 0.03
-"""An actual pose that differs from the camera's by more is a mistake. Larger: it is taken for an
-error of the camera."""
+"""Difference from the camera's pose above which an actual pose is a mistake, m. Larger: a mistake
+is taken for an error of the camera."""
 MOST_MISMATCH_RAD = math.radians(10.0)
-"""The same for the yaw."""
+"""The same difference of the yaw, rad."""
 SAMPLES = 30
 """Frames of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
 WITHIN_S = 5.0
@@ -175,7 +176,8 @@ class SessionFile:
             raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
         rows = Counter(positions)
         if torn:
-            # The position that was being written: its tail is lost, so all of it is taken again.
+            # The tail of the position that was being written is lost, so the whole position is
+            # taken again.
             if positions and rows[positions[-1]] < frames:
                 del lines[-rows.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
@@ -231,7 +233,7 @@ class MocapPoses:
 
     def actual_pose(self, ask: Ask) -> ActualPose:
         """The median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
-        self._capture.poll(self._now())  # an older one does not count
+        self._capture.poll(self._now())  # an older frame does not count
         frames: list[CaptureFrame] = []
         until_s = self._now() + WITHIN_S
         while len(frames) < SAMPLES:

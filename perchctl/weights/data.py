@@ -35,7 +35,7 @@ NEEDED = (
 HEADER = ",".join(NEEDED)
 
 MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
-"""A marker that measures a position so far from the truth was written in other units."""
+"""Difference from the truth above which a marker's pose was probably written in other units, m."""
 
 
 @dataclass(frozen=True, eq=False)

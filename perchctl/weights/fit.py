@@ -1,10 +1,10 @@
-"""The weights from the data, per axis: the paper's LMS, and the least squares in closed form that
-it approaches; and whether they help.
+"""Fit the weights to the data for each axis, by the paper's LMS and by the closed-form least
+squares to which it converges, and test whether they help.
 
-With a = large - actual and b = small - actual the merged error of equation 8 is
-``w a + (1 - w) b``. What is constant in a and b, the markers' bias, no weight can mend:
-it is reported apart, and the weights are fitted to the rest. Differences of yaw are wrapped
-about their mean direction.
+With a = large - actual and b = small - actual the merged error of equation 8 is ``w a + (1 - w)
+b``. The constant part of a and b is the markers' bias. No weight can correct it, so it is reported
+separately, and the weights are fitted to the rest. Differences of yaw are wrapped about their mean
+direction.
 
 Frames of one position share its errors, so whole positions are held out in turn to test
 the weights, bias included, as it acts in a flight. Intervals are Student's t over positions
@@ -28,10 +28,10 @@ from perchctl.geometry import Array
 from perchctl.weights.data import AXES, YAW_COLUMN, Measurements, wrap_angles
 
 OUTLIER_SIGMAS = 6.0
-"""A row does not count on an axis where a marker's error is farther from the median of its
-position than this many robust standard deviations."""
+"""Number of robust standard deviations from the median of its position beyond which a marker's
+error excludes the row on that axis."""
 LEAST_ROWS = 8
-"""Rows a position, on average, below which nothing is called an outlier."""
+"""Average number of rows per position below which nothing counts as an outlier."""
 _MAD_TO_SIGMA = 1.4826
 
 PAPER_WEIGHTS = (0.275, 0.306, 0.728, 0.469)
@@ -102,7 +102,7 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return False at outliers by `OUTLIER_SIGMAS`, (n, 4); positions begin at rows `starts`."""
     use = np.ones(error.shape, dtype=bool)
     if len(starts) * LEAST_ROWS > len(error):
-        return use  # too few rows a position to estimate what is usual
+        return use  # too few rows per position to estimate the usual error
     for start, end in itertools.pairwise([*starts, len(error)]):
         part = error[start:end]
         away = np.abs(part - np.median(part, axis=0))
@@ -136,9 +136,10 @@ def closed_form_weights(sums: Array) -> Array:
 
 START_STEP = 0.02
 LEAST_RUN_ROWS, LEAST_PASSES = 40_000, 3
-"""Rows to run through, in as many passes as that takes, so that few rows suffice."""
+"""Least number of rows to process, in as many passes as necessary, and least number of passes, so
+that a few rows suffice."""
 MOST_ROWS = 100_000
-"""Of more rows an even share is run through."""
+"""Largest number of rows; of more rows, evenly spaced ones are processed."""
 _LMS_STREAM = (0, 601)
 
 
@@ -187,7 +188,7 @@ def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
     return d * d / mean, b * d / mean
 
 
-# --- Both methods, and their errors on positions that they were not fitted to ---
+# --- Both methods, and their errors on positions left out of the fit ---
 
 
 @dataclass(frozen=True, eq=False)
