@@ -1,4 +1,4 @@
-"""Analysis of flight logs: shown, compared, drawn, reported, and replayed."""
+"""Analysis of flight logs: show, compare, plot, report and replay flights."""
 
 import lazy_loader
 

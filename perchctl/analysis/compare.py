@@ -1,4 +1,4 @@
-"""What differs between two flights: their numbers, their phases, their profiles."""
+"""Compare two flights: their figures, their phases and their profiles."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A flight decided again: the recorded observations through the planner.
+"""Replay the decisions of a flight: pass the recorded observations to the planner again.
 
-The planner is pure, so the same observations and the same profile have to give the same
-commands: to the bit on the computer that flew, and within a tolerance on any other, whose libraries
+The planner is pure, so the same observations and the same profile must give the same commands. They
+are bit-identical on the computer that flew, and within a tolerance on any other, whose libraries
 may round differently.
 """
 
@@ -94,7 +94,7 @@ def replay_decisions(
             if turn.role != "failed" or ("Turn", "error") not in comparison.unknown:
                 differs = comparison.difference("error", turn.error, name)
             yield ReplayedDecision(tick, turn, differs, name)
-            return  # what came after it cannot be decided
+            return  # later turns cannot be replayed
         yield ReplayedDecision(tick, turn, _difference(turn, new, command, comparison))
         if turn.role == "flown":
             state, tick = new, tick + 1

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ARM_M = 0.046
-"""From the vehicle's centre to a motor."""
+"""Distance from the vehicle's centre to a motor, m."""
 BESIDE_M, ABOVE_M = 0.25, 0.12
-"""The side view shows so much more than the flight needs."""
+"""Margins of the side view beside and above the flight, m."""
 LEAST_ASIDE_M = 0.05
-"""A start nearer to the target gives the view no direction."""
+"""Horizontal distance from the target below which the start gives the view no direction, m."""
 LAST_PICTURE_S = 2.0
-"""The last picture stays for so long."""
+"""Time for which the last picture stays, s."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
 SIZE_STEP_PX = 32
-"""Of the width, so that width and height are even, as H.264 needs them."""
+"""Multiple to which the width is rounded, so that width and height are even, as H.264 requires."""
 Rgb = NDArray[np.uint8]
 Progress = Callable[[int, int | None], object]
 """Called with the number done, and the total."""
@@ -236,7 +236,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     if not seen_m.size:
         return place_m, None
     target_z_m = float(target_m[2] - start_m[2])
-    # Nothing is above the sheet; an estimate of a vehicle that hangs drifts.
+    # Nothing is above the sheet: the estimate of a vehicle that hangs drifts.
     highest_m = target_z_m - log.flown_profile.vehicle.gear_body_m[2]
     place_m[:, 1] = np.minimum(place_m[:, 1], highest_m)
     return place_m, target_z_m

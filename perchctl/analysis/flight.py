@@ -1,4 +1,4 @@
-"""What a flight was: one value under `log show`, `compare`, `plot` and `report`."""
+"""One flight as a value on which `log show`, `compare`, `plot` and `report` are based."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from perchctl.record import read_log as read_records
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 SETTLED_S = 1.0
-"""So long before the contact begins is looked at for how well the vehicle has settled."""
+"""Time before the contact over which the settled errors are computed, s."""
 _NUMBER = re.compile(r"[0-9.]+")
 
 
@@ -265,7 +265,7 @@ def _known(value: float) -> float | None:
 # --- what was sent in the loop's place ---
 
 APART_S = 2.0
-"""Commands of one sender that are farther apart are two goes."""
+"""Time between two commands of one sender above which they belong to two series, s."""
 _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 """Two words of a class's name."""
 

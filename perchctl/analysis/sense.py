@@ -1,6 +1,7 @@
-"""A flight seen again: the recorded telemetry and pictures through the loop's own inputs.
+"""Replay the perception of a flight: pass the recorded telemetry and pictures to the loop's own
+inputs again.
 
-The same pictures, samples and times have to give the same poses, to the bit, on one thread.
+On one thread, the same pictures, samples and times must give bit-identical poses.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class _Given:
         return None
 
     def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        if self._taken.camera_problem is not None:  # nobody looked at it
+        if self._taken.camera_problem is not None:  # no picture was searched in this turn
             return np.zeros((1, 1), np.uint8)
         image = self._repeated_picture(seen) if seen.repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)

@@ -1,4 +1,5 @@
-"""What the camera saw, by a flight's log: frames, their quality, and losses."""
+"""What the camera saw, according to a flight's log: frames, their quality, and losses of the
+target."""
 
 from __future__ import annotations
 
@@ -14,9 +15,10 @@ from perchctl.geometry import Array
 from perchctl.record import FlightLog, PhaseSpan
 
 BLIND_PHASE = "COMPLETE"
-"""Against the ceiling no frame is looked at."""
+"""Phase at the ceiling, in which no frames are searched."""
 GAP_PERIODS = 2.5
-"""Frames come irregularly: less than that may be a late one."""
+"""Number of median periods up to which a gap may be a late frame, since frames arrive
+irregularly."""
 
 
 def percentile(values: Array, percent: float) -> float:
@@ -95,7 +97,7 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
 # --- losses ---
 
 LEAST_LOSS_S = 0.3
-"""A shorter gap is coasted through and changes nothing."""
+"""Duration below which a loss is coasted through and changes nothing, s."""
 NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER", "HOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 

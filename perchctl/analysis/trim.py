@@ -1,4 +1,4 @@
-"""What a level hover says about a vehicle's motors and balance.
+"""Estimate the balance of a vehicle and its motors from a level hover.
 
 The thrust f_i that the firmware asks of each motor follows from its duty cycle and the battery's
 voltage by the thrust curve; what a weak motor gives is less. The shares a_i = 4 f_i / (f_1 + f_2 +
@@ -58,19 +58,22 @@ HOVER_CLIMB_MPS = 0.3
 HOVER_LEAN_RAD = math.radians(4.0)
 """Largest lean of a hover, rad. Larger: samples in which the vehicle changes its speed."""
 SAMPLE_PERIOD_S = 0.1
-"""Of the log packets with duty cycles (`perchctl.link.telemetry`, `SLOW_PERIOD_S`)."""
+"""Period of the log packets with duty cycles, s (`perchctl.link.telemetry`, `SLOW_PERIOD_S`)."""
 LEAST_SAMPLES = 20
-"""For an estimate: 2 s of hover. Smaller: more flights have one, with wide intervals."""
+"""Least number of samples for an estimate: 2 s of hover. Smaller: more flights have an estimate,
+but with wide intervals."""
 CORRELATED_SAMPLES = 10
-"""So far apart, samples are independent: 1 s, a few swings of the attitude. Larger: intervals that
-are less certain themselves. Smaller: too narrow ones."""
+"""Number of samples after which they are independent: 1 s, a few oscillations of the attitude.
+Larger: the intervals themselves are less certain. Smaller: they are too narrow."""
 HARMLESS_SHIFT_M = 0.0025
-"""Shift of the centre of mass without advice, m: recorded vehicles flew with up to 2.4 mm."""
+"""Shift of the centre of mass up to which no advice is given, m: recorded vehicles flew with up to
+2.4 mm."""
 HARMLESS_YAW = 0.06
-"""Yaw imbalance without advice: of two recorded vehicles one flew with 0.058, one with 0.165."""
+"""Yaw imbalance up to which no advice is given: of two recorded vehicles, one flew with 0.058 and
+one with 0.165."""
 
 MOTOR_PLACES = ("front right", "back right", "back left", "front left")
-"""Places of M1..M4."""
+"""Positions of M1..M4."""
 _PATTERNS = np.array([(1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), (-1.0, 1.0, -1.0, 1.0)]) / 4.0
 _WAYS = (("forward", "backward"), ("to the left", "to the right"))
 
