@@ -1,4 +1,5 @@
-"""Many seeded flights in lockstep: flown in processes or on a cluster, counted, and compared."""
+"""Campaigns of many seeded flights in lockstep, flown in processes or on a cluster, counted and
+compared."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
 """The workers of a dask cluster as an executor of flights, by dask's own executor.
 
-A flight elsewhere is the flight here only by the same program, libraries and data.
+A flight on another computer has the same result only with the same program, libraries and data.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from perchctl.profile import Profile
 R = TypeVar("R")
 
 SCHEDULER_TIMEOUT_S = 10.0
-"""The scheduler must answer within this time."""
+"""Time within which the scheduler must answer, s."""
 WORKERS_S = 20.0
-"""The first worker must register within this time."""
+"""Time within which the first worker must register, s."""
 _CLOSE_S = 1.0
 _QUIET = ("distributed", "tornado", "asyncio")
 _LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
@@ -74,7 +74,8 @@ def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
 
 
 _differences: dict[str, str] = {}
-"""In what this worker differs from what its campaigns require, by campaign; empty: in nothing."""
+"""Return the differences between this worker and the requirements of its campaigns, by campaign;
+empty without any."""
 
 
 def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:

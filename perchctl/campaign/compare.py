@@ -1,4 +1,4 @@
-"""The same seeds flown by several profiles: what differs, and whether it is proven.
+"""Fly the same seeds with several profiles, and find out which differences are significant.
 
 A figure's difference is the mean over the pairs of flights of one seed, with Student's interval;
 success is compared by the pairs in which only one of both succeeded (McNemar's exact test). All
@@ -78,9 +78,10 @@ None where nothing is proven:
   A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
 """
 FEWEST_PAIRS = 20
-"""Fewer pairs get no interval, since only the mean of many is nearly normal."""
+"""Number of pairs below which no interval is given, since only the mean of many is nearly
+normal."""
 _ROUNDING_RATIO = 1e-9
-"""Values whose relative difference is below this differ by rounding only."""
+"""Relative difference below which two values differ only by rounding."""
 NOT_PROVEN = "no significant difference"
 FIGURES = {
     "miss_m": ("miss [mm]", "mm", 1e3),

@@ -1,4 +1,4 @@
-"""Processes that fly a campaign, deaf to signals, killed at an early end."""
+"""Processes that fly a campaign: they ignore signals and are killed when it ends early."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class FlightProcesses(ProcessPoolExecutor):
 
     def __init__(self, count: int) -> None:
         super().__init__(count, _CONTEXT, end_with_parent)
-        resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
+        # started here, because starting it clears the signal mask of the calling thread
+        resource_tracker.ensure_running()
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
         """Queue the flight ``fn(*args, **kwargs)`` for the next free process; return its future."""

@@ -1,6 +1,6 @@
-"""What stays of a campaign: a file of results that grows line by line, and logs.
+"""The persistent results of a campaign: a file that grows line by line, and logs.
 
-Line 1 of the file is a header that says what is flown; then comes one record a flight.
+Line 1 of the file is a header that describes what is flown. One record per flight follows.
 """
 
 from __future__ import annotations
