@@ -171,7 +171,8 @@ class HubDriver:
         self._thread.start()
 
     def send_packet(self, packet: Any) -> bool:
-        """Send a packet at once. Never waits: whoever can wait asks `out_queue` for room."""
+        """Send a packet at once, without waiting. A caller that can wait asks `out_queue` for room
+        first."""
         if self._socket is None or self._closed.is_set():
             return False
         self.out_queue.waiting += 1

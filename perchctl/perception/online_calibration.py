@@ -23,8 +23,8 @@ from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
 LIKELY_S = 0.02
-"""Standard deviation of the delay below which the factors of the next pictures are computed at that
-delay, s."""
+"""Standard deviation of the delay below which the factors of the next pictures are computed with
+that delay, s."""
 USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
 oscillate."""
