@@ -104,7 +104,7 @@ WAYS: dict[str, Callable[[Picture], Picture]] = {
 def mosaic(number: int) -> int:
     """Corner errors of the first sight, whatever the way from the mosaic to grey."""
     camera = load_calibration(CALIBRATION)
-    setup = setup_with(camera).detector
+    setup = setup_with(camera).detector_setup
     rng = np.random.default_rng(1)
     rows = []
     for as_jpeg in (False, True):

@@ -139,7 +139,7 @@ def main() -> int:
             for i in range(pictures):
                 rng = np.random.default_rng([number, int(10 * blur_px), i])
                 frame = Frame(0, 0.0, make(rng, blur_px))
-                result = detect_markers(frame, None, SETUP.detector, CAMERA)
+                result = detect_markers(frame, None, SETUP.detector_setup, CAMERA)
                 seen += result.large is not None or result.small is not None
             good = good and (name in OWN or seen <= MOST_FOREIGN * pictures)
             found.append(str(seen))

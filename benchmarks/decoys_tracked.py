@@ -19,7 +19,7 @@ import numpy as np
 from common import Picture, setup_with, table
 
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
-from perchctl.vision import Attitude, Frame, PipelineState, step
+from perchctl.vision import Frame, PipelineState, VehicleState, step
 from tests.helpers.target_picture import CAMERA, Drawn, render, side_by_side
 
 RATE_HZ = 30.0
@@ -61,7 +61,7 @@ class View:
     """Where the camera is, and with which attitude its vehicle says so."""
 
     T_world_cam: Array
-    attitude: Attitude
+    attitude: VehicleState
 
 
 def view(k: int, seed: int) -> View:
@@ -72,7 +72,7 @@ def view(k: int, seed: int) -> View:
     sway = np.array([0.04, 0.04, 0.03]) * np.sin(1.5 * t + phase[:3])
     roll, pitch, yaw = np.array([0.04, 0.04, 0.3]) * np.sin(1.2 * t + phase[3:])
     x, y, z = (float(v) for v in TARGET_M + sway - np.array([0.0, 0.0, height]))
-    attitude = Attitude(t, float(roll), float(pitch), float(yaw), (x, y, z))
+    attitude = VehicleState(t, float(roll), float(pitch), float(yaw), (x, y, z))
     return View(make_T(rotation_from_rpy(roll, pitch, yaw), (x, y, z)), attitude)
 
 

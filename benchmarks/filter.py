@@ -28,10 +28,10 @@ from perchctl.geometry import (
 from perchctl.profile import KalmanConfig
 from perchctl.vision import (
     MARKERS,
-    Attitude,
     Pipeline,
     PipelineOutput,
     PipelineState,
+    VehicleState,
     project,
     square_corners,
 )
@@ -117,11 +117,11 @@ def corners(moment: Moment, sigma_px: float, index: int, rng: np.random.Generato
     return Detections(index, moment.t_s, **seen)
 
 
-def attitude_of(moment: Moment, bias_rad: tuple[float, float]) -> Attitude:
+def attitude_of(moment: Moment, bias_rad: tuple[float, float]) -> VehicleState:
     """The vehicle's own, with its estimate's errors."""
     roll, pitch, yaw = moment.rpy
     x, y, z = moment.T_world_body[:3, 3] + moment.estimate_error_m
-    return Attitude(moment.t_s, roll + bias_rad[0], pitch + bias_rad[1], yaw, (x, y, z))
+    return VehicleState(moment.t_s, roll + bias_rad[0], pitch + bias_rad[1], yaw, (x, y, z))
 
 
 def true_error(moment: Moment, in_world: bool) -> tuple[Array, float]:

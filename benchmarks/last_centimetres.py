@@ -24,7 +24,7 @@ from perchctl.profile import CameraConfig, Mounting, Profile
 from perchctl.profile.vision import VehicleConfig
 from perchctl.sim import Renderer
 from perchctl.target.prints import MEASURED_SIGMA
-from perchctl.vision import Attitude, Frame, Pipeline, PipelineState, make_pipeline, step
+from perchctl.vision import Frame, Pipeline, PipelineState, VehicleState, make_pipeline, step
 
 LAST_M, FROM_M, SPEED_MPS, RATE_HZ = 0.10, 0.16, 0.10, 30.0
 EXPOSURE_S = 0.008
@@ -107,7 +107,7 @@ def ascent(case: Case, setup: Pipeline, scene: Renderer, seed: int, in_hand: boo
         T, (roll, pitch, yaw) = body_at(t_s, sway, case)
         image = scene.render(samples, frame_index=1000 * seed + k)
         off = keep * off + rng.normal(0.0, ESTIMATE_M * math.sqrt(1.0 - keep**2), 3)
-        attitude = None if in_hand else Attitude(t_s, roll, pitch, yaw, tuple(T[:3, 3] + off))
+        attitude = None if in_hand else VehicleState(t_s, roll, pitch, yaw, tuple(T[:3, 3] + off))
         start_s = time.process_time()
         state, output = step(state, Frame(k, t_s, image), attitude, setup)
         took_s = time.process_time() - start_s

@@ -129,7 +129,7 @@ def views(case: Case, marker: str, side_px: float, count: int) -> Iterator[View]
 
 
 def finder(method: str, marker: str) -> Callable[[View], Array | None]:
-    setup = setup_with().detector
+    setup = setup_with().detector_setup
 
     def plain(view: View) -> Array | None:
         return plain_detect(view.image).get(marker)

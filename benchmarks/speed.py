@@ -24,10 +24,10 @@ from common import (
 
 from perchctl.geometry import Array
 from perchctl.vision import (
-    Attitude,
     Frame,
     PipelineOutput,
     PipelineState,
+    VehicleState,
     deinterlace,
     step,
 )
@@ -39,17 +39,17 @@ BASE, WHOLE = "two full-frame detectors", "frame to target pose"
 Found = dict[str, object]
 
 
-def path(t: float) -> tuple[Array, Attitude]:
+def path(t: float) -> tuple[Array, VehicleState]:
     """A flight towards the target, swaying and turning: T_world_cam and the attitude."""
     roll, pitch = 0.06 * math.sin(2.3 * t), 0.05 * math.cos(1.9 * t)
     yaw = 0.4 * math.sin(0.7 * t)
     height = 0.20 + 0.85 * (0.5 + 0.5 * math.cos(0.45 * t))
     x, y = 0.12 * height * math.sin(1.3 * t), 0.10 * height * math.sin(1.7 * t + 0.5)
     T = camera_pose(x, y, height, yaw, roll, pitch)
-    return T, Attitude(t, roll, pitch, -yaw, tuple(T[:3, 3]))
+    return T, VehicleState(t, roll, pitch, -yaw, tuple(T[:3, 3]))
 
 
-def sequence(count: int) -> Iterator[tuple[Frame, Attitude, Array]]:
+def sequence(count: int) -> Iterator[tuple[Frame, VehicleState, Array]]:
     scene = renderer(seed=4, camera_noise_sigma=4.0)
     for k in range(count):
         t = k / RATE_HZ
@@ -91,11 +91,11 @@ def main() -> None:
 
     def detection(k: int) -> Found:
         nonlocal last
-        seen = detect_markers(frames[k][0], last, setup.detector, CAMERA)
+        seen = detect_markers(frames[k][0], last, setup.detector_setup, CAMERA)
         last = seen if seen.large or seen.small else last
         return {"large": seen.large, "small": seen.small}
 
-    def whole(k: int, attitude: Attitude | None) -> Found:
+    def whole(k: int, attitude: VehicleState | None) -> Found:
         nonlocal state
         state, (frame,) = deinterlace(state, frames[k][0], setup)
         state, output = step(state, frame, attitude, setup)

@@ -16,10 +16,10 @@ from .profile import load_profile as load_profile
 from .real_time import fly as fly
 from .sighting import Sighting as Sighting
 from .sighting import track as track
-from .vision import Attitude as Attitude
 from .vision import Detector as Detector
 from .vision import Frame as Frame
 from .vision import PipelineState as PipelineState
+from .vision import VehicleState as VehicleState
 from .vision import estimate as estimate
 from .vision import make_pipeline as make_pipeline
 from .vision import step as step

@@ -33,16 +33,16 @@ from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.values import replace
 from perchctl.vision import (
-    Attitude,
     CameraModel,
     Detection,
     Frame,
     Pipeline,
     PipelineOutput,
     PipelineState,
-    camera_covariance,
+    VehicleState,
     make_camera_only_profile,
     make_pipeline,
+    target_covariance_cam,
     to_grey,
 )
 
@@ -53,7 +53,7 @@ FRAME_TIMEOUT_S = 2.0
 INTERLACED = "interlaced: each field of a frame is measured separately"
 _NO_POSE = "no pose fits the marker's corners"
 _DISAGREE = "the two markers contradict each other: check the printed sizes and the calibration"
-AttitudeAt = Callable[[float], Attitude | None]
+AttitudeAt = Callable[[float], VehicleState | None]
 Named = tuple[Frame, str | None]
 """A frame, and its file's name if it has one."""
 
@@ -92,7 +92,7 @@ def track(
     profile: Profile | Path | str = "sim",
     calibration: CameraModel | Path | str | None = None,
     *,
-    attitude: Attitude | AttitudeAt | None = None,
+    attitude: VehicleState | AttitudeAt | None = None,
     rate_hz: float | None = None,
 ) -> Iterator[Sighting]:
     """Yield a `Sighting` for each picture of a source, or for each field of an interlaced one.
@@ -137,11 +137,11 @@ def track(
     return _sightings(source, profile, camera, at, stills, rate_hz or 1.0)
 
 
-def _attitude_at(attitude: Attitude | AttitudeAt, t_s: float) -> Attitude | None:
+def _attitude_at(attitude: VehicleState | AttitudeAt, t_s: float) -> VehicleState | None:
     found = attitude(t_s) if callable(attitude) else attitude
     if found is None:
         return None
-    require_type("the attitude", found, Attitude)
+    require_type("the attitude", found, VehicleState)
     if not np.isfinite(found.R_level_body).all():
         raise InvalidValue(f"the attitude at {t_s} s is not finite: {found}")
     return found
@@ -263,23 +263,23 @@ class Tracker:
             yield _NO_POSE
         if output.detections.mirrored:
             yield mirrored_problem(self._config).sentence
-        if output.disagreeing_frames >= self._disagreement_frames:
+        if output.frames_with_contradicting_markers >= self._disagreement_frames:
             yield _DISAGREE
 
 
 def _add_pose(
-    seen: Sighting, state: PipelineState, attitude: Attitude | None, pipeline: Pipeline
+    seen: Sighting, state: PipelineState, attitude: VehicleState | None, pipeline: Pipeline
 ) -> Sighting:
     """The sighting with its pose, if the pipeline accepted one of this picture."""
     if state.last_pose is None or state.last_pose.pose.t_s != seen.t_s:
         return seen
-    pose, T_body_cam = state.last_pose.pose, pipeline.pose.T_body_cam
+    pose, T_body_cam = state.last_pose.pose, pipeline.pose_setup.T_body_cam
     R_cam_target = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0]) @ R_MARKER_TARGET
     T_cam_target = make_T(R_cam_target, pose.tvec_m)
     R_level_body = np.eye(3) if attitude is None else attitude.R_level_body
     T_level_cam = make_T(R_level_body, np.zeros(3)) @ T_body_cam
     order = [3, 4, 5, 0, 1, 2]
-    covariance = camera_covariance(pose)[np.ix_(order, order)]
+    covariance = target_covariance_cam(pose)[np.ix_(order, order)]
     print_m = T_level_cam[:3, :3].T @ pose.print_error_shifts_m
     covariance[:3, :3] += print_m @ print_m.T
     level = None if attitude is None else T_level_cam @ T_cam_target

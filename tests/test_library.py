@@ -20,7 +20,6 @@ import pytest
 
 import perchctl
 from perchctl import (
-    Attitude,
     CaptureSource,
     Frame,
     FrameSource,
@@ -29,6 +28,7 @@ from perchctl import (
     Sighting,
     Transition,
     VehicleLink,
+    VehicleState,
     fly,
     fly_lockstep,
     load_profile,
@@ -99,7 +99,7 @@ def test_the_covariance_holds_the_print_s_scale_and_the_example_s_calibration_is
 def test_with_an_attitude_the_pose_is_also_in_the_level_frame() -> None:
     image, truth = picture()
     # At the profile's mounting of zero the camera's axes are the body's: it leans as was drawn.
-    attitude = Attitude(0.0, math.radians(6), math.radians(-4), 1.0)
+    attitude = VehicleState(0.0, math.radians(6), math.radians(-4), 1.0)
     T_level_body = np.eye(4)
     T_level_body[:3, :3] = attitude.R_level_body
     level = T_level_body @ SIM.camera.mount.T_body_cam @ truth
@@ -208,7 +208,8 @@ def test_a_source_that_is_none_is_refused(tmp_path: Path) -> None:
     (lambda: track([], SIM, {}), "calibration must be CameraModel or Path or str, found dict"),
     (lambda: track([], SIM, CAMERA, rate_hz=0.0), "rate_hz must be positive, found 0.0"),
     (lambda: next(track([picture()[0]], SIM, CAMERA, attitude=(0, 0))), "attitude must be"),
-    (lambda: next(track([picture()[0]], SIM, CAMERA, attitude=Attitude(0.0, math.nan, 0.0, 0.0))),
+    (lambda: next(
+        track([picture()[0]], SIM, CAMERA, attitude=VehicleState(0.0, math.nan, 0.0, 0.0))),
      "attitude at 0.0 s is not finite"),
     (lambda: SIM.with_(3), "changes must be Mapping, found int"),
     (lambda: SIM.with_({3: 1}), "a key must be str, found int"),

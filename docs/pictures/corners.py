@@ -58,7 +58,7 @@ def edge_fit(file: Path) -> None:
     markers = prepare_marker_sides(_expected(view)[None], [_LARGE.border_cells], CAMERA)
     assert markers is not None
     edges, _ = measure_edges(view.image, markers, CAMERA, with_inner_edges=False)
-    used = edges.points[edges.weight > 0.0]
+    used = edges.points_normalised[edges.weight > 0.0]
     at = distort_to_px(used, CAMERA)
     _dots(whole, near, at, "edge on a profile")
     _finish(figure, file, whole, view)
@@ -70,7 +70,9 @@ def half_size_search(file: Path) -> None:
     figure, whole, half = _panels(view, width_ratios=(2.0, 1.0))
     rows, columns = (
         make_search_window(
-            view.prior.expected_both_corners_px, SETUP.small_to_large_side, view.image.shape
+            view.prior.expected_corners_of_both_markers_px,
+            SETUP.small_to_large_side,
+            view.image.shape,
         )
         or _WHOLE
     )
@@ -82,7 +84,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_half_size(view.picture, view.prior.expected_both_corners_px)
+    searched = search_half_size(view.picture, view.prior.expected_corners_of_both_markers_px)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25
@@ -97,7 +99,7 @@ def partial_view_fit(file: Path) -> None:
     H = homography_from_centred_square(undistort_px(_found(view), CAMERA))
     seen = find_visible_edges(view.picture, H, _LARGE)
     assert seen is not None
-    points = apply_homography(H, seen.points[seen.weight > 0.0])
+    points = apply_homography(H, seen.points_half_sides[seen.weight > 0.0])
     at = distort_px(points.T, CAMERA).T
     _dots(whole, near, at, "edge in view")
     _finish(figure, file, whole, view)
@@ -123,8 +125,9 @@ def cut_view_fit(file: Path) -> None:
     fit = fit_pose(view.image, start, outline, CAMERA)
     assert fit is not None
     X = (
-        np.column_stack([outline.points, np.zeros(len(outline.points))]) @ fit.pose.R_cam_drawing.T
-        + fit.pose.t_cam_half_sides
+        np.column_stack([outline.points_half_sides, np.zeros(len(outline.points_half_sides))])
+        @ fit.pose.R_cam_drawing.T
+        + fit.pose.t_cam_drawing_half_sides
     )
     x = X[:, :2] / X[:, 2:]
     at = distort_to_px(x[np.hypot(*x.T) < make_lattice(CAMERA).valid_radius_normalised], CAMERA)
@@ -156,7 +159,7 @@ def _view(method: str) -> View:
 
 
 def _expected(view: View) -> Array:
-    return view.prior.expected_both_corners_px[view.marker]
+    return view.prior.expected_corners_of_both_markers_px[view.marker]
 
 
 def _found(view: View) -> Array:
@@ -219,11 +222,11 @@ def _drawing(view: View, file: Path) -> None:
     fit = align_drawing(view.image, found, drawing, CAMERA, view.blur_px)
     assert fit is not None
     n = 44
-    grid = make_grid(n, drawing.compared_half_side)
+    grid = make_grid(n, drawing.photometric_fit_reach_half_sides)
     H = homography_from_centred_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
-    node_px = drawing.compared_half_side * mean_side_px(fit.corners_px) / n
+    node_px = drawing.photometric_fit_reach_half_sides * mean_side_px(fit.corners_px) / n
     rows, _ = render_blurred(
         drawing, n, round(np.log(fit.blur_px / node_px) / 0.02)
     ).illumination_basis

@@ -73,7 +73,7 @@ from perchctl.sim import (  # noqa: E402
 from perchctl.vehicle import Idle, Telemetry  # noqa: E402
 from perchctl.vision import Frame, PipelineState, TargetEstimate, make_pipeline, step  # noqa: E402
 from perchctl.vision.markers.detect import CORNER_METHODS  # noqa: E402
-from perchctl.vision.types import Stage  # noqa: E402
+from perchctl.vision.types import VisibleMarkers  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1280, 760), (1200, 1250)
 PAGE_S = 8.0  # of the flight, on the page before it is photographed
@@ -139,7 +139,7 @@ class Flight:
             e_m, tracked = np.array([r["ex_m"], r["ey_m"], r["ez_m"]]), bool(r["tracked"])
             yaw_rad = np.nan if r["eyaw_rad"] is None else r["eyaw_rad"]
             target = TargetEstimate(
-                t_s, t_s, t_s, Stage(r["stage"] or "none"), tracked, tracked, 0, e_m,
+                t_s, t_s, t_s, VisibleMarkers(r["stage"] or "none"), tracked, tracked, 0, e_m,
                 yaw_rad, np.zeros(3), np.zeros(3), 0.0,
             )  # fmt: skip
         battery = BatteryOutlook(

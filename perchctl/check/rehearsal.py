@@ -209,7 +209,7 @@ def _blur_px(
             seen = output.detections.get(name)
             if seen is None:
                 continue
-            rim = pipeline.detector.patterns[name].border_cells
+            rim = pipeline.detector_setup.patterns[name].border_cells
             corners = seen.corners_px.reshape(1, 4, 2)
             (refined,) = refine_corners_by_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:

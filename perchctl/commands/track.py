@@ -300,6 +300,13 @@ def track_record(
     }
 
 
+_POSE_FIELD_OF_KEY = {
+    "rvec_rad": "rvec_rad",
+    "tvec_m": "tvec_m",
+    "reprojection_px": "rms_reprojection_px",
+}
+
+
 def _marker_record(
     output: visions.PipelineOutput, name: Literal["large", "small"]
 ) -> dict[str, Any] | None:
@@ -308,8 +315,8 @@ def _marker_record(
         return None
     pose = output.poses.get(name)
     return {"corners_px": _finite(marker.corners_px)} | {
-        key: None if pose is None else _finite(getattr(pose, key))
-        for key in ("rvec_rad", "tvec_m", "reprojection_px")
+        key: None if pose is None else _finite(getattr(pose, name))
+        for key, name in _POSE_FIELD_OF_KEY.items()
     }
 
 

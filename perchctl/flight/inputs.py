@@ -242,7 +242,7 @@ class FlightInputs:
             battery_age_s=self.history.battery_age_s(now_s),
             has_estimate_jumped=self.history.jumped,
             heading_jump_rad=self.history.turned_rad,
-            successive_marker_conflicts=perception.state.disagreeing_frames,
+            successive_marker_conflicts=perception.state.frames_with_contradicting_markers,
             extra_camera_latency_s=perception.calibration.applied_delay_s,
             camera_latency_sigma_s=perception.latency_sigma_s,
             target_refusal_reason=perception.refused,
@@ -328,7 +328,7 @@ class TargetPositioning:
     them."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
-        self.feed = TargetFeed(send, profile, pipeline.pose)
+        self.feed = TargetFeed(send, profile, pipeline.pose_setup)
         self._touches = False
 
     def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:

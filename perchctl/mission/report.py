@@ -81,8 +81,8 @@ class CameraFindings:
         """Return the findings from a flight's estimates, with advice on each error that is beyond
         its limit and significant at 95 %; no advice if the flight was `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
-        x, y, z = (math.degrees(turn) for turn in seen.rotation_rad)
-        sx, sy, sz = (math.degrees(sigma) for sigma in seen.rotation_sigma_rad)
+        x, y, z = (math.degrees(turn) for turn in seen.mount_rotation_xyz_rad)
+        sx, sy, sz = (math.degrees(sigma) for sigma in seen.mount_rotation_sigma_xyz_rad)
         found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
         if simulated:
             return found

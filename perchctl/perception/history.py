@@ -12,7 +12,7 @@ from perchctl.mission import ImuMotion
 from perchctl.profile import SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
-from perchctl.vision import Attitude
+from perchctl.vision import VehicleState
 
 Vector = tuple[float, float, float]
 _time_s = attrgetter("t_s")
@@ -85,7 +85,7 @@ def add_samples(
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
 
 
-def attitude_at(history: History, t_s: float) -> Attitude | None:
+def attitude_at(history: History, t_s: float) -> VehicleState | None:
     """Return attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
 
     Before the oldest sample, its values are used. After the newest sample, the position is
@@ -101,7 +101,7 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
         return _attitude(samples[-1], min(t_s - samples[-1].t_s, 0.1))
     a, b = samples[i - 1], samples[i]
     part = (t_s - a.t_s) / (b.t_s - a.t_s)
-    return Attitude(
+    return VehicleState(
         t_s,
         a.roll_rad + part * wrap_rad(b.roll_rad - a.roll_rad),
         a.pitch_rad + part * wrap_rad(b.pitch_rad - a.pitch_rad),
@@ -124,9 +124,11 @@ def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
 
 
-def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
+def _attitude(s: Telemetry, ahead_s: float) -> VehicleState:
     x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
-    return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps)
+    return VehicleState(
+        s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps
+    )
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:

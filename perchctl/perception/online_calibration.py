@@ -18,7 +18,7 @@ from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.perception.history import History, attitude_at, velocity_at
 from perchctl.profile import USED_LATENCY_S
 from perchctl.values import replace
-from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
+from perchctl.vision import CameraErrors, MarkerPose, PoseSetup, VehicleState
 
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
@@ -202,8 +202,8 @@ class ConsistencySums:
 
 def consistency_rows(
     pose: MarkerPose,
-    before: Attitude,
-    after: Attitude,
+    before: VehicleState,
+    after: VehicleState,
     velocity_mps: tuple[float, float, float],
     delay_s: float,
     setup: PoseSetup,
@@ -252,7 +252,7 @@ def _above(size: float, noise: float) -> float:
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
-def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
+def _upper_rows(attitude: VehicleState) -> tuple[tuple[float, float, float], ...]:
     """Return the first two rows of ``R_world_body`` without arrays."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
@@ -323,6 +323,10 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Camer
     return CameraErrors(
         delay_s=float(found[DELAY - 1]),
         delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
-        rotation_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
-        rotation_sigma_rad=(tilt_x, tilt_y, math.hypot(sigma[TURN - 1], LARGE_TURN * turn)),
+        mount_rotation_xyz_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
+        mount_rotation_sigma_xyz_rad=(
+            tilt_x,
+            tilt_y,
+            math.hypot(sigma[TURN - 1], LARGE_TURN * turn),
+        ),
     )

@@ -28,13 +28,13 @@ from perchctl.perception.visual_inertial import (
 from perchctl.profile import USED_LATENCY_S, Profile
 from perchctl.values import replace
 from perchctl.vision import (
-    Attitude,
     CameraErrors,
     Frame,
     Pipeline,
     PipelineOutput,
     PipelineState,
     TargetEstimate,
+    VehicleState,
     deinterlace,
     estimate,
     step,
@@ -68,7 +68,7 @@ class Perception:
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
-    attitude: Callable[[float], Attitude | None] | None = None
+    attitude: Callable[[float], VehicleState | None] | None = None
     _mirrored: int = 0  # successive frames with the target's mirror image
 
     def exposure_s(self, frame: Frame) -> float:
@@ -136,7 +136,7 @@ class Perception:
             return
         measured = self._measured_latency
         if pose.t_s == output.detections.t_s:
-            T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
+            T_body_cam, history = self.pipeline.pose_setup.T_body_cam, self.history
             x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
             self.motion = estimate_motion(
                 self.motion,
@@ -152,7 +152,7 @@ class Perception:
                 t_s,
                 pose,
                 self.history,
-                self.pipeline.pose,
+                self.pipeline.pose_setup,
                 self._attitude_sigma_rad,
             )
         if measured is not None:

@@ -23,12 +23,12 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import ExternalPosition, SendPosition
 from perchctl.vision import (
-    Attitude,
     MarkerPose,
     PoseSetup,
     TargetEstimate,
-    to_level,
-    to_world,
+    VehicleState,
+    target_level_to_world,
+    target_world_to_level,
 )
 
 GROUND_FRAMES = 15
@@ -58,12 +58,12 @@ NOWHERE = Place(np.zeros(3), 0.0)
 """Zero difference between two places."""
 
 
-def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
+def target_place(pose: MarkerPose, attitude: VehicleState, setup: PoseSetup) -> Place:
     """Return the target's place from its pose in a picture and the body's attitude and position."""
-    return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
+    return Place(*target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
-def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
+def body_place(pose: MarkerPose, attitude: VehicleState, target: Place, setup: PoseSetup) -> Place:
     """Return the body's place below a stationary target; only roll and pitch of `attitude` are
     used."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
@@ -109,20 +109,26 @@ class TargetFeed:
         x, y, z = self.target.position_m - way_m
         return float(x), float(y), float(z)
 
-    def with_fixed_target(self, seen: TargetEstimate, attitude: Attitude) -> TargetEstimate:
+    def with_fixed_target(self, seen: TargetEstimate, attitude: VehicleState) -> TargetEstimate:
         """Return `seen` with the target at the place known to the feed, in the world frame of the
         state estimate, for a vehicle with this `attitude`; unchanged while the place is unknown."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
         world_yaw_rad = wrap_rad(self.target.yaw_rad - self.off.yaw_rad)
-        e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, self._setup)
+        e_m, e_yaw_rad = target_world_to_level(world_m, world_yaw_rad, attitude, self._setup)
         return replace(
             seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad
         )
 
     def add_pose(
-        self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
+        self,
+        pose: MarkerPose,
+        then: VehicleState,
+        now: VehicleState,
+        now_s: float,
+        *,
+        at_rest: bool,
     ) -> None:
         """Send the vehicle's position from a pose in this tick's picture. While the target's place
         is unknown, learn it instead if the vehicle is `at_rest`. `then` and `now` are the vehicle's
@@ -167,7 +173,7 @@ class TargetFeed:
         )
 
     def _refused(
-        self, pose: MarkerPose, place: Place, then: Attitude, silent_s: float, now_s: float
+        self, pose: MarkerPose, place: Place, then: VehicleState, silent_s: float, now_s: float
     ) -> str:
         """Return why a sighting is rejected; an empty string if it is accepted."""
         age_s, sigma_m = now_s - pose.t_s, float(np.max(pose.sigma_m))
@@ -182,7 +188,7 @@ class TargetFeed:
             return f"the target places the vehicle {off_m:.2f} m from its estimate"
         return ""
 
-    def _learn_place(self, pose: MarkerPose, then: Attitude) -> None:
+    def _learn_place(self, pose: MarkerPose, then: VehicleState) -> None:
         self._on_ground.append(target_place(pose, then, self._setup))
         if len(self._on_ground) < GROUND_FRAMES:
             return
@@ -191,7 +197,7 @@ class TargetFeed:
         position_m = np.median([place.position_m for place in self._on_ground], axis=0)
         self.target = Place(position_m, wrap_rad(first_rad + float(np.median(turns_rad))))
 
-    def _learn_off(self, pose: MarkerPose, place: Place, then: Attitude) -> None:
+    def _learn_off(self, pose: MarkerPose, place: Place, then: VehicleState) -> None:
         away = (float(np.linalg.norm(pose.e_m)) - LEARN_NEAR_M) / (LEARN_FAR_M - LEARN_NEAR_M)
         lasts_s = LEARN_NEAR_S + min(max(away, 0.0), 1.0) * (LEARN_FAR_S - LEARN_NEAR_S)
         share = 1.0 - math.exp(-min(max(pose.t_s - self._seen_s, 0.0), 0.5) / lasts_s)

@@ -226,7 +226,7 @@ def _output_values(output: PipelineOutput | None) -> dict[str, Any]:
         if pose is not None:
             values |= _xyz(short, pose.e_m)
             values[f"{short}yaw_rad"] = pose.e_yaw_rad
-            values[f"{short}_rms_px"] = pose.reprojection_px
+            values[f"{short}_rms_px"] = pose.rms_reprojection_px
     return values
 
 

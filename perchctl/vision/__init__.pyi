@@ -12,13 +12,12 @@ from .pipeline import make_camera_only_profile as make_camera_only_profile
 from .pipeline import make_pipeline as make_pipeline
 from .pipeline import step as step
 from .pose import PoseSetup as PoseSetup
-from .pose import camera_covariance as camera_covariance
 from .pose import estimate_pose as estimate_pose
 from .pose import square_corners as square_corners
-from .target_selection import to_level as to_level
-from .target_selection import to_world as to_world
+from .pose import target_covariance_cam as target_covariance_cam
+from .target_selection import target_level_to_world as target_level_to_world
+from .target_selection import target_world_to_level as target_world_to_level
 from .types import MARKERS as MARKERS
-from .types import Attitude as Attitude
 from .types import CameraErrors as CameraErrors
 from .types import CameraModel as CameraModel
 from .types import Detection as Detection
@@ -28,4 +27,5 @@ from .types import PictureKind as PictureKind
 from .types import PipelineOutput as PipelineOutput
 from .types import PipelineState as PipelineState
 from .types import TargetEstimate as TargetEstimate
+from .types import VehicleState as VehicleState
 from .types import to_grey as to_grey

@@ -22,11 +22,11 @@ from perchctl.vision.types import FieldState, Frame
 GreyImage = NDArray[np.uint8]
 
 # threshold of the ratio of differences; exceeded by fields one pixel apart
-_MIN_COMBING_ENERGY_RATIO = 1.4
+_MIN_ACROSS_TO_WITHIN_FIELD_ENERGY = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # multiple of the mean difference within a field above which a difference counts
-_MIN_ROW_TO_MEAN_DIFFERENCE_RATIO = 5.0
+_MIN_PIXEL_TO_MEAN_FIELD_DIFFERENCE = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _CLASSIFICATION_PERIOD_FRAMES = 3
@@ -35,7 +35,7 @@ _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
 _STANDARD_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
-_STANDARD_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
+_SNAPPED_FRAME_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
 _VALID_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_KEPT_PERIODS = 25
 _MIN_LOST_FRAME_PERIOD_RATIO = 1.8
@@ -63,12 +63,14 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_MIN_ROW_TO_MEAN_DIFFERENCE_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
+    least = max(_MIN_PIXEL_TO_MEAN_FIELD_DIFFERENCE * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
-    return energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_COMBING_ENERGY_RATIO
+    return (
+        energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_ACROSS_TO_WITHIN_FIELD_ENERGY
+    )
 
 
 def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
@@ -133,46 +135,53 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     skipped = state.frames_since_examined + 1 if skip else 0
     # Once interlaced, a stream counts as interlaced.
     kind = state.kind if state.kind == "woven" else frame.picture_kind
-    periods_s = _update_periods_s(state, frame)
+    frame_periods_s = _update_frame_periods_s(state, frame)
     if frame.picture_kind == "whole":
-        new = FieldState(kind, skipped, state.order_votes, state.is_top_first, periods_s, frame.t_s)
+        new = FieldState(
+            kind, skipped, state.top_first_votes, state.is_top_first, frame_periods_s, frame.t_s
+        )
         return new, (frame,)
     state = _vote_on_field_order(
-        replace(state, kind=kind, frames_since_examined=skipped, periods_s=periods_s), frame
+        replace(state, kind=kind, frames_since_examined=skipped, frame_periods_s=frame_periods_s),
+        frame,
     )
     if frame.picture_kind != "woven" or state.is_top_first is None:
         return state, (frame,)
     top, bottom = interpolate_fields(frame)
     early, late = (top, bottom) if state.is_top_first else (bottom, top)
-    apart_s = _estimate_period_s(state.periods_s) / 2.0
+    apart_s = _estimate_period_s(state.frame_periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
     )
 
 
-def _estimate_period_s(periods_s: tuple[float, ...]) -> float:
-    if not periods_s:
+def _estimate_period_s(frame_periods_s: tuple[float, ...]) -> float:
+    if not frame_periods_s:
         return _STANDARD_PERIODS_S[1]
-    middle_s = median(periods_s)
+    middle_s = median(frame_periods_s)
     # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
     # ms apart.
-    period_s = mean(p for p in periods_s if p < _MIN_LOST_FRAME_PERIOD_RATIO * middle_s)
-    if _STANDARD_PERIOD_RANGE_S[0] < period_s < _STANDARD_PERIOD_RANGE_S[1]:
+    period_s = mean(p for p in frame_periods_s if p < _MIN_LOST_FRAME_PERIOD_RATIO * middle_s)
+    if _SNAPPED_FRAME_PERIOD_RANGE_S[0] < period_s < _SNAPPED_FRAME_PERIOD_RANGE_S[1]:
         return min(_STANDARD_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s
 
 
-def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
+def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     if state.last_frame_t_s is not None:
         gap_s = frame.t_s - state.last_frame_t_s
         if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
-            return (*state.periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
-    return state.periods_s
+            return (*state.frame_periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
+    return state.frame_periods_s
 
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
-    before, order_votes, is_top_first = state.previous_image, state.order_votes, state.is_top_first
+    before, top_first_votes, is_top_first = (
+        state.previous_image,
+        state.top_first_votes,
+        state.is_top_first,
+    )
     near = (
         state.last_frame_t_s is not None
         and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FRAME_GAP_S
@@ -186,18 +195,18 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        order_votes = min(max(order_votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
-    if is_top_first is None and abs(order_votes) > _MIN_ORDER_VOTES:
-        is_top_first = order_votes > 0.0
+        top_first_votes = min(max(top_first_votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
+    if is_top_first is None and abs(top_first_votes) > _MIN_ORDER_VOTES:
+        is_top_first = top_first_votes > 0.0
     elif (
         is_top_first is not None
-        and (order_votes if not is_top_first else -order_votes) > _MIN_REVERSAL_VOTES
+        and (top_first_votes if not is_top_first else -top_first_votes) > _MIN_REVERSAL_VOTES
     ):
         is_top_first = not is_top_first
     return replace(
         state,
         last_frame_t_s=frame.t_s,
-        order_votes=order_votes,
+        top_first_votes=top_first_votes,
         is_top_first=is_top_first,
         previous_image=frame.image,
     )

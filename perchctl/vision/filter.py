@@ -40,7 +40,7 @@ _RATE_TO_VALUE_MATRIX[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_SI_PER_PAPER_UNIT = np.array(
+_SI_PER_PUBLISHED_UNIT = np.array(
     [_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM]
 )  # units of the paper, per state
 
@@ -51,7 +51,7 @@ _ESTIMATE_WALK_VARIANCE_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]
 """Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
 m^2)."""
 _HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
-_RESTART_NIS = 25.0
+_MAX_NIS_WITHOUT_RESTART = 25.0
 """Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
 5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
 velocity. Smaller: noise restarts the track."""
@@ -64,16 +64,16 @@ class ProcessNoise:
     Attributes:
         acceleration_sigma_mps2: of the target along each axis.
         heading_acceleration_sigma_radps2: of the target's heading.
-        frame_rotation_sigma_radps2: of the rotation of the level frame about its origin, which
-            moves a target in proportion to its distance.
-        is_frame_drifting: True if the tracks are in the world frame, whose origin drifts with the
-            state estimate.
+        level_frame_acceleration_sigma_radps2: of the rotation of the level frame about its origin,
+            which moves a target in proportion to its distance.
+        is_world_frame_drifting: True if the tracks are in the world frame, whose origin drifts with
+            the state estimate.
     """
 
     acceleration_sigma_mps2: float
     heading_acceleration_sigma_radps2: float
-    frame_rotation_sigma_radps2: float = 0.0
-    is_frame_drifting: bool = False
+    level_frame_acceleration_sigma_radps2: float = 0.0
+    is_world_frame_drifting: bool = False
 
     @cached_property
     def rate_noise_cov_per_s(self) -> Array:
@@ -92,14 +92,15 @@ class FilterSetup:
         R, Q: noise of a measurement (4, 4) and of a step (8, 8): ``k1 I`` and ``k2 I`` of the paper
             (cm^2, deg^2), converted to SI.
         P0: covariance (8, 8) after the first measurement.
-        rate_factor_per_unseen_frame: factor on all rates in a frame without a measurement,
+        velocity_factor_per_unseen_frame: factor on all rates in a frame without a measurement,
             ``kalman.alpha`` of the profile (equation 3).
         max_unseen_frames: frames without a measurement after which a track ends, ``kalman.n_max``
             of the profile.
-        process_noise: if not None, it replaces Q, and the covariance of each pose replaces R.
+        acceleration_noise: if not None, it replaces Q, and the covariance of each pose replaces R.
         tilt_sigma_rad: constant error of the vehicle's roll and pitch.
-        max_drift_mps: largest speed of the target in its frame while it is not measured.
-        restart_nis: limit of the normalized innovation squared (NIS), above which a track restarts.
+        max_target_speed_mps: largest speed of the target in its frame while it is not measured.
+        max_nis_without_restart: limit of the normalized innovation squared (NIS), above which a
+            track restarts.
 
     With the innovation v = z - H x of a measurement z and its covariance S = H P H^T + R, NIS is
     v^T S^-1 v. The motion model cannot explain a larger one, for example after lost frames, and an
@@ -110,12 +111,14 @@ class FilterSetup:
     R: Array
     Q: Array
     P0: Array
-    rate_factor_per_unseen_frame: float
+    velocity_factor_per_unseen_frame: float
     max_unseen_frames: int
-    process_noise: ProcessNoise | None = None
+    acceleration_noise: ProcessNoise | None = None
     tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
-    max_drift_mps: float = math.inf  # largest speed of the target in its frame without measurements
-    restart_nis: float = math.inf
+    max_target_speed_mps: float = (
+        math.inf
+    )  # largest speed of the target in its frame without measurements
+    max_nis_without_restart: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,14 +126,14 @@ class Measurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
     means the setup's R.
 
-    Column k of `constant_error_shifts` (4, 4) is the change of z by one standard deviation of
+    Column k of `shift_per_constant_error` (4, 4) is the change of z by one standard deviation of
     constant error k: the vehicle's roll and pitch, the print's size and curl. None means no such
     errors.
     """
 
     z: Array
     R: Array | None = None
-    constant_error_shifts: Array | None = None
+    shift_per_constant_error: Array | None = None
 
 
 @cache
@@ -152,12 +155,12 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
     first[RATES] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
-    squares = _SI_PER_PAPER_UNIT**2
-    process_noise = None
+    squares = _SI_PER_PUBLISHED_UNIT**2
+    acceleration_noise = None
     if measured:
-        process_noise = (
+        acceleration_noise = (
             ProcessNoise(
-                config.drift_mps2, _HEADING_ACCELERATION_SIGMA_RADPS2, is_frame_drifting=True
+                config.drift_mps2, _HEADING_ACCELERATION_SIGMA_RADPS2, is_world_frame_drifting=True
             )
             if is_world_frame
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
@@ -166,17 +169,19 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
         R=np.diag(config.k1 * squares[MEASURED]),
         Q=np.diag(config.k2 * squares),
         P0=np.diag(first * squares),
-        rate_factor_per_unseen_frame=config.alpha,
+        velocity_factor_per_unseen_frame=config.alpha,
         max_unseen_frames=config.n_max,
-        process_noise=process_noise,
+        acceleration_noise=acceleration_noise,
         tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
-        max_drift_mps=config.drift_mps if is_world_frame else math.inf,
+        max_target_speed_mps=config.drift_mps if is_world_frame else math.inf,
         # In flight, the gate detects jumps of the state estimate (`perchctl.vision.tracks`).
-        restart_nis=_RESTART_NIS if measured and not is_world_frame else math.inf,
+        max_nis_without_restart=_MAX_NIS_WITHOUT_RESTART
+        if measured and not is_world_frame
+        else math.inf,
     )
 
 
-def tilt_jacobian(vector_m: Array) -> Array:
+def vector_by_tilt_jacobian(vector_m: Array) -> Array:
     """Return the derivative (3, 2), m/rad, of `vector_m` (3,) by rotations about level x and y."""
     x, y, z = vector_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
@@ -187,30 +192,30 @@ def transition_matrix(dt_s: float) -> Array:
     return _IDENTITY_8 + dt_s * _RATE_TO_VALUE_MATRIX
 
 
-def process_noise_covariance(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Return the process noise Q (8, 8) over `dt_s` for a target at `position_m` (3,) in its
+def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
+    """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in its
     frame."""
-    noise = setup.process_noise
+    noise = setup.acceleration_noise
     if noise is None:
         return setup.Q
-    pushed = _acceleration_covariance(noise, position_m) * dt_s
+    pushed = _acceleration_covariance(noise, target_position_m) * dt_s
     # A value and its rate are adjacent in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
-    if noise.is_frame_drifting:
+    if noise.is_world_frame_drifting:
         Q[MEASURED, MEASURED] += _ESTIMATE_WALK_VARIANCE_PER_S * dt_s
     return Q
 
 
-def _acceleration_covariance(noise: ProcessNoise, position_m: Array) -> Array:
+def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
     """Return the covariance (4, 4) that one second adds to the rates of yaw, x, y and z."""
-    if noise.frame_rotation_sigma_radps2 == 0.0:
+    if noise.level_frame_acceleration_sigma_radps2 == 0.0:
         return noise.rate_noise_cov_per_s
-    turned2 = noise.frame_rotation_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
-    x, y, z = position_m.tolist()
+    turned2 = noise.level_frame_acceleration_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
+    x, y, z = target_position_m.tolist()
     density = noise.rate_noise_cov_per_s.copy()
     density[1:, 1:] += turned2 * (
-        (x * x + y * y + z * z) * _IDENTITY_3 - np.outer(position_m, position_m)
+        (x * x + y * y + z * z) * _IDENTITY_3 - np.outer(target_position_m, target_position_m)
     )
     return density
 
@@ -223,11 +228,11 @@ def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> Marker
     P = setup.P0.copy()
     if measured.R is not None:
         P[MEASURED, MEASURED] = measured.R
-    constant_error_shifts = np.zeros((8, 4))
-    if measured.constant_error_shifts is not None:
-        constant_error_shifts[MEASURED] = measured.constant_error_shifts
+    shift_per_constant_error = np.zeros((8, 4))
+    if measured.shift_per_constant_error is not None:
+        shift_per_constant_error[MEASURED] = measured.shift_per_constant_error
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, constant_error_shifts=constant_error_shifts
+        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_constant_error=shift_per_constant_error
     )
 
 
@@ -247,7 +252,7 @@ def step_track(
     Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
     3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap of more than
     `MAX_TRACK_GAP_S` in either direction restarts the track, and so does a measurement that the
-    motion model does not explain (`FilterSetup.restart_nis`).
+    motion model does not explain (`FilterSetup.max_nis_without_restart`).
     """
     if measured is not None and not is_finite(measured.z):
         measured = None
@@ -264,26 +269,26 @@ def step_track(
         if track.unseen_frames >= setup.max_unseen_frames:
             return None
         x = track.x.copy()
-        x[RATES] *= setup.rate_factor_per_unseen_frame  # equation 3
+        x[RATES] *= setup.velocity_factor_per_unseen_frame  # equation 3
         return _predict_from_state(track, x, dt_s, t_s, track.unseen_frames + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise_covariance(dt_s, track.x[POSITION], setup)
     x, P = _import_filterpy_predict()(track.x, track.P, F=F, Q=Q)
     R = setup.R if measured.R is None else measured.R
-    if setup.restart_nis < math.inf:
+    if setup.max_nis_without_restart < math.inf:
         off, S = _innovation(x, measured.z), P[MEASURED, MEASURED] + R
         regular, solved = cv2.solve(S, off[:, None], flags=cv2.DECOMP_CHOLESKY)
-        if regular and off.dot(solved)[0] > setup.restart_nis:
+        if regular and off.dot(solved)[0] > setup.max_nis_without_restart:
             begun = start_track(measured, t_s, setup)
             begun.P[MEASURED, MEASURED] += np.outer(off, off)
             return begun
     x, P, gain = _kalman_update(x, P, measured.z, R)
-    constant_error_shifts = F.dot(track.constant_error_shifts)
-    if measured.constant_error_shifts is not None:
-        constant_error_shifts += gain.dot(
-            measured.constant_error_shifts - constant_error_shifts[MEASURED]
+    shift_per_constant_error = F.dot(track.shift_per_constant_error)
+    if measured.shift_per_constant_error is not None:
+        shift_per_constant_error += gain.dot(
+            measured.shift_per_constant_error - shift_per_constant_error[MEASURED]
         )
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, constant_error_shifts=constant_error_shifts
+        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_constant_error=shift_per_constant_error
     )
 
 
@@ -323,12 +328,13 @@ def predict_track(
 
 
 def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
-    """Return the state (8,) with the target's speed limited to `max_drift_mps` of the setup."""
+    """Return the state (8,) with the target's speed limited to `max_target_speed_mps` of the
+    setup."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
-    if speed_mps <= setup.max_drift_mps:
+    if speed_mps <= setup.max_target_speed_mps:
         return x
     x = x.copy()
-    x[VELOCITY] *= setup.max_drift_mps / speed_mps
+    x[VELOCITY] *= setup.max_target_speed_mps / speed_mps
     return x
 
 
@@ -347,5 +353,5 @@ def _predict_from_state(
         x=x,
         P=P,
         unseen_frames=unseen_frames,
-        constant_error_shifts=F @ track.constant_error_shifts,
+        shift_per_constant_error=F @ track.shift_per_constant_error,
     )

@@ -17,19 +17,23 @@ from perchctl.profile import MergeConfig, WeightsConfig
 from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
 from perchctl.vision.pose import PoseCandidate, PoseSetup, R_level_body_of, estimate_pose
 from perchctl.vision.types import (
-    Attitude,
     Detection,
     Detections,
     MarkerPose,
     MarkerTrack,
     MeasuredMarkers,
-    Stage,
+    VehicleState,
+    VisibleMarkers,
 )
 
 MAX_CONSISTENT_CHI2 = 4.0
 """Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
 _POSITION_AND_YAW = [X, Y, Z, YAW]
-_STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
+_STAGE_OF = {
+    "joint": VisibleMarkers.BOTH,
+    "large": VisibleMarkers.LARGE,
+    "small": VisibleMarkers.SMALL,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,43 +41,42 @@ class MergedTarget:
     """The target in the tracks' frame.
 
     Attributes:
-        xyz_yaw: position and yaw (4,).
-        velocity_mps: velocity (3,).
+        track_frame_xyz_yaw: position and yaw (4,).
+        track_frame_velocity_mps: velocity (3,).
         cov_m2, var_yaw_rad2: covariance (3, 3) of the position, and variance of the yaw, without
             constant errors.
-        constant_error_shifts_m: change (3, 4) of the position by one standard deviation of each
+        shift_per_constant_error_m: change (3, 4) of the position by one standard deviation of each
             constant error (see `Measurement`).
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
 
-    xyz_yaw: Array
-    velocity_mps: Array
+    track_frame_xyz_yaw: Array
+    track_frame_velocity_mps: Array
     cov_m2: Array
-    constant_error_shifts_m: Array
+    shift_per_constant_error_m: Array
     var_yaw_rad2: float
     unseen_frames: int
-    stage: Stage
+    stage: VisibleMarkers
 
 
 def measure_markers(
     detections: Detections,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     start_pose: PoseCandidate | None,
-    previous_normal_cam: Array | None,
+    previous_target_normal_cam: Array | None,
     config: MergeConfig,
     setup: PoseSetup,
 ) -> MeasuredMarkers:
     """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
     `start_pose` is the last pose of the target, moved by the vehicle's motion since.
-    `previous_normal_cam` (3,) is the target's normal in the last pose, in the camera's axes at that
-    time.
-    """
+    `previous_target_normal_cam` (3,) is the target's normal in the last pose, in the camera's axes
+    at that time."""
     seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
     joint = None
     if config.method == "joint" and len(seen) == 2:
-        joint = estimate_pose(seen, t_s, attitude, setup, previous_normal_cam, start_pose)
+        joint = estimate_pose(seen, t_s, attitude, setup, previous_target_normal_cam, start_pose)
     clear = joint is not None and joint.chi2 < MAX_CONSISTENT_CHI2
     enough = clear and config.stages == "seen"
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
@@ -81,7 +84,7 @@ def measure_markers(
     if not enough or setup.config.each_marker:
         start = start_pose if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
         for each in seen:
-            pose = estimate_pose([each], t_s, attitude, setup, previous_normal_cam, start)
+            pose = estimate_pose([each], t_s, attitude, setup, previous_target_normal_cam, start)
             if pose is not None:
                 singles[each.marker] = pose
     poses |= singles
@@ -125,13 +128,15 @@ def merge_tracks(
     if len(used) == 1:
         ((name, track),) = used.items()
         return MergedTarget(
-            xyz_yaw=track.x[_POSITION_AND_YAW],
-            velocity_mps=track.x[VELOCITY],
+            track_frame_xyz_yaw=track.x[_POSITION_AND_YAW],
+            track_frame_velocity_mps=track.x[VELOCITY],
             cov_m2=track.P[POSITION, POSITION],
-            constant_error_shifts_m=track.constant_error_shifts[POSITION],
+            shift_per_constant_error_m=track.shift_per_constant_error[POSITION],
             var_yaw_rad2=float(track.P[YAW, YAW]),
             unseen_frames=least,
-            stage=_STAGE_OF[poses_by_track[name].source] if name in poses_by_track else Stage.NONE,
+            stage=_STAGE_OF[poses_by_track[name].source]
+            if name in poses_by_track
+            else VisibleMarkers.NONE,
         )
     large, small = used["large"], used["small"]
     order = _POSITION_AND_YAW
@@ -140,14 +145,14 @@ def merge_tracks(
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
     return MergedTarget(
-        xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
-        velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
+        track_frame_xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
+        track_frame_velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
         cov_m2=np.diag(variance[:3]),
-        constant_error_shifts_m=w[:, None] * large.constant_error_shifts[POSITION]
-        + (1.0 - w[:, None]) * small.constant_error_shifts[POSITION],
+        shift_per_constant_error_m=w[:, None] * large.shift_per_constant_error[POSITION]
+        + (1.0 - w[:, None]) * small.shift_per_constant_error[POSITION],
         var_yaw_rad2=float(variance[3]),
         unseen_frames=least,
-        stage=Stage.BOTH if poses_by_track else Stage.NONE,
+        stage=VisibleMarkers.BOTH if poses_by_track else VisibleMarkers.NONE,
     )
 
 
@@ -155,7 +160,7 @@ def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Return the target with a covariance that also covers a second possible position: that of a
     contradicting rival with the state `rival_state` (8,). With the difference d between both, the
     covariance grows by d d^T."""
-    off = rival_state[_POSITION_AND_YAW] - merged.xyz_yaw
+    off = rival_state[_POSITION_AND_YAW] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
@@ -179,9 +184,9 @@ frame earlier."""
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the markers with their corners moved to the frame's time.
 
-    With `readout_s` None, the corners stay, and `common_error_shift_px` is their possible shift,
-    for a typical readout time. Otherwise the corners are moved, and `common_error_shift_px`,
-    `sigma_px` and `cov_px2` include the error of that correction.
+    With `readout_s` None, the corners stay, and `rolling_shutter_error_shift_px` is their possible
+    shift, for a typical readout time. Otherwise the corners are moved, and
+    `rolling_shutter_error_shift_px`, `sigma_px` and `cov_px2` include the error of that correction.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
@@ -199,7 +204,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
-            out.append(replace(d, common_error_shift_px=moved_px))
+            out.append(replace(d, rolling_shutter_error_shift_px=moved_px))
         else:
             turned_px = FLOW_ROTATION_SIGMA * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
@@ -209,7 +214,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    common_error_shift_px=FLOW_SIGMA_FRACTION * moved_px,
+                    rolling_shutter_error_shift_px=FLOW_SIGMA_FRACTION * moved_px,
                 )
             )
     return out
@@ -218,11 +223,11 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 # --- Merge the two markers into one target pose (paper, section II-A.2) ---
 
 
-def detected_stage(is_large_detected: bool, is_small_detected: bool) -> Stage:
+def detected_stage(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
     """Return the stage of a frame from whether its large and its small marker were detected."""
     if is_large_detected:
-        return Stage.BOTH if is_small_detected else Stage.LARGE
-    return Stage.SMALL if is_small_detected else Stage.NONE
+        return VisibleMarkers.BOTH if is_small_detected else VisibleMarkers.LARGE
+    return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
 
 
 def make_weight_matrix(weights: WeightsConfig) -> Array:
@@ -243,16 +248,19 @@ def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
     return np.asarray(merged)
 
 
-def is_pair_inconsistent(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """True if the markers differ by more than `limit_m` and four standard deviations on any axis.
-    Errors of the print shift both markers alike, so they add no tolerance."""
+def is_pair_inconsistent(
+    large: MarkerPose, small: MarkerPose, max_position_difference_m: float
+) -> bool:
+    """True if the markers differ by more than `max_position_difference_m` and four standard
+    deviations on any axis. Errors of the print shift both markers alike, so they add no
+    tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
         np.maximum(p.sigma_m**2 - (p.print_error_shifts_m**2).sum(axis=1), 0.0)
         for p in (large, small)
     ]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])
-    return bool((gap > np.maximum(limit_m, vague)).any())
+    return bool((gap > np.maximum(max_position_difference_m, vague)).any())
 
 
 def choose_better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:

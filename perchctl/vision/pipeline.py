@@ -34,13 +34,13 @@ from perchctl.vision.merge import (
     merge_tracks,
     widen_covariance,
 )
-from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
+from perchctl.vision.pose import PoseCandidate, PoseSetup, target_normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPosition,
     gear_to_target_error_shifts_m,
-    marker_offset_m,
-    to_level,
-    to_world,
+    marker_to_own_target_m,
+    target_level_to_world,
+    target_world_to_level,
 )
 from perchctl.vision.tracks import (
     TrackedFrame,
@@ -52,7 +52,6 @@ from perchctl.vision.tracks import (
 )
 from perchctl.vision.types import (
     MARKERS,
-    Attitude,
     CameraModel,
     Detection,
     Detections,
@@ -61,8 +60,9 @@ from perchctl.vision.types import (
     PictureKind,
     PipelineOutput,
     PipelineState,
-    Stage,
     TargetEstimate,
+    VehicleState,
+    VisibleMarkers,
     to_grey,
 )
 
@@ -80,7 +80,7 @@ class Detector(Protocol):
 
 
 Step = Callable[
-    [PipelineState, Frame, Attitude | None, "Pipeline"], tuple[PipelineState, PipelineOutput]
+    [PipelineState, Frame, VehicleState | None, "Pipeline"], tuple[PipelineState, PipelineOutput]
 ]
 """The signature of `step`."""
 
@@ -89,8 +89,8 @@ Step = Callable[
 class Pipeline:
     """The pipeline's constants, made by `make_pipeline`. If set, `custom_step` replaces `step`."""
 
-    detector: DetectorSetup
-    pose: PoseSetup
+    detector_setup: DetectorSetup
+    pose_setup: PoseSetup
     merge: MergeConfig
     track_setup: TrackSetup
     kalman: KalmanConfig
@@ -107,7 +107,7 @@ def make_pipeline(
     `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's pictures; None
     reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
     """
-    pose = PoseSetup(
+    pose_setup = PoseSetup(
         config=profile.pose,
         target=profile.target,
         T_body_cam=profile.camera.mount.T_body_cam,
@@ -121,22 +121,22 @@ def make_pipeline(
             read_mask(profile.camera.mask, camera.size_px) if hidden_mask is None else hidden_mask
         )
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
-    detector = make_detector_setup(profile.detector, profile.target, mask)
-    if detector.is_line_fit_enabled:
-        warm_up_cut_marker_fit(detector.patterns, camera)
+    detector_setup = make_detector_setup(profile.detector, profile.target, mask)
+    if detector_setup.is_line_fit_enabled:
+        warm_up_cut_marker_fit(detector_setup.patterns, camera)
     target = profile.target
     # the position where the vehicle searches for it
     own = OwnTargetPosition(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
         own = OwnTargetPosition(target.expected_xy_m, target.expected_within_m)
     return Pipeline(
-        detector=detector,
-        pose=pose,
+        detector_setup=detector_setup,
+        pose_setup=pose_setup,
         merge=profile.merge,
         track_setup=TrackSetup(
             level_filter=make_filter(profile.kalman, is_world_frame=False),
             world_filter=make_filter(profile.kalman, is_world_frame=True),
-            pose=pose,
+            pose_setup=pose_setup,
             has_gate=profile.kalman.gate,
             own_target=own,
         ),
@@ -173,7 +173,7 @@ def deinterlace(
 
 
 def step(
-    state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
+    state: PipelineState, frame: Frame, attitude: VehicleState | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
     """Process a frame, in grey or colour; return the new state and the frame's output. Raises
     InvalidValue for an invalid image, or one that does not have the size of the calibration.
@@ -183,27 +183,31 @@ def step(
     """
     frame = classify_fields(_grey_frame(frame, pipeline.camera))
     expected_corners_px, start_pose = expected_corners(
-        state.last_pose, frame.t_s, attitude, pipeline.pose
+        state.last_pose, frame.t_s, attitude, pipeline.pose_setup
     )
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
         # The first picture is searched by all methods.
-        first = state.last_detections is None and state.rival is None and state.empty_frames == 0
-        empty = None if first else state.empty_frames
+        first = (
+            state.last_detections is None
+            and state.rival is None
+            and state.frames_without_markers == 0
+        )
+        empty = None if first else state.frames_without_markers
         own_target = pipeline.track_setup.own_target
-        own_target_offset_m = partial(
-            marker_offset_m, own_target, frame.t_s, attitude, pipeline.pose
+        measure_own_target_distance_m = partial(
+            marker_to_own_target_m, own_target, frame.t_s, attitude, pipeline.pose_setup
         )
         with nullcontext() if state.last_detections is None else one_thread():
             detections = detect_markers(
                 frame,
                 state.last_detections,
-                pipeline.detector,
+                pipeline.detector_setup,
                 pipeline.camera,
                 expected_corners_px,
                 empty,
-                own_target_offset_m,
+                measure_own_target_distance_m,
             )
     return step_detections(
         state, detections, attitude, pipeline, start_pose, frame.picture_kind or "whole"
@@ -234,7 +238,7 @@ def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
             if name not in MARKERS or corners_px.shape != (4, 2) or not 1e-3 <= sigma_px <= 1e3:
                 raise ValueError(f"{name!r}, {corners_px.shape}, sigma {sigma_px}")
             if np.isfinite(corners_px).all():
-                found[name] = Detection(name, corners_px, sigma_px, refined=True)
+                found[name] = Detection(name, corners_px, sigma_px, is_fitted=True)
     except Exception as error:
         raise InvalidValue(
             f"detector.own failed: {error_at(error)}; it must return the corners of large and "
@@ -246,7 +250,7 @@ def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
 def step_detections(
     state: PipelineState,
     detections: Detections,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     pipeline: Pipeline,
     start_pose: PoseCandidate | None = None,
     picture_kind: PictureKind = "whole",
@@ -254,9 +258,11 @@ def step_detections(
     """Run the part of `step` after the detection. `start_pose` is the expected pose of the target,
     and `picture_kind` tells whether the picture is whole or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
-    normal = normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
+    normal = (
+        target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
+    )
     measured = measure_markers(
-        detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose
+        detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose_setup
     )
 
     is_in_world_frame = pipeline.kalman.frame == "world" and attitude is not None
@@ -266,14 +272,14 @@ def step_detections(
     measured, verdict = tracked_frame.measured, tracked_frame.verdict
 
     stage = detected_stage(detections.large is not None, detections.small is not None)
-    anything = stage is not Stage.NONE
-    disagreeing = state.disagreeing_frames
-    if stage is Stage.BOTH and verdict.accepted:
+    anything = stage is not VisibleMarkers.NONE
+    disagreeing = state.frames_with_contradicting_markers
+    if stage is VisibleMarkers.BOTH and verdict.accepted:
         disagreeing = disagreeing + 1 if measured.are_markers_contradicting else 0
     most_certain_pose = measured.most_certain_pose
     sees = most_certain_pose is not None and verdict.accepted
     if most_certain_pose is not None and sees:
-        last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose)
+        last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose_setup)
     target = _estimate_at_frame(
         tracked_frame, state.target, t_s, attitude, is_in_world_frame, pipeline
     )
@@ -289,8 +295,8 @@ def step_detections(
         target=target or state.target,
         last_detections=last,
         last_pose=last_pose if sees or tracked_frame.tracks else None,
-        disagreeing_frames=disagreeing,
-        empty_frames=0 if anything else state.empty_frames + 1,
+        frames_with_contradicting_markers=disagreeing,
+        frames_without_markers=0 if anything else state.frames_without_markers + 1,
         lock=tracked_frame.lock,
         rival=tracked_frame.rival,
         field_state=state.field_state,
@@ -300,7 +306,7 @@ def step_detections(
         poses=measured.poses,
         target=target,
         stage=stage,
-        disagreeing_frames=disagreeing,
+        frames_with_contradicting_markers=disagreeing,
         lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
         picture_kind=picture_kind,
         is_foreign_target=verdict.is_foreign_target,
@@ -311,7 +317,7 @@ def step_detections(
 def estimate(
     state: PipelineState,
     t_s: float,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     pipeline: Pipeline,
     with_sigma: bool = True,
 ) -> TargetEstimate | None:
@@ -340,7 +346,7 @@ def estimate(
         nothing = np.zeros(3)
         target = replace(
             target,
-            stage=Stage.NONE,
+            stage=VisibleMarkers.NONE,
             measured=False,
             tracked=False,
             velocity_mps=nothing,
@@ -348,7 +354,9 @@ def estimate(
         )
     assert target.world_m is not None
     assert target.world_yaw_rad is not None
-    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
+    e_m, e_yaw_rad = target_world_to_level(
+        target.world_m, target.world_yaw_rad, attitude, pipeline.pose_setup
+    )
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
@@ -359,7 +367,7 @@ def _estimate_at_frame(
     tracked_frame: TrackedFrame,
     previous_estimate: TargetEstimate | None,
     t_s: float,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     is_in_world_frame: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
@@ -373,7 +381,7 @@ def _estimate_at_frame(
     )
     merged = merged if rival is None else widen_covariance(merged, rival)
     measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_track)
-    small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
+    small = measured and merged.stage in (VisibleMarkers.BOTH, VisibleMarkers.SMALL)
     never = -np.inf
     frames = _express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline)
     offset_m = None if previous_estimate is None else previous_estimate.measured_offset_m
@@ -402,29 +410,31 @@ def _estimate_at_frame(
 
 def _express_in_level_and_world(
     merged: MergedTarget,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     is_in_world_frame: bool,
     pipeline: Pipeline,
     with_sigma: bool = True,
 ) -> dict[str, Any]:
-    place_m, yaw_rad = merged.xyz_yaw[:3], float(merged.xyz_yaw[3])
-    cov_m2, error_shifts_m = merged.cov_m2, merged.constant_error_shifts_m
-    seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}
+    place_m, yaw_rad = merged.track_frame_xyz_yaw[:3], float(merged.track_frame_xyz_yaw[3])
+    cov_m2, error_shifts_m = merged.cov_m2, merged.shift_per_constant_error_m
+    seen: dict[str, Any] = {"velocity_mps": merged.track_frame_velocity_mps}
     if attitude is not None and is_in_world_frame:
         turn = attitude.R_world_level.T
         seen["world_m"], seen["world_yaw_rad"] = place_m, yaw_rad
-        seen["e_m"], seen["e_yaw_rad"] = to_level(place_m, yaw_rad, attitude, pipeline.pose)
-        seen["velocity_mps"] = turn.dot(merged.velocity_mps)
-        seen["world_velocity_mps"] = merged.velocity_mps
+        seen["e_m"], seen["e_yaw_rad"] = target_world_to_level(
+            place_m, yaw_rad, attitude, pipeline.pose_setup
+        )
+        seen["velocity_mps"] = turn.dot(merged.track_frame_velocity_mps)
+        seen["world_velocity_mps"] = merged.track_frame_velocity_mps
         if with_sigma:
             cov_m2 = turn.dot(cov_m2).dot(turn.T)
             error_shifts_m = gear_to_target_error_shifts_m(
-                error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose
+                error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose_setup
             )
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
         if attitude is not None:
-            world = to_world(place_m, yaw_rad, attitude, pipeline.pose)
+            world = target_level_to_world(place_m, yaw_rad, attitude, pipeline.pose_setup)
             seen["world_m"], seen["world_yaw_rad"] = world
     if with_sigma:
         variance = cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)

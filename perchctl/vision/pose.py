@@ -20,7 +20,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, is_finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
-from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
+from perchctl.vision.types import CameraModel, Detection, MarkerPose, VehicleState
 
 _ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
 _PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
@@ -63,7 +63,7 @@ def square_corners(side_m: float) -> Array:
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
-def R_level_body_of(attitude: Attitude | None) -> Array:
+def R_level_body_of(attitude: VehicleState | None) -> Array:
     """Return ``R_level_body`` (3, 3); without an attitude, the vehicle is assumed level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
@@ -71,18 +71,17 @@ def R_level_body_of(attitude: Attitude | None) -> Array:
 def estimate_pose(
     detections: Sequence[Detection],
     t_s: float,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     setup: PoseSetup,
-    previous_normal_cam: Array | None = None,
+    previous_target_normal_cam: Array | None = None,
     start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
     """Return the pose from one marker's corners, or from both markers' corners at once.
 
     `start`, the joint pose of the same frame, is refined with these corners instead of solving from
-    scratch, since its tilt is already decided. Without an attitude, `previous_normal_cam` (3,)
-    decides the tilt. Returns None if the corners yield no pose: no finite solution in front of the
-    camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
-    """
+    scratch, since its tilt is already decided. Without an attitude, `previous_target_normal_cam`
+    (3,) decides the tilt. Returns None if the corners yield no pose: no finite solution in front of
+    the camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`."""
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_px):
@@ -94,7 +93,7 @@ def estimate_pose(
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
         prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_SIGMA_RAD)
     else:
-        prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_SIGMA_RAD)
+        prior = TiltPrior(previous_target_normal_cam, _PREVIOUS_TILT_SIGMA_RAD)
     max_rms_px = setup.config.max_reprojection_px
     solution = _refine_from_start(points, start, prior, max_rms_px) or solve_pose(points, prior)
     if solution is None or not solution.rms_px <= max_rms_px:
@@ -106,7 +105,7 @@ def estimate_pose(
         return pose  # sides between interpolated rows look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
-    points = replace(points, is_curled=True)
+    points = replace(points, allows_for_curl=True)
     settled = _refine_from_start(points, solution, prior, max_rms_px)
     if settled is None:
         return pose
@@ -161,7 +160,7 @@ def _make_marker_pose(
         e_yaw_rad=yaw_of(R_level_target),
         sigma_m=sigma[:3],
         sigma_yaw_rad=float(sigma[3]),
-        reprojection_px=solution.rms_px,
+        rms_reprojection_px=solution.rms_px,
         chi2=chi2,
         xyz_yaw_cov=cov_e,
         print_error_shifts_m=print_shift_m,
@@ -169,7 +168,7 @@ def _make_marker_pose(
     )
 
 
-def camera_covariance(pose: MarkerPose) -> Array:
+def target_covariance_cam(pose: MarkerPose) -> Array:
     """Return a pose's covariance (6, 6) as small rotations (rad) about and translations (m) along
     the camera's x, y, z, without the errors of the print."""
     assert pose.rvec_tvec_cov is not None
@@ -190,7 +189,7 @@ def rotation_vector(R: Array) -> Array:
     return np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
 
 
-def normal_cam(pose: MarkerPose) -> Array:
+def target_normal_cam(pose: MarkerPose) -> Array:
     """Return the marker's z axis (out of the paper) in camera axes, (3,)."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
@@ -246,15 +245,16 @@ class TiltPrior:
     """Expected normal (3,) of the marker in camera axes, None if unknown, and its standard
     deviation."""
 
-    normal_cam: Array | None
+    target_normal_cam: Array | None
     sigma_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """True if the candidate's normal differs from a known `normal_cam` by more than
+        """True if the candidate's normal differs from a known `target_normal_cam` by more than
         `sigma_rad`."""
         return (
-            self.normal_cam is not None
-            and tilt_rad(candidate.rvec, self.normal_cam) > self.sigma_rad
+            self.target_normal_cam is not None
+            and angle_to_expected_normal_rad(candidate.rvec, self.target_normal_cam)
+            > self.sigma_rad
         )
 
 
@@ -265,7 +265,7 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     if not scored:
         return None
     best = _choose_likeliest(scored, points, prior)
-    if prior.normal_cam is None or prior.contradicts(best):
+    if prior.target_normal_cam is None or prior.contradicts(best):
         best = _choose_likeliest([best, *_find_flipped_candidates(best, points)], points, prior)
     # The unweighted optimum is so close that the errors are linear.
     return refine_pose(points, best) or best
@@ -281,7 +281,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         scored = _score(candidate, points)
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
-        if points.is_curled:
+        if points.allows_for_curl:
             weight = curl_weight_matrix(_whitened_curl_effect(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
@@ -319,7 +319,7 @@ class PoseCovariance(NamedTuple):
 
     cov: Array
     chi2: float
-    curl_shift: Array
+    pose_shift_per_curl_sigma: Array
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
@@ -332,7 +332,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
     curl = _whitened_curl_effect(points, scored)
-    weight = curl_weight_matrix(curl) if points.is_curled else None
+    weight = curl_weight_matrix(curl) if points.allows_for_curl else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
@@ -340,7 +340,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
     growth = max((_CLAIMED_SIGMA_DOF + chi2) / (_CLAIMED_SIGMA_DOF + freedom), 0.7)
-    common = gain.dot(points.whitened_error_shifts)
+    common = gain.dot(points.whitened_corner_shift_per_error)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
     curled, twisted = gain.dot(curl).T
@@ -352,13 +352,13 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 def _whitened_curl_effect(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the change (2n, 2) of the whitened errors by one standard deviation of each mode of
     curl."""
-    normal_cam = rotation_matrix(scored.rvec)[:, 2]
+    target_normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane appears where a target moved along its normal would show it.
-    moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m
+    moved = scored.jacobian[:, 3:].dot(target_normal_cam)[:, None] * points.curl_lift_m
     return np.asarray(points.whitening.dot(moved))
 
 
-def tilt_rad(rvec: Array, expected_normal_cam: Array) -> float:
+def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> float:
     """Return the angle between a marker's normal at rotation `rvec` and the normal
     `expected_normal_cam`, rad."""
     normal = rotation_matrix(rvec)[:, 2]
@@ -424,8 +424,10 @@ def _choose_likeliest(
 
     def cost(s: ScoredPose) -> float:
         total = float(((s.error_px / sigma) ** 2).sum())
-        if prior.normal_cam is not None:
-            total += (tilt_rad(s.rvec, prior.normal_cam) / prior.sigma_rad) ** 2
+        if prior.target_normal_cam is not None:
+            total += (
+                angle_to_expected_normal_rad(s.rvec, prior.target_normal_cam) / prior.sigma_rad
+            ) ** 2
         return total
 
     return min(scored, key=cost)
@@ -434,12 +436,12 @@ def _choose_likeliest(
 # --- A sheet that is not flat: effect of its curl on corners, and their weights ---
 
 
-def curl_lift(object_m: Array, curl_per_m: float) -> Array:
+def curl_lift(object_m: Array, paper_curvature_per_m: float) -> Array:
     """Return the distances of corners (n, 3) from the flat sheet for one standard deviation of each
     mode of curl: a bowl, with all corners to one side, and a saddle, with neighbouring corners to
     opposite sides. Shape (2n, 2), m, with each corner's row twice, for its x and y."""
     x, y = object_m[:, 0], object_m[:, 1]
-    lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
+    lift: Array = paper_curvature_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
@@ -483,21 +485,21 @@ class WeightedCorners:
             camera `K` (3, 3).
         sigma_px: standard deviations (n,).
         whitening: matrix (2n, 2n) that makes the errors independent, with unit variance.
-        whitened_error_shifts: one standard deviation, whitened, of each error common to several
-            corners (2n, k): the shift of all edges, `common_error_shift_px` of the detections, and
-            the jitter of each detection's rows.
+        whitened_corner_shift_per_error: one standard deviation, whitened, of each error common to
+            several corners (2n, k): the shift of all edges, `rolling_shutter_error_shift_px` of the
+            detections, and the jitter of each detection's rows.
         curl_lift_m: result (2n, 2) of `curl_lift`.
-        is_curled: True if the sheet's curl changes the weights of the corners.
+        allows_for_curl: True if the sheet's curl changes the weights of the corners.
     """
 
     object_m: Array
     image_px: Array
     sigma_px: Array
     whitening: Array
-    whitened_error_shifts: Array
+    whitened_corner_shift_per_error: Array
     K: Array
     curl_lift_m: Array
-    is_curled: bool = False
+    allows_for_curl: bool = False
 
 
 def weigh_corners(
@@ -517,13 +519,13 @@ def weigh_corners(
     moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
-        error_shifts[rows, 0] = d.edge_shift_sigma_px * moved[i]
+        error_shifts[rows, 0] = d.remaining_edge_shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
             except np.linalg.LinAlgError:  # rounding, for far corners of a cut target
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
-        elif d.refined:
+        elif d.is_fitted:
             spread_px = (
                 d.sigma_px
                 if d.horizontal_side_extra_sigma_px == 0.0
@@ -534,8 +536,8 @@ def weigh_corners(
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
-        if d.common_error_shift_px is not None:
-            error_shifts[rows, 1] = d.common_error_shift_px.ravel()
+        if d.rolling_shutter_error_shift_px is not None:
+            error_shifts[rows, 1] = d.rolling_shutter_error_shift_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
             # As for a line: half to all of its rows shift alike, and they slant.
             down = corners[:, 1] - corners[:, 1].mean()

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
-from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilt_jacobian
+from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, vector_by_tilt_jacobian
 from perchctl.vision.pose import PoseSetup, estimate_pose
-from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
+from perchctl.vision.types import Detection, MarkerName, MarkerPose, VehicleState
 
 _SEARCHED_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
@@ -27,62 +27,64 @@ class OwnTargetPosition:
     unknown. A target further than `max_distance_m` from this position belongs to another
     vehicle."""
 
-    xy_m: tuple[float, float] | None = None
+    xy_world_m: tuple[float, float] | None = None
     max_distance_m: float = math.inf
 
 
-OwnTargetOffset = Callable[[MarkerName, Array], float]
+OwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
 """Function that returns the distance, m, of a marker with corners (4, 2) px from the own target's
 position, or inf."""
 
 
-_NO_POSE_OFFSET_M = 1e9
+_NO_POSE_DISTANCE_M = 1e9
 """Distance for corners that yield no pose yet, for example next to a highlight, m: examined last,
 but not refused."""
 
 
-def marker_offset_m(
+def marker_to_own_target_m(
     own_target: OwnTargetPosition,
     t_s: float,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     setup: PoseSetup,
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return `target_offset_m` for a marker's corners (4, 2) px; infinite beyond
-    `own_target.max_distance_m`."""
-    seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, refined=False)
+    """Return `horizontal_distance_to_own_target_m` for a marker's corners (4, 2) px; infinite
+    beyond `own_target.max_distance_m`."""
+    seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, is_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    offset_m = (
-        _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, own_target, setup)
+    distance_m = (
+        _NO_POSE_DISTANCE_M
+        if pose is None
+        else horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
     )
     is_bounded = attitude is not None and math.isfinite(own_target.max_distance_m)
-    return offset_m if not is_bounded or offset_m <= own_target.max_distance_m else math.inf
+    return distance_m if not is_bounded or distance_m <= own_target.max_distance_m else math.inf
 
 
-def target_offset_m(
-    pose: MarkerPose, attitude: Attitude | None, own_target: OwnTargetPosition, setup: PoseSetup
+def horizontal_distance_to_own_target_m(
+    pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
     """Return a target's horizontal distance from the own target's position; from the gear if
     unknown."""
-    if own_target.xy_m is None or attitude is None:
+    if own_target.xy_world_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
-    seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
-    return math.hypot(seen_m[0] - own_target.xy_m[0], seen_m[1] - own_target.xy_m[1])
+    seen_m, _ = target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
+    return math.hypot(seen_m[0] - own_target.xy_world_m[0], seen_m[1] - own_target.xy_world_m[1])
 
 
 def refusal_text(
-    pose: MarkerPose, attitude: Attitude | None, own_target: OwnTargetPosition, setup: PoseSetup
+    pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
     """Return the message that a pose is another vehicle's target; None if it may be the own
     target."""
-    if attitude is None or own_target.xy_m is None:
+    if attitude is None or own_target.xy_world_m is None:
         return None
-    offset_m = target_offset_m(pose, attitude, own_target, setup)
-    if offset_m <= own_target.max_distance_m:
+    distance_m = horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
+    if distance_m <= own_target.max_distance_m:
         return None
     return (
-        f"a target {offset_m:.2f} m from target.expected_xy_m is ignored "
+        f"a target {distance_m:.2f} m from target.expected_xy_m is ignored "
         f"(target.expected_within_m is {own_target.max_distance_m:g} m)"
     )
 
@@ -96,8 +98,8 @@ _MIN_MEASUREMENT_COVARIANCE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
 _YAW_FIRST_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
-def to_world(
-    e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
+def target_level_to_world(
+    e_m: Array, e_yaw_rad: float, attitude: VehicleState, setup: PoseSetup
 ) -> tuple[Array, float]:
     """Convert a target's position (3,) and heading, relative to the gear in the level frame, to the
     world frame of the state estimate."""
@@ -106,19 +108,24 @@ def to_world(
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
 
 
-def to_level(
-    position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
+def target_world_to_level(
+    target_position_world_m: Array,
+    target_yaw_world_rad: float,
+    attitude: VehicleState,
+    setup: PoseSetup,
 ) -> tuple[Array, float]:
     """Convert a target's position (3,) and heading in the world to the level frame, relative to the
-    gear; the inverse of `to_world`."""
+    gear; the inverse of `target_level_to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
-    body_to_target_m = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
-    return body_to_target_m - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
+    body_to_target_m = (target_position_world_m - np.asarray(attitude.position_m)).dot(
+        attitude.R_world_level
+    )
+    return body_to_target_m - gear_level, wrap_rad(target_yaw_world_rad - attitude.yaw_rad)
 
 
 def track_measurement(
     pose: MarkerPose,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     is_in_world_frame: bool,
     filter_setup: FilterSetup,
     setup: PoseSetup,
@@ -131,34 +138,39 @@ def track_measurement(
         lever_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
         z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
-    if filter_setup.process_noise is None or pose.xyz_yaw_cov is None:
+    if filter_setup.acceleration_noise is None or pose.xyz_yaw_cov is None:
         return Measurement(z)
     noise = pose.xyz_yaw_cov.copy()
     noise[:3, :3] -= pose.print_error_shifts_m.dot(pose.print_error_shifts_m.T)
-    constant_error_shifts = np.zeros((4, 4))
-    constant_error_shifts[1:, PRINT] = pose.print_error_shifts_m
+    shift_per_constant_error = np.zeros((4, 4))
+    shift_per_constant_error[1:, PRINT] = pose.print_error_shifts_m
     if attitude is not None:
-        constant_error_shifts[1:, TILTS] = tilt_jacobian(lever_m) * filter_setup.tilt_sigma_rad
+        shift_per_constant_error[1:, TILTS] = (
+            vector_by_tilt_jacobian(lever_m) * filter_setup.tilt_sigma_rad
+        )
     if is_in_world_frame and attitude is not None:
         turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
-        constant_error_shifts[1:] = attitude.R_world_level.dot(constant_error_shifts[1:])
+        shift_per_constant_error[1:] = attitude.R_world_level.dot(shift_per_constant_error[1:])
     R = (
         np.asarray(noise[_YAW_FIRST_INDICES] + _MIN_MEASUREMENT_COVARIANCE)
         if is_finite(noise)
         else None
     )
-    return Measurement(z, R, constant_error_shifts)
+    return Measurement(z, R, shift_per_constant_error)
 
 
 def gear_to_target_error_shifts_m(
-    target_error_shifts_m: Array, attitude: Attitude, filter_setup: FilterSetup, setup: PoseSetup
+    target_error_shifts_m: Array,
+    attitude: VehicleState,
+    filter_setup: FilterSetup,
+    setup: PoseSetup,
 ) -> Array:
     """Return the change (3, 4) of the vector from gear to target, in level axes, by one standard
     deviation of each constant error: `target_error_shifts_m` (3, 4) of the target in the world,
     minus the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_error_shifts_m)
-    moved[:, TILTS] -= tilt_jacobian(gear_level) * filter_setup.tilt_sigma_rad
+    moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.tilt_sigma_rad
     return np.asarray(moved)

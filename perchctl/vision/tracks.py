@@ -25,7 +25,6 @@ from perchctl.vision.markers.cut import make_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
 from perchctl.vision.target_selection import OwnTargetPosition, refusal_text, track_measurement
 from perchctl.vision.types import (
-    Attitude,
     LastPose,
     MarkerName,
     MarkerPose,
@@ -35,6 +34,7 @@ from perchctl.vision.types import (
     PipelineState,
     RivalTrack,
     TargetLock,
+    VehicleState,
 )
 
 
@@ -45,7 +45,7 @@ class TrackSetup:
 
     level_filter: FilterSetup
     world_filter: FilterSetup
-    pose: PoseSetup
+    pose_setup: PoseSetup
     has_gate: bool
     own_target: OwnTargetPosition
 
@@ -70,14 +70,14 @@ def update_tracks(
     state: PipelineState,
     measured: MeasuredMarkers,
     t_s: float,
-    attitude: Attitude | None,
+    attitude: VehicleState | None,
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
     """Return the tracks after a frame, updated with the poses that the gate accepts."""
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
-        name: track_measurement(pose, attitude, is_in_world_frame, filter_setup, setup.pose)
+        name: track_measurement(pose, attitude, is_in_world_frame, filter_setup, setup.pose_setup)
         for name, pose in measured.poses_by_track.items()
     }
     old = state.tracks if state.are_tracks_in_world_frame == is_in_world_frame else {}
@@ -98,15 +98,17 @@ def update_tracks(
         )
         if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
-            looks = not is_in_world_frame or is_in_view(place_m, attitude, setup.pose)
-            frame_pose = replace(frame_pose, is_lock_in_view=looks)
+            looks = not is_in_world_frame or is_in_view(place_m, attitude, setup.pose_setup)
+            frame_pose = replace(frame_pose, is_locked_target_in_view=looks)
         if setup.has_gate:
             verdict = judge_pose(state.lock, state.rival, frame_pose, filter_setup)
         # A locked target stays locked, however far the estimate's world frame has drifted
         # meanwhile.
-        goes_on = not verdict.restarts_track or verdict.is_same_target
+        goes_on = not verdict.restarts_track or verdict.restarts_for_locked_target
         goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
-        another = None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose)
+        another = (
+            None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose_setup)
+        )
         if another is not None and verdict.accepted:
             verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
     if not verdict.accepted:
@@ -168,7 +170,7 @@ _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the last pose: that pose may have been wrong"
 )
-_GATE_CHI2 = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
+_MAX_GATE_CHI2 = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
 _MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
 # Errors outside any covariance: calibration, print, latency; plus shares of the range.
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
@@ -192,7 +194,7 @@ class FramePose:
     measured: Measurement
     is_in_world_frame: bool
     has_both_markers: bool
-    is_lock_in_view: bool = True
+    is_locked_target_in_view: bool = True
     is_attitude_unknown: bool = False
 
 
@@ -206,7 +208,7 @@ class GateVerdict:
 
     accepted: bool
     restarts_track: bool = False
-    is_same_target: bool = False
+    restarts_for_locked_target: bool = False
     rival: RivalTrack | None = None
     text: str = ""
     is_foreign_target: bool = False  # another vehicle's target, by its position
@@ -230,20 +232,28 @@ def judge_pose(
         return GateVerdict(accepted=True)
     misfit = _compute_misfit(lock.track, frame_pose, filter_setup)
     rival_misfit = None if rival is None else _compute_misfit(rival.track, frame_pose, filter_setup)
-    theirs = rival_misfit is not None and rival_misfit.squared_mahalanobis <= _GATE_CHI2
-    if misfit.squared_mahalanobis <= _GATE_CHI2 and not (
+    theirs = rival_misfit is not None and rival_misfit.squared_mahalanobis <= _MAX_GATE_CHI2
+    if misfit.squared_mahalanobis <= _MAX_GATE_CHI2 and not (
         theirs
         and rival_misfit is not None
         and rival_misfit.log_likelihood_cost < misfit.log_likelihood_cost
     ):
         return GateVerdict(accepted=True, rival=rival)
-    if not theirs and _matches_last_view(lock, frame_pose, misfit.residual):
+    if not theirs and _matches_last_view(lock, frame_pose, misfit.measured_minus_predicted_yaw_xyz):
         return GateVerdict(
-            accepted=True, restarts_track=True, is_same_target=True, text=_ESTIMATE_JUMPED_TEXT
+            accepted=True,
+            restarts_track=True,
+            restarts_for_locked_target=True,
+            text=_ESTIMATE_JUMPED_TEXT,
         )
-    if not theirs and _matches_previous_track(lock, frame_pose, misfit.residual, filter_setup):
+    if not theirs and _matches_previous_track(
+        lock, frame_pose, misfit.measured_minus_predicted_yaw_xyz, filter_setup
+    ):
         return GateVerdict(
-            accepted=True, restarts_track=True, is_same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
+            accepted=True,
+            restarts_track=True,
+            restarts_for_locked_target=True,
+            text=_PREVIOUS_POSE_WRONG_TEXT,
         )
     seen = _update_rival(rival if theirs else None, frame_pose, misfit, filter_setup)
     if _is_rival_accepted(lock, seen, frame_pose):
@@ -297,7 +307,7 @@ def update_lock(
 ) -> TargetLock:
     """Return the lock after the gate accepted `frame_pose`. `track` is the track that this pose
     updated."""
-    anew = verdict.restarts_track and not verdict.is_same_target
+    anew = verdict.restarts_track and not verdict.restarts_for_locked_target
     before = (
         None
         if lock is None or anew or lock.is_in_world_frame != frame_pose.is_in_world_frame
@@ -322,12 +332,15 @@ class _Misfit:
     """The difference of a pose from its prediction in (yaw, x, y, z), (4,), and its covariance (4,
     4)."""
 
-    residual: Array
+    measured_minus_predicted_yaw_xyz: Array
     S: Array
 
     @cached_property
     def squared_mahalanobis(self) -> float:
-        return float(self.residual @ np.linalg.solve(self.S, self.residual))
+        return float(
+            self.measured_minus_predicted_yaw_xyz
+            @ np.linalg.solve(self.S, self.measured_minus_predicted_yaw_xyz)
+        )
 
     @property
     def log_likelihood_cost(self) -> float:
@@ -337,7 +350,7 @@ class _Misfit:
 
     @property
     def distance_m(self) -> float:
-        return float(np.linalg.norm(self.residual[1:]))
+        return float(np.linalg.norm(self.measured_minus_predicted_yaw_xyz[1:]))
 
 
 def _compute_misfit(
@@ -345,14 +358,16 @@ def _compute_misfit(
 ) -> _Misfit:
     wanted, measured = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measured
     # The largest drift counts as three standard deviations.
-    drift_m = min(filter_setup.max_drift_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
+    drift_m = (
+        min(filter_setup.max_target_speed_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
+    )
     residual = measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     # A constant error shifts both.
     error_shifts = (
-        wanted.constant_error_shifts[MEASURED]
-        if measured.constant_error_shifts is None
-        else measured.constant_error_shifts - wanted.constant_error_shifts[MEASURED]
+        wanted.shift_per_constant_error[MEASURED]
+        if measured.shift_per_constant_error is None
+        else measured.shift_per_constant_error - wanted.shift_per_constant_error[MEASURED]
     )
     R = filter_setup.R if measured.R is None else measured.R
     S = (
@@ -361,7 +376,7 @@ def _compute_misfit(
         + R
         + error_shifts @ error_shifts.T
     )
-    return _Misfit(residual, S + np.diag(_unmodelled_sigma(_range_m(frame_pose)) ** 2))
+    return _Misfit(residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_range_m(frame_pose)) ** 2))
 
 
 def _is_clearly_consistent(
@@ -372,15 +387,15 @@ def _is_clearly_consistent(
     wanted = predict_track(track, frame_pose.t_s, filter_setup, with_cov=False)
     residual = frame_pose.measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
-    residual /= _unmodelled_sigma(_range_m(frame_pose))
-    return float(residual @ residual) <= _GATE_CHI2
+    residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))
+    return float(residual @ residual) <= _MAX_GATE_CHI2
 
 
 def _range_m(frame_pose: FramePose) -> float:
     return math.hypot(*frame_pose.pose.tvec_m.tolist())
 
 
-def _unmodelled_sigma(range_m: float) -> Array:
+def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
     """Return the standard deviations of (yaw, x, y, z) at a range due to errors that no covariance
     models."""
     sideways_m, along_m = (
@@ -402,9 +417,9 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
     residual[1:] = frame_pose.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
-    unclaimed = _unmodelled_sigma(range_m)
+    unclaimed = _unmodelled_yaw_xyz_sigma(range_m)
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, world_residual))
-    calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _GATE_CHI2
+    calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _MAX_GATE_CHI2
     return calm and seen < _MAX_REMAINING_MISFIT_FRACTION * jumped
 
 
@@ -419,11 +434,15 @@ def _matches_previous_track(
         return False
     misfit, unclaimed = (
         _compute_misfit(lock.track_before_last_pose, frame_pose, filter_setup),
-        _unmodelled_sigma(_range_m(frame_pose)),
+        _unmodelled_yaw_xyz_sigma(_range_m(frame_pose)),
     )
-    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (misfit.residual, residual))
+    before, now = (
+        float(((o / unclaimed) ** 2).sum())
+        for o in (misfit.measured_minus_predicted_yaw_xyz, residual)
+    )
     return (
-        misfit.squared_mahalanobis <= _GATE_CHI2 and before < _MAX_REMAINING_MISFIT_FRACTION * now
+        misfit.squared_mahalanobis <= _MAX_GATE_CHI2
+        and before < _MAX_REMAINING_MISFIT_FRACTION * now
     )
 
 
@@ -431,16 +450,25 @@ def _matches_previous_track(
 
 
 def _update_rival(
-    before: RivalTrack | None, frame_pose: FramePose, misfit: _Misfit, filter_setup: FilterSetup
+    previous_rival: RivalTrack | None,
+    frame_pose: FramePose,
+    misfit: _Misfit,
+    filter_setup: FilterSetup,
 ) -> RivalTrack:
-    if before is not None:
-        track = step_track(before.track, frame_pose.measured, frame_pose.t_s, filter_setup)
+    if previous_rival is not None:
+        track = step_track(previous_rival.track, frame_pose.measured, frame_pose.t_s, filter_setup)
         assert track is not None
-        whole = before.frames_with_both_markers + int(frame_pose.has_both_markers)
+        whole = previous_rival.frames_with_both_markers + int(frame_pose.has_both_markers)
         return replace(
-            before, track=track, seen_frames=before.seen_frames + 1, frames_with_both_markers=whole
+            previous_rival,
+            track=track,
+            seen_frames=previous_rival.seen_frames + 1,
+            frames_with_both_markers=whole,
         )
-    turned_rad, farther_m = abs(float(misfit.residual[0])), float(misfit.residual[3])
+    turned_rad, farther_m = (
+        abs(float(misfit.measured_minus_predicted_yaw_xyz[0])),
+        float(misfit.measured_minus_predicted_yaw_xyz[3]),
+    )
     has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(misfit.S[3, 3])
     where = f"{misfit.distance_m:.2f} m away from it"
     if turned_rad > _MIN_ROTATION_TO_REPORT_RAD:
@@ -471,7 +499,7 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
     unseen_s = frame_pose.t_s - max(rival.since_s, lock.track.t_s)
     # A position outside the picture is not known to be empty.
     return (
-        (frame_pose.is_lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
+        (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.has_different_range
         and rival.frames_with_both_markers >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
@@ -497,7 +525,7 @@ _MOTION_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each picture
 
 
 def expected_corners(
-    last_pose: LastPose | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
+    last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Return the expected corners of both markers, (4, 2) px, and the expected pose of the target:
     the last pose, moved by the vehicle's motion.
@@ -527,7 +555,7 @@ def expected_corners(
 
 
 def update_last_pose(
-    previous: LastPose | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
+    previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
     """Return the record of a new pose, with the errors of the estimated motion since `previous`."""
     if previous is None:
@@ -549,7 +577,7 @@ def update_last_pose(
     return LastPose(pose, attitude, MotionErrors(by_place, by_speed))
 
 
-def is_in_view(position_world_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
+def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup) -> bool:
     """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (
@@ -569,12 +597,12 @@ class _CameraDisplacements(NamedTuple):
     """The camera's displacement (3,) in the world between two attitudes: from the difference of the
     two estimated positions, and from velocity times time."""
 
-    by_position_m: Array
-    by_velocity_m: Array
+    from_positions_m: Array
+    from_velocity_m: Array
 
 
 def _camera_displacements_m(
-    then: Attitude, now: Attitude, setup: PoseSetup
+    then: VehicleState, now: VehicleState, setup: PoseSetup
 ) -> _CameraDisplacements:
     """Return the camera's displacement between two attitudes, computed in both ways."""
     turned_m = _vehicle_to_camera_world_m(now, setup) - _vehicle_to_camera_world_m(then, setup)
@@ -586,12 +614,12 @@ def _camera_displacements_m(
     return _CameraDisplacements(stepped_m, flown_m)
 
 
-def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
+def _R_world_cam(attitude: VehicleState, setup: PoseSetup) -> Array:
     R_world_cam: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, :3])
     return R_world_cam
 
 
-def _vehicle_to_camera_world_m(attitude: Attitude, setup: PoseSetup) -> Array:
+def _vehicle_to_camera_world_m(attitude: VehicleState, setup: PoseSetup) -> Array:
     """Return the vector from the vehicle to the camera in the world, (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -22,7 +22,7 @@ GearToTargetInLevel = Array
 """A vector (3,) from the gear to the target in level axes, m: the paper's (e_x, e_y, e_z)."""
 
 
-class Stage(Enum):
+class VisibleMarkers(Enum):
     """The markers of the target in view (paper, section II-A.2)."""
 
     NONE = "none"
@@ -151,10 +151,12 @@ class Detection:
     marker: MarkerName
     corners_px: Array
     sigma_px: float
-    refined: bool
-    edge_shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
+    is_fitted: bool
+    remaining_edge_shift_sigma_px: float = (
+        0.0  # standard deviation of the common outward shift of all edges
+    )
     # (4, 2): change of the corners by one standard deviation of an error common to all of them
-    common_error_shift_px: Array | None = None
+    rolling_shutter_error_shift_px: Array | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = (
         0.0  # standard deviation due to the jitter of rows in analogue video
@@ -168,7 +170,7 @@ class EdgeShift:
     """How far white has grown over black at all edges of a picture, px, its standard deviation, px,
     and the number of pictures since it was measured."""
 
-    shift_px: float
+    white_growth_px: float
     sigma_px: float
     age_frames: int = 0
 
@@ -199,7 +201,7 @@ class Detections:
 
 
 @dataclass(frozen=True, eq=False)
-class Attitude:
+class VehicleState:
     """The vehicle's attitude and position at a frame's time, world axes.
 
     Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
@@ -238,7 +240,7 @@ class MarkerPose:
         e_m: position of the target relative to the gear in the level frame, (3,).
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
-        reprojection_px: RMS error of the corners.
+        rms_reprojection_px: RMS error of the corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
         print_error_shifts_m: shift of `e_m` by one standard deviation of the print's size and of
@@ -255,7 +257,7 @@ class MarkerPose:
     e_yaw_rad: float
     sigma_m: Array
     sigma_yaw_rad: float
-    reprojection_px: float
+    rms_reprojection_px: float
     chi2: float = 0.0
     xyz_yaw_cov: Array | None = None
     print_error_shifts_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
@@ -268,7 +270,7 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. Column k of `constant_error_shifts` (8, 4) is the change of the state by one standard
+    motion. Column k of `shift_per_constant_error` (8, 4) is the change of the state by one standard
     deviation of constant error k: the vehicle's roll and pitch, the print's size and curl.
     `unseen_frames` counts the frames since the last measurement.
     """
@@ -277,12 +279,12 @@ class MarkerTrack:
     x: Array
     P: Array
     unseen_frames: int = 0
-    constant_error_shifts: Array = field(default_factory=lambda: np.zeros((8, 4)))
+    shift_per_constant_error: Array = field(default_factory=lambda: np.zeros((8, 4)))
 
     @property
-    def cov(self) -> Array:
+    def state_cov_with_constant_errors(self) -> Array:
         """Covariance (8, 8) of the state, including the constant errors."""
-        return self.P + self.constant_error_shifts @ self.constant_error_shifts.T
+        return self.P + self.shift_per_constant_error @ self.shift_per_constant_error.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +318,7 @@ class TargetEstimate:
     t_s: float
     measured_s: float
     small_measured_s: float
-    stage: Stage
+    stage: VisibleMarkers
     measured: bool
     tracked: bool
     unseen: int
@@ -336,8 +338,8 @@ class MotionErrors(NamedTuple):
     seen from the camera, rad^2: computed from the difference of two estimated positions, and from
     velocity times time."""
 
-    by_position_rad2: float = 0.0
-    by_velocity_rad2: float = 0.0
+    from_positions_rad2: float = 0.0
+    from_velocity_rad2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +349,7 @@ class LastPose:
     the prediction of the next pose."""
 
     pose: MarkerPose
-    attitude: Attitude | None
+    attitude: VehicleState | None
     motion_errors: MotionErrors = field(default_factory=MotionErrors)
 
 
@@ -417,19 +419,19 @@ class FieldState:
     Attributes:
         kind: kind of the last frame that was examined for interlacing.
         frames_since_examined: number of frames since then.
-        order_votes: sum of the votes on the order: positive if the top field seems to be first,
+        top_first_votes: sum of the votes on the order: positive if the top field seems to be first,
             negative if the bottom field does.
         is_top_first: order of the fields; None until the votes decide.
-        periods_s: the last periods between frames.
+        frame_periods_s: the last periods between frames.
         last_frame_t_s: time of the last frame.
         previous_image: picture of the previous frame, unless that frame was whole.
     """
 
     kind: PictureKind | None = None
     frames_since_examined: int = 0
-    order_votes: float = 0.0
+    top_first_votes: float = 0.0
     is_top_first: bool | None = None
-    periods_s: tuple[float, ...] = ()
+    frame_periods_s: tuple[float, ...] = ()
     last_frame_t_s: float | None = None
     previous_image: NDArray[np.uint8] | None = None
 
@@ -446,8 +448,8 @@ class PipelineState:
     target: TargetEstimate | None = None  # at the last frame with a track
     last_detections: Detections | None = None
     last_pose: LastPose | None = None  # the last pose
-    disagreeing_frames: int = 0
-    empty_frames: int = 0  # number of successive frames without a marker
+    frames_with_contradicting_markers: int = 0
+    frames_without_markers: int = 0  # number of successive frames without a marker
     lock: TargetLock | None = None
     rival: RivalTrack | None = None
     field_state: FieldState = FieldState()
@@ -460,8 +462,10 @@ class PipelineOutput:
     detections: Detections
     poses: dict[str, MarkerPose]
     target: TargetEstimate | None  # at the frame's time
-    stage: Stage  # from this frame's detections
-    disagreeing_frames: int = 0  # number of successive frames with contradicting markers
+    stage: VisibleMarkers  # from this frame's detections
+    frames_with_contradicting_markers: int = (
+        0  # number of successive frames with contradicting markers
+    )
     picture_kind: PictureKind = "whole"  # kind of the picture
     lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
     is_foreign_target: bool = False  # this frame showed another vehicle's target, by its position
@@ -472,12 +476,12 @@ class CameraErrors:
     """Errors of the profile's camera latency and mounting estimated in flight, each with one
     standard deviation.
 
-    `delay_s` is the latency beyond the profile's. `rotation_rad` is the rotation of the mounting
-    about body x, y and z. `rotation_sigma_rad` includes the constant error of the attitude, which
-    moves the target just as an error in roll and pitch of the mounting does.
+    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` is the rotation of the
+    mounting about body x, y and z. `mount_rotation_sigma_xyz_rad` includes the constant error of
+    the attitude, which moves the target just as an error in roll and pitch of the mounting does.
     """
 
     delay_s: float
     delay_sigma_s: float
-    rotation_rad: tuple[float, float, float]
-    rotation_sigma_rad: tuple[float, float, float]
+    mount_rotation_xyz_rad: tuple[float, float, float]
+    mount_rotation_sigma_xyz_rad: tuple[float, float, float]

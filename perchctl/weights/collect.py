@@ -30,11 +30,11 @@ from perchctl.positioning import CaptureFrame, CaptureSource, VehiclePose
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import (
     MARKERS,
-    Attitude,
     CameraModel,
     Frame,
     MarkerPose,
     PipelineState,
+    VehicleState,
     make_pipeline,
     step,
 )
@@ -76,7 +76,7 @@ def read_markers(
     frames: Iterable[Frame],
     profile: Profile,
     camera: CameraModel,
-    attitude: Attitude | None = None,
+    attitude: VehicleState | None = None,
 ) -> Iterator[MarkerReading]:
     """Yield the markers' poses in the frames of one position, relative to the gear in the level
     frame, by the profile's pipeline with `merge.method` weights."""
@@ -188,7 +188,7 @@ class SessionFile:
 # --- The actual pose ---
 
 
-ActualPose = tuple[Array, Attitude | None]
+ActualPose = tuple[Array, VehicleState | None]
 """The actual pose (4,), and the attitude of the vehicle, None where it stands level."""
 
 
@@ -252,7 +252,7 @@ class MocapPoses:
         body_m, (roll, pitch, yaw) = _median(frames, self._config.body, self._config)
         level = rot_z(-yaw) @ (target_m - body_m)
         e_m = level - rotation_from_rpy(roll, pitch, 0.0) @ self._gear
-        attitude = Attitude(0.0, roll, pitch, yaw, (body_m[0], body_m[1], body_m[2]))
+        attitude = VehicleState(0.0, roll, pitch, yaw, (body_m[0], body_m[1], body_m[2]))
         return np.array([*e_m, wrap_rad(target_yaw - yaw)]), attitude
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ from perchctl.mission import (
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
-from perchctl.vision.types import Detection, Detections, Stage
+from perchctl.vision.types import Detection, Detections, VisibleMarkers
 from tests.helpers.live_page import CORNERS, ask, hover_tick, press, tick
 from tests.helpers.mission import entered, note
 
@@ -51,7 +51,7 @@ def seen_in(frame: Frame) -> PipelineOutput:
         np.zeros(3), 0.0, np.ones(3), 1.0, 0.1,
     )  # fmt: skip
     detections = Detections(frame.index, frame.t_s, large=large)
-    return PipelineOutput(detections, {"large": pose}, None, Stage.LARGE)
+    return PipelineOutput(detections, {"large": pose}, None, VisibleMarkers.LARGE)
 
 
 # --- what it shows ---------------------------------------------------------------------------

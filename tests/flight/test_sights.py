@@ -86,7 +86,7 @@ def test_an_attitude_that_stands_still_places_nobody(frozen: bool) -> None:
     pose = MarkerPose(
         source="large", t_s=1.45, rvec_rad=np.zeros(3), tvec_m=np.array([0.0, 0.0, 1.0]),
         e_m=np.array([0.0, 0.0, 1.0]), e_yaw_rad=0.0, sigma_m=np.full(3, 1e-3), sigma_yaw_rad=1e-3,
-        reprojection_px=0.1,
+        rms_reprojection_px=0.1,
     )  # fmt: skip
     samples = [
         telemetry(1.0 + SAMPLE_S * i, 1.0, **({"roll_rad": 0.1} if frozen and i else {}))

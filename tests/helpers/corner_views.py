@@ -86,7 +86,7 @@ def findings(view: View) -> list[tuple[CornerMethod, CornerFindings]]:
     picture, prior, found = view.picture, view.prior, CornerFindings()
     steps = []
     for method in CORNER_METHODS:
-        if method.is_used(picture, prior, found):
+        if method.should_run(picture, prior, found):
             found = method.find(picture, prior, found)
             steps.append((method, found))
     return steps

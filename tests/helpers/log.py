@@ -27,7 +27,7 @@ from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
 from perchctl.vehicle import Command, Idle, PositionSetpoint, StopMotors, Telemetry
 from perchctl.vision import CameraErrors, MarkerPose, PipelineOutput, TargetEstimate
-from perchctl.vision.types import Detection, Detections, Stage
+from perchctl.vision.types import Detection, Detections, VisibleMarkers
 from tests.helpers import mission
 from tests.helpers.mission import state_with
 
@@ -57,7 +57,7 @@ def telemetry(t_s: float = 0.0, z_m: float = 0.0) -> Telemetry:
 
 
 def target(
-    t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.BOTH
+    t_s: float, z_m: float, measured: bool = True, stage: VisibleMarkers = VisibleMarkers.BOTH
 ) -> TargetEstimate:
     decay = math.exp(-t_s / 4.0)
     return mission.target_at(
@@ -88,7 +88,7 @@ def output(index: int, truth: TargetEstimate, rng: np.random.Generator) -> Pipel
                 marker, truth.t_s, np.zeros(3), np.zeros(3), e_m, e_yaw_rad, np.full(3, sigma),
                 sigma, 0.4,
             )  # fmt: skip
-            found[marker] = Detection(marker, corners_px, 0.1, refined=True)
+            found[marker] = Detection(marker, corners_px, 0.1, is_fitted=True)
     detections = Detections(index, truth.t_s, **found)
     return PipelineOutput(detections=detections, poses=poses, target=truth, stage=truth.stage)
 
@@ -103,7 +103,7 @@ def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
             z_m = min(1.87, 0.25 * flown_s)
             seen = flown_s > 3.2
             gone = GONE_S[0] < flown_s < GONE_S[1]
-            stage = Stage.LARGE if z_m < 1.5 else Stage.BOTH
+            stage = VisibleMarkers.LARGE if z_m < 1.5 else VisibleMarkers.BOTH
             pose = target(flown_s, z_m, not gone, stage) if seen else None
             frame = None
             if pose is not None and not gone and n % 2 == 0:

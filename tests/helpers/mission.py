@@ -20,7 +20,7 @@ from perchctl.mission.table import PHASE_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
 from perchctl.vision import TargetEstimate
-from perchctl.vision.types import Stage
+from perchctl.vision.types import VisibleMarkers
 
 READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
@@ -91,7 +91,7 @@ def target_at(
         t_s=t_s,
         measured_s=t_s,
         small_measured_s=t_s,
-        stage=Stage.BOTH,
+        stage=VisibleMarkers.BOTH,
         measured=True,
         tracked=True,
         unseen=0,

@@ -19,7 +19,7 @@ from perchctl.perception.online_calibration import (
     solve_consistency,
 )
 from perchctl.profile import Profile
-from perchctl.vision import Attitude, CameraErrors, CameraModel, MarkerPose, PoseSetup
+from perchctl.vision import CameraErrors, CameraModel, MarkerPose, PoseSetup, VehicleState
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -78,7 +78,7 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
     turned = rotation_from_rpy(*truth.turn_rad) @ SETUP.T_body_cam[:3, :3]
     place_m = SETUP.T_body_cam[:3, 3]
 
-    def estimated(t_s: float) -> Attitude:
+    def estimated(t_s: float) -> VehicleState:
         place, rpy = _flown(t_s, truth, phase)
         k = min(max(t_s / SAMPLE_S, 0.0), count - 1.0)
         low = math.floor(k)
@@ -86,7 +86,7 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
         place[:2] += off[:2]
         place[:2] += np.array(truth.drift_mps) * t_s + truth.jump_m * (t_s > FLIGHT_S / 2)
         rpy[:2] += off[2:] + truth.attitude_rad
-        return Attitude(t_s, *rpy, tuple(place))
+        return VehicleState(t_s, *rpy, tuple(place))
 
     def velocity(t_s: float) -> tuple[float, float, float]:
         way = _flown(t_s + 1e-3, truth, phase)[0] - _flown(t_s - 1e-3, truth, phase)[0]
@@ -144,7 +144,9 @@ def test_each_turn_is_found_about_its_own_axis(axis: int) -> None:
     turn = [0.0, 0.0, 0.0]
     turn[axis] = math.radians(5.0)
     found = _seen(Truth(turn_rad=(turn[0], turn[1], turn[2])))
-    for truth, seen, sigma in zip(turn, found.rotation_rad, found.rotation_sigma_rad, strict=True):
+    for truth, seen, sigma in zip(
+        turn, found.mount_rotation_xyz_rad, found.mount_rotation_sigma_xyz_rad, strict=True
+    ):
         assert abs(seen - truth) < 3.0 * sigma
         assert sigma < math.radians(1.5)
 
@@ -164,8 +166,8 @@ def test_what_is_claimed_is_what_is_so() -> None:
             drift_mps=tuple(rng.normal(0.0, 0.01, 2)),
         )
         found = _seen(truth, seed, told_s=delay_s + rng.uniform(-0.01, 0.01))
-        off = np.array([found.delay_s - delay_s, *(np.array(found.rotation_rad) - turn)])
-        ratios.append((off / [found.delay_sigma_s, *found.rotation_sigma_rad]) ** 2)
+        off = np.array([found.delay_s - delay_s, *(np.array(found.mount_rotation_xyz_rad) - turn)])
+        ratios.append((off / [found.delay_sigma_s, *found.mount_rotation_sigma_xyz_rad]) ** 2)
     mean = np.mean(ratios, axis=0)
     assert ((mean > 0.5) & (mean < 2.0)).all(), mean
 
@@ -173,10 +175,10 @@ def test_what_is_claimed_is_what_is_so() -> None:
 def test_a_vehicle_at_rest_tells_nothing() -> None:
     found = _seen(Truth(delay_s=0.05, turn_rad=(0.1, 0.1, 0.5), rests=True))
     assert found.delay_sigma_s > 0.05
-    assert min(found.rotation_sigma_rad) > math.radians(3.0)
+    assert min(found.mount_rotation_sigma_xyz_rad) > math.radians(3.0)
 
 
 def test_a_world_that_jumps_spoils_nothing() -> None:
     found = _seen(Truth(delay_s=0.02, jump_m=0.3))
     assert found.delay_s == pytest.approx(0.02, abs=0.006)
-    assert abs(found.rotation_rad[2]) < 3.0 * found.rotation_sigma_rad[2]
+    assert abs(found.mount_rotation_xyz_rad[2]) < 3.0 * found.mount_rotation_sigma_xyz_rad[2]

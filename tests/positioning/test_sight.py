@@ -13,7 +13,7 @@ from perchctl.geometry import Place
 from perchctl.positioning import TargetFeed
 from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, body_place, target_place
 from perchctl.vehicle import ExternalPosition
-from perchctl.vision import Attitude, MarkerPose
+from perchctl.vision import MarkerPose, VehicleState
 from tests.helpers.mission import target_at
 from tests.helpers.sights import SETUP, TARGET_ONLY, attitude, seen
 
@@ -43,8 +43,8 @@ def feed(sent: Sent) -> TargetFeed:
 
 
 def shown(
-    it: TargetFeed, at: Attitude, now_s: float, believed: Attitude | None = None,
-    now: Attitude | None = None, pose: MarkerPose | None = None, at_rest: bool = True,
+    it: TargetFeed, at: VehicleState, now_s: float, believed: VehicleState | None = None,
+    now: VehicleState | None = None, pose: MarkerPose | None = None, at_rest: bool = True,
 ) -> None:  # fmt: skip
     """A picture from `at`, which the vehicle's estimate had at `believed`, and has it at `now`."""
     then = believed or at

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, TargetConfig
-from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineState
+from perchctl.vision import MarkerPose, Pipeline, PipelineState, VehicleState
 from perchctl.vision.filter import (
     MEASURED,
     POSITION,
@@ -208,7 +208,7 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float, scale: float) -> Ar
             attitude = None
             if in_world:
                 here = (float(position[0]), float(position[1]), float(position[2]))
-                attitude = Attitude(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
+                attitude = VehicleState(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
             seen = seen_from(T, TARGET_M, k / HZ, rng, scale=scale)
             state, output = step_detections(state, seen, attitude, setup)
             target, pose = output.target, next(iter(output.poses.values()), None)
@@ -270,18 +270,18 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
     """A pose that is solved with roll and pitch off by a little is off by `tilt` times it."""
     setup = build(gear_body_m=(0.01, -0.02, 0.03), kalman=KalmanConfig(attitude_sigma_deg=0.3))
     constants = setup.track_setup.select_filter(in_world)
-    true = Attitude(0.0, *rpy, (0.3, -0.2, 1.0))
-    wrong = Attitude(0.0, rpy[0] + bias_rad[0], rpy[1] + bias_rad[1], rpy[2], true.position_m)
+    true = VehicleState(0.0, *rpy, (0.3, -0.2, 1.0))
+    wrong = VehicleState(0.0, rpy[0] + bias_rad[0], rpy[1] + bias_rad[1], rpy[2], true.position_m)
     in_body = rotation_from_rpy(rpy[0], rpy[1], 0.0).T @ e_m
 
-    def measured(attitude: Attitude) -> tuple[Array, Array]:
+    def measured(attitude: VehicleState) -> tuple[Array, Array]:
         level = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0) @ in_body
         pose = MarkerPose(
             "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
             xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
-        found = track_measurement(pose, attitude, in_world, constants, setup.pose)
-        return found.z, found.constant_error_shifts[:, TILTS]
+        found = track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
+        return found.z, found.shift_per_constant_error[:, TILTS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

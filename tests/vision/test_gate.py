@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import (
-    Attitude,
     MarkerPose,
     Pipeline,
     PipelineOutput,
     PipelineState,
     TargetEstimate,
+    VehicleState,
     estimate,
 )
 from perchctl.vision.filter import Measurement, X, make_filter
@@ -53,7 +53,7 @@ class Watch:
     jumped_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the estimate
     state: PipelineState = field(default_factory=PipelineState)
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(3))
-    attitude: Attitude | None = None  # at the last frame
+    attitude: VehicleState | None = None  # at the last frame
 
     def show(self, frames: int, **what: object) -> list[PipelineOutput]:
         """So many frames of the target, `away_m` from its place and otherwise as
@@ -70,7 +70,7 @@ class Watch:
             if self.in_world:
                 jx, jy, jz = self.jumped_m
                 here = (x + jx, y + jy, z + jz)
-                self.attitude = Attitude(t, 0.02 * np.sin(2 * t), 0.0, yaw, here)
+                self.attitude = VehicleState(t, 0.02 * np.sin(2 * t), 0.0, yaw, here)
             self.state, output = step_detections(self.state, seen, self.attitude, self.setup)
             outputs.append(output)
             self.k += 1
@@ -185,7 +185,7 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
     verdict = judge_pose(lock, None, sight, make_filter(KalmanConfig(), in_world))
     assert verdict.accepted is (x_m == -0.02 and not in_world)
-    assert verdict.is_same_target is verdict.accepted
+    assert verdict.restarts_for_locked_target is verdict.accepted
     again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
     assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).accepted
 

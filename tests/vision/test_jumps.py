@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.vision import MARKERS, Attitude, Pipeline, PipelineState
+from perchctl.vision import MARKERS, Pipeline, PipelineState, VehicleState
 from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import MIN_RIVAL_ONLY_S
 from tests.helpers.seen import seen_from
@@ -104,7 +104,7 @@ def claims(setup: Pipeline, scene: Scene, in_flight: bool) -> list[Claim]:
         roll, yaw = 0.02 * np.sin(2.0 * t_s), 0.1 * np.sin(t_s)
         T = make_T(rotation_from_rpy(roll, 0.0, yaw), camera_m)
         x, y, z = camera_m + estimate_m
-        attitude = Attitude(t_s, roll, 0.0, yaw, (x, y, z)) if in_flight else None
+        attitude = VehicleState(t_s, roll, 0.0, yaw, (x, y, z)) if in_flight else None
         seen = seen_from(T, shown_m, t_s, rng, markers=scene.markers, sigma_px=scene.sigma_px)
         if len(seen.markers) < len(scene.markers) or shown_m[2] - camera_m[2] < NEAREST_M:
             return []

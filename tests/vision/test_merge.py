@@ -36,7 +36,7 @@ def pose(
         e_yaw_rad=0.0,
         sigma_m=np.full(3, sigma_m),
         sigma_yaw_rad=0.01,
-        reprojection_px=0.1,
+        rms_reprojection_px=0.1,
     )
 
 

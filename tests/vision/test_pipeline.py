@@ -32,18 +32,18 @@ from perchctl.profile import (
     TargetConfig,
 )
 from perchctl.vision import (
-    Attitude,
     Frame,
     MarkerPose,
     Pipeline,
     PipelineOutput,
     PipelineState,
     PoseSetup,
+    VehicleState,
     estimate,
     step,
 )
 from perchctl.vision.tracks import expected_corners, update_last_pose
-from perchctl.vision.types import LastPose, Stage
+from perchctl.vision.types import LastPose, VisibleMarkers
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., Pipeline]
@@ -54,7 +54,7 @@ TARGET_YAW = 2.5
 EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
 
 
-def view(attitude: Attitude) -> NDArray[np.uint8]:
+def view(attitude: VehicleState) -> NDArray[np.uint8]:
     """What the mounted camera sees of the target in the world."""
     R = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     T_world_cam = make_T(R, np.array(attitude.position_m)) @ MOUNT.T_body_cam
@@ -62,16 +62,16 @@ def view(attitude: Attitude) -> NDArray[np.uint8]:
     return render(np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel(), T[:3, 3])
 
 
-def true_e(attitude: Attitude) -> tuple[Array, float]:
+def true_e(attitude: VehicleState) -> tuple[Array, float]:
     R = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     gear = np.array(attitude.position_m) + R @ GEAR
     return rot_z(-attitude.yaw_rad) @ (TARGET - gear), wrap_rad(TARGET_YAW - attitude.yaw_rad)
 
 
-def fly(k: int) -> Attitude:
+def fly(k: int) -> VehicleState:
     """A vehicle that drifts, climbs, sways and turns: frame k at 30 Hz."""
     t = k / 30.0
-    return Attitude(
+    return VehicleState(
         t,
         0.05 * math.sin(3 * t),
         0.04 * math.cos(2 * t),
@@ -115,7 +115,7 @@ def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: 
     for k, output in enumerate(outputs):
         e, yaw = true_e(fly(k))
         assert output.target.measured
-        assert output.target.stage is Stage.BOTH
+        assert output.target.stage is VisibleMarkers.BOTH
         assert np.abs(output.target.e_m - e).max() < limit_m
         assert abs(wrap_rad(output.target.e_yaw_rad - yaw)) < limit_rad
         assert np.abs(output.target.world_m - TARGET).max() < limit_m
@@ -138,22 +138,26 @@ def test_while_unseen_the_target_coasts_in_the_world_and_is_then_given_up(
         target = outputs[3 + n].target
         assert not target.measured
         assert target.unseen == n
-        assert target.stage is Stage.NONE
+        assert target.stage is VisibleMarkers.NONE
         e, yaw = true_e(fly(3 + n))  # the vehicle flies on: e follows
         assert np.abs(target.e_m - e).max() < 0.01
         assert abs(wrap_rad(target.e_yaw_rad - yaw)) < 0.02
-        assert outputs[3 + n].stage is Stage.NONE
+        assert outputs[3 + n].stage is VisibleMarkers.NONE
         assert (target.sigma_m > outputs[3].target.sigma_m).all()
     assert all(output.target is None for output in outputs[4 + n_max :])
 
 
 @pytest.mark.parametrize(
     ("seen", "stage"),
-    [(("large",), Stage.LARGE), (("small",), Stage.SMALL), (("large", "small"), Stage.BOTH)],
+    [
+        (("large",), VisibleMarkers.LARGE),
+        (("small",), VisibleMarkers.SMALL),
+        (("large", "small"), VisibleMarkers.BOTH),
+    ],
 )
 @pytest.mark.parametrize("method", ["joint", "weights"])
 def test_any_one_marker_feeds_the_target(
-    build: Build, seen: tuple[str, ...], stage: Stage, method: str
+    build: Build, seen: tuple[str, ...], stage: VisibleMarkers, method: str
 ) -> None:
     setup = build(merge=MergeConfig(method=method))
     image = render(*pose_of(0.01, 0.02, 0.22, 0.2), markers=seen)
@@ -164,16 +168,17 @@ def test_any_one_marker_feeds_the_target(
 
 
 @pytest.mark.parametrize(
-    ("z_m", "stage"), [(0.30, Stage.LARGE), (0.22, Stage.BOTH), (0.17, Stage.SMALL)]
+    ("z_m", "stage"),
+    [(0.30, VisibleMarkers.LARGE), (0.22, VisibleMarkers.BOTH), (0.17, VisibleMarkers.SMALL)],
 )
 @pytest.mark.parametrize("method", ["joint", "weights"])
-def test_stages_by_range(build: Build, z_m: float, stage: Stage, method: str) -> None:
+def test_stages_by_range(build: Build, z_m: float, stage: VisibleMarkers, method: str) -> None:
     merge = MergeConfig(method=method, stages="range", z3_m=0.18)
     # z counts from the camera: the gear above it must not matter
     setup = build(merge=merge, gear_body_m=(0.0, 0.0, 0.05))
     image = render(*pose_of(0.0, 0.0, z_m))
     _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
-    assert output.stage is Stage.BOTH
+    assert output.stage is VisibleMarkers.BOTH
     assert output.target.stage is stage
 
 
@@ -187,9 +192,9 @@ def test_markers_that_contradict_are_counted_and_the_better_is_used(
     for k in range(3):
         image = render(*pose_of(0.0, 0.0, 0.24))
         state, output = step(state, Frame(k, k / 30, image), None, setup)
-        assert output.disagreeing_frames == k + 1
+        assert output.frames_with_contradicting_markers == k + 1
         assert output.target.e_m[2] == pytest.approx(0.24, abs=0.001)
-        assert output.target.stage is Stage.LARGE
+        assert output.target.stage is VisibleMarkers.LARGE
 
 
 @given(
@@ -207,7 +212,7 @@ def test_the_estimate_follows_the_vehicle(
     """The target stays in the world, wherever the vehicle is at the moment of asking."""
     setup, attitude = build(mount=MOUNT, gear_body_m=GEAR), fly(0)
     state, _ = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
-    now = Attitude(attitude.t_s + later_s, *angles, position_m)
+    now = VehicleState(attitude.t_s + later_s, *angles, position_m)
     target = estimate(state, now.t_s, now, setup)
     assert target.world_m is not None
     e_m, e_yaw_rad = true_e(now)
@@ -229,7 +234,7 @@ def test_a_lost_target_is_remembered_in_the_world(build: Build, frame: str) -> N
     target = estimate(state, attitude.t_s + 5.0, attitude, setup)
     assert (target.tracked, target.measured) == (False, False)
     assert target.measured_s == last.t_s
-    assert target.stage is Stage.NONE
+    assert target.stage is VisibleMarkers.NONE
     limit_m = 0.01 if frame == "world" else 0.15  # level: the vehicle's own way while it coasts
     assert np.abs(target.e_m - true_e(attitude)[0]).max() < limit_m
 
@@ -246,7 +251,7 @@ def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(bui
         state, output = step(state, Frame(k, k / 30, EMPTY if k == 0 else hidden), None, setup)
         found.append(output.detections.large is not None)
     assert found == [False, False, False, False, True]
-    assert state.empty_frames == 0
+    assert state.frames_without_markers == 0
 
 
 def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
@@ -254,18 +259,18 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
     sight = LastPose(output.poses["joint"], then)
-    expected, near = expected_corners(sight, now.t_s, now, setup.pose)
+    expected, near = expected_corners(sight, now.t_s, now, setup.pose_setup)
     _, later = step(PipelineState(), Frame(1, now.t_s, view(now)), now, setup)
     for name in ("large", "small"):
         seen = later.detections.get(name)
         assert np.abs(expected[name] - seen.corners_px).max() < 1.0
     assert np.allclose(near.tvec, later.poses["joint"].tvec_m, atol=0.002)
-    corners, unmoved = expected_corners(sight, now.t_s, None, setup.pose)
+    corners, unmoved = expected_corners(sight, now.t_s, None, setup.pose_setup)
     assert corners is None
     assert np.array_equal(unmoved.tvec, sight.pose.tvec_m)
     assert np.array_equal(unmoved.rvec, sight.pose.rvec_rad)
-    assert expected_corners(None, now.t_s, now, setup.pose) == (None, None)
-    assert expected_corners(sight, then.t_s + 5.0, now, setup.pose) == (None, None)
+    assert expected_corners(None, now.t_s, now, setup.pose_setup) == (None, None)
+    assert expected_corners(sight, then.t_s + 5.0, now, setup.pose_setup) == (None, None)
 
 
 # --- Which of the vehicle's two accounts of its way tells where the target goes is learned -----
@@ -288,14 +293,14 @@ class Flight:
         self._place_m, self._speed_mps = place_m, speed_mps
         self.jump_m: Array = np.zeros(3)
 
-    def at(self, t_s: float) -> tuple[Attitude, MarkerPose]:
+    def at(self, t_s: float) -> tuple[VehicleState, MarkerPose]:
         phase = 2.0 * t_s
         true_m = np.array([0.03 * math.sin(phase), 0.02 * math.cos(phase), 1.8])
         speed_mps = np.array([0.06 * math.cos(phase), -0.04 * math.sin(phase), 0.0])
         roll, pitch = 0.04 * math.sin(3.0 * t_s), 0.03 * math.cos(3.0 * t_s)
         x, y, z = true_m + self.jump_m + self._rng.normal(0.0, self._place_m, 3)
         vx, vy, vz = speed_mps + self._rng.normal(0.0, self._speed_mps, 3)
-        attitude = Attitude(t_s, roll, pitch, 0.3, (x, y, z), (vx, vy, vz))
+        attitude = VehicleState(t_s, roll, pitch, 0.3, (x, y, z), (vx, vy, vz))
         R_world_cam = attitude.R_world_body @ SETUP.T_body_cam[:3, :3]
         eye_m = true_m + attitude.R_world_body @ SETUP.T_body_cam[:3, 3]
         rvec = cv2.Rodrigues(R_world_cam.T @ R_MARKER_TARGET)[0].ravel()

@@ -25,12 +25,12 @@ from perchctl.geometry import (
 from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
 from perchctl.sim.renderer import add_analogue_faults
 from perchctl.vision import (
-    Attitude,
     Frame,
     MarkerPose,
     Pipeline,
     PipelineState,
     PoseSetup,
+    VehicleState,
     estimate_pose,
     project,
     square_corners,
@@ -38,7 +38,7 @@ from perchctl.vision import (
 )
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import is_pair_inconsistent
-from perchctl.vision.pose import normal_cam
+from perchctl.vision.pose import target_normal_cam
 from perchctl.vision.target_selection import track_measurement
 from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -94,7 +94,7 @@ def line_errors(corners: Array, noise_px: float, rng: np.random.Generator) -> Ar
 
 
 def posed(
-    detections: list[Detection], attitude: Attitude | None = None, setup: PoseSetup = PLAIN
+    detections: list[Detection], attitude: VehicleState | None = None, setup: PoseSetup = PLAIN
 ) -> MarkerPose:
     pose = estimate_pose(detections, 0.0, attitude, setup)
     assert pose is not None
@@ -117,10 +117,10 @@ def test_the_pose_is_the_one_that_was_shown(values: tuple) -> None:
     rvec, tvec = pose_of(*values)
     for seen in (["large"], ["large", "small"]):
         detections = [marker(name, rvec, tvec) for name in seen]
-        pose = posed(detections, Attitude(0.0, *values[4:], 0.0))
+        pose = posed(detections, VehicleState(0.0, *values[4:], 0.0))
         assert np.allclose(pose.tvec_m, tvec, atol=2e-5)
         assert pose.source == ("joint" if len(seen) == 2 else "large")
-        assert pose.reprojection_px < 0.01
+        assert pose.rms_reprojection_px < 0.01
         R = cv2.Rodrigues(pose.rvec_rad)[0] @ cv2.Rodrigues(rvec)[0].T
         assert math.acos(min(1.0, (np.trace(R) - 1) / 2)) < 2e-3
 
@@ -154,7 +154,7 @@ def test_e_is_the_target_relative_to_the_gear_in_the_level_frame(
     rvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], dtype=float).ravel()
     setup = setup_with(MOUNT, GEAR)
     seen = marker("large", rvec, T_cam_marker[:3, 3])
-    pose = posed([seen], Attitude(0.0, roll, pitch, yaw, position), setup)
+    pose = posed([seen], VehicleState(0.0, roll, pitch, yaw, position), setup)
     gear_world = (T_world_body @ np.array([*GEAR, 1.0]))[:3]
     expected = rot_z(-yaw) @ (target - gear_world)
     assert np.allclose(pose.e_m, expected, atol=1e-4)
@@ -170,9 +170,9 @@ def tilts_deg(attitude: bool, previous: bool, draws: int = 60) -> Array:
     result = []
     for _ in range(draws):
         detection = marker("small", rvec, tvec, 0.1, rng, sigma_px=0.1)
-        known = Attitude(0.0, roll, pitch, 0.0) if attitude else None
+        known = VehicleState(0.0, roll, pitch, 0.0) if attitude else None
         pose = estimate_pose([detection], 0.0, known, PLAIN, true if previous else None)
-        result.append(math.degrees(math.acos(min(1.0, float(normal_cam(pose) @ true)))))
+        result.append(math.degrees(math.acos(min(1.0, float(target_normal_cam(pose) @ true)))))
     return np.array(result)
 
 
@@ -196,7 +196,7 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     for k in range(400):
         values = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.25, 0.6), *rng.uniform(-0.2, 0.2, 3))
         rvec, tvec = pose_of(*values)
-        attitude = Attitude(0.0, float(values[4]), float(values[5]), 0.0)
+        attitude = VehicleState(0.0, float(values[4]), float(values[5]), 0.0)
         noise = 0.02 if k % 2 else 0.06
         detections = [marker(n, rvec, tvec, noise, rng, noise, True) for n in seen]
         pose = posed(detections, attitude)
@@ -270,7 +270,7 @@ def solved(
         if rng is not None:
             px = px + rng.normal(0.0, 0.05, (4, 2))
         detections.append(Detection(name, px, 0.05, False))
-    pose = estimate_pose(detections, 0.0, Attitude(0.0, 0.05, -0.04, 0.3), setup)
+    pose = estimate_pose(detections, 0.0, VehicleState(0.0, 0.05, -0.04, 0.3), setup)
     assert pose is not None
     return pose
 
@@ -336,7 +336,7 @@ def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     assert known.R is not None
     assert told.R is not None
     assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
-    assert np.linalg.norm(told.constant_error_shifts[1:, PRINT]) > 0.02 * 0.3
+    assert np.linalg.norm(told.shift_per_constant_error[1:, PRINT]) > 0.02 * 0.3
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------

@@ -16,16 +16,16 @@ from perchctl.geometry import make_T, rot_z
 from perchctl.profile import Profile
 from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.vision import (
-    Attitude,
     CameraModel,
     Frame,
     Pipeline,
     PipelineOutput,
     PipelineState,
+    VehicleState,
     make_pipeline,
     step,
 )
-from perchctl.vision.target_selection import OwnTargetPosition, marker_offset_m
+from perchctl.vision.target_selection import OwnTargetPosition, marker_to_own_target_m
 from tests.helpers.markers import box
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -80,7 +80,7 @@ class Flight:
         t_s = self.k / self.hz
         T = make_T(rot_z(yaw_rad), position_m)
         image = renderer(self.neighbour).render([T], frame_index=self.k)
-        attitude = Attitude(t_s, 0.0, 0.0, yaw_rad, position_m)
+        attitude = VehicleState(t_s, 0.0, 0.0, yaw_rad, position_m)
         frame = Frame(self.k, t_s, image, t_s)
         self.state, output = step(self.state, frame, attitude, self.pipeline)
         self.k += 1
@@ -195,11 +195,11 @@ def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
 
 def test_a_marker_without_a_pose_yet_is_refused_only_by_a_known_place() -> None:
     """A highlight on a corner spoils what the search finds; the edges still give it."""
-    spoilt, setup = box(320, 240, 120), make_pipeline(profile(), CAMERA).pose
+    spoilt, setup = box(320, 240, 120), make_pipeline(profile(), CAMERA).pose_setup
     spoilt[0] += 60.0, 0.0
-    level = Attitude(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
+    level = VehicleState(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
     anywhere, known = OwnTargetPosition(), OwnTargetPosition((0.0, 0.0), 0.3)
     for place, attitude in ((anywhere, None), (known, None), (anywhere, level)):
-        offset_m = marker_offset_m(place, 0.0, attitude, setup, "large", spoilt)
+        offset_m = marker_to_own_target_m(place, 0.0, attitude, setup, "large", spoilt)
         assert 1e3 < offset_m < math.inf  # behind all that have a pose
-    assert marker_offset_m(known, 0.0, level, setup, "large", spoilt) == math.inf
+    assert marker_to_own_target_m(known, 0.0, level, setup, "large", spoilt) == math.inf

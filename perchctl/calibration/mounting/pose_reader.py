@@ -17,9 +17,9 @@ from perchctl.vision import (
     Frame,
     MarkerPose,
     PipelineOutput,
-    camera_covariance,
     make_camera_only_profile,
     make_pipeline,
+    target_covariance_cam,
 )
 
 
@@ -65,7 +65,7 @@ def _best_pose(output: PipelineOutput, t_s: float) -> TargetPose | None:
     if pose is None or pose.rvec_tvec_cov is None or not np.isfinite(pose.rvec_tvec_cov).all():
         return None
     R = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0], dtype=np.float64)
-    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, camera_covariance(pose))
+    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, target_covariance_cam(pose))
 
 
 def _uncertainty(pose: MarkerPose) -> float:

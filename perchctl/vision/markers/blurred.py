@@ -61,18 +61,18 @@ _PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 def find_expected_blurred(
     picture: Picture,
     expected_corners_px: Mapping[MarkerName, Array],
-    start_blur_index: int | None = None,
+    start_blur_counter: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first marker found near its expected corners (4, 2) px; empty if none is found.
 
-    `start_blur_index` selects the blur with which the fits start: little blur if it is even, much
+    `start_blur_counter` selects the blur with which the fits start: little blur if it is even, much
     blur if it is odd, to save time; None tries both.
     """
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = (
         _START_BLURS_PX
-        if start_blur_index is None
-        else (_START_BLURS_PX[start_blur_index % len(_START_BLURS_PX)],)
+        if start_blur_counter is None
+        else (_START_BLURS_PX[start_blur_counter % len(_START_BLURS_PX)],)
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
@@ -163,19 +163,19 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
 
 
 def _render_template(
-    pattern: Pattern, marker_coordinates: Array, side_px: float
+    pattern: Pattern, sample_points_half_sides: Array, side_px: float
 ) -> NDArray[np.float32]:
     """Return the blurred drawing at the marker's own coordinates (n, n, 2)."""
     n = len(pattern.drawing.cell_whiteness)
-    cell = np.floor((marker_coordinates + 1.0) * 0.5 * n).astype(np.intp)
+    cell = np.floor((sample_points_half_sides + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
     cell = np.clip(cell, 0, n - 1)
     white = np.where(inside, pattern.drawing.cell_whiteness[cell[..., 1], cell[..., 0]], 1.0)
     if pattern.drawing.small_cell_whiteness is not None:
-        white[np.abs(marker_coordinates).max(axis=2) < pattern.drawing.small_to_large_side] = (
-            _CENTRE_GREY
-        )
-    white[np.abs(marker_coordinates).max(axis=2) > _PAPER_REACH_HALF_SIDES] = _OUTSIDE_GREY
+        white[
+            np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side
+        ] = _CENTRE_GREY
+    white[np.abs(sample_points_half_sides).max(axis=2) > _PAPER_REACH_HALF_SIDES] = _OUTSIDE_GREY
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
@@ -198,34 +198,37 @@ _MIN_SHORTEST_TO_LONGEST_SIDE = 0.6  # ratio of the shortest side to the longest
 def align_marker(
     picture: Picture,
     name: MarkerName,
-    start_px: Array,
-    max_motion_sides: float = 0.6,
+    start_corners_px: Array,
+    max_motion_from_start_sides: float = 0.6,
     blur_px: float = 1.5,
     max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
-    must_be_distinctive: bool = True,
+    needs_distinctive_bits: bool = True,
 ) -> RefinedCorners | None:
     """Fit a marker's drawing to the picture and return its corners; None unless the picture matches
     the drawing.
 
-    `max_motion_sides` is the largest distance of the corners from `start_px`, and
-    `max_corner_sigma_sides` their largest standard deviation, both in side lengths; `blur_px` is a
-    first guess. If `must_be_distinctive`, the picture must also exclude every other codeword; this
-    is not necessary if the other marker identifies this one.
-    """
-    side_px = mean_side_px(start_px)
+    `max_motion_from_start_sides` is the largest distance of the corners from `start_corners_px`,
+    and `max_corner_sigma_sides` their largest standard deviation, both in side lengths; `blur_px`
+    is a first guess. If `needs_distinctive_bits`, the picture must also exclude every other
+    codeword; this is not necessary if the other marker identifies this one."""
+    side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
         return None
     image, drawing = picture.image, picture.setup.patterns[name].drawing
-    alignment = align_drawing(image, start_px, drawing, picture.camera, blur_px)
+    alignment = align_drawing(image, start_corners_px, drawing, picture.camera, blur_px)
     if (
         alignment is None
         or not has_matching_drawing(alignment, max_corner_sigma_sides)
-        or (must_be_distinctive and not has_distinctive_bits(alignment))
-        or alignment.motion_from_start_px > max(max_motion_sides * side_px, _MIN_MOTION_LIMIT_PX)
+        or (needs_distinctive_bits and not has_distinctive_bits(alignment))
+        or alignment.motion_from_start_px
+        > max(max_motion_from_start_sides * side_px, _MIN_MOTION_LIMIT_PX)
     ):
         return None
     # The square must remain a square of about the same size and orientation.
-    sides_px, areas = side_lengths_px(alignment.corners_px), [alignment.corners_px, start_px]
+    sides_px, areas = (
+        side_lengths_px(alignment.corners_px),
+        [alignment.corners_px, start_corners_px],
+    )
     if (
         sides_px.min() < _MIN_SHORTEST_TO_LONGEST_SIDE * sides_px.max()
         or not _MIN_SIZE_RATIO < float(sides_px.mean()) / side_px < _MAX_SIZE_RATIO

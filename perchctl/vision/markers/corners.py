@@ -56,21 +56,21 @@ def apply_homography(H: Array, points: Array) -> Array:
 
 def projected_corners_jacobian(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
-    respect to the `increment` of `increment_homography`."""
+    respect to the `homography_increment` of `increment_homography`."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
     return np.asarray((A @ _INCREMENT_JACOBIANS).reshape(8, 8))
 
 
-def increment_homography(H: Array, increment: Array) -> Array:
-    """Return H (I + P), scaled so that its last element is 1. `increment` (8,) contains the first
-    eight elements of P (3, 3), row by row; the last one is 0."""
+def increment_homography(H: Array, homography_increment: Array) -> Array:
+    """Return H (I + P), scaled so that its last element is 1. `homography_increment` (8,) contains
+    the first eight elements of P (3, 3), row by row; the last one is 0."""
     H = H @ np.array(
         [
-            [1 + increment[0], increment[1], increment[2]],
-            [increment[3], 1 + increment[4], increment[5]],
-            [increment[6], increment[7], 1.0],
+            [1 + homography_increment[0], homography_increment[1], homography_increment[2]],
+            [homography_increment[3], 1 + homography_increment[4], homography_increment[5]],
+            [homography_increment[6], homography_increment[7], 1.0],
         ]
     )
     return np.asarray(H / H[2, 2])
@@ -102,26 +102,29 @@ def is_inside_picture(corners_px: Array, shape: tuple[int, ...], margin_px: floa
     return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())
 
 
-def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
-    without a camera, lens distortion is ignored."""
+def scale_square(
+    corners_px: Array, scaled_to_given_side: float, camera: CameraModel | None = None
+) -> Array:
+    """Return the corners (4, 2) of the square scaled by `scaled_to_given_side` about its centre, in
+    its plane; without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
-        homography_from_centred_square(straight), (_CENTRED_SQUARE_F32 * ratio).astype(np.float64)
+        homography_from_centred_square(straight),
+        (_CENTRED_SQUARE_F32 * scaled_to_given_side).astype(np.float64),
     )
     return found if camera is None else distort_to_px(found, camera)
 
 
 def add_missing_marker(
-    expected_corners_px: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+    expected_corners_px: Mapping[MarkerName, Array], small_to_large_side: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
     """Return both markers' corners; a missing marker follows from the other one and their
-    `ratio`."""
+    `small_to_large_side`."""
     both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
-        both["small"] = scale_square(both["large"], ratio, camera)
+        both["small"] = scale_square(both["large"], small_to_large_side, camera)
     elif "large" not in both and "small" in both:
-        both["large"] = scale_square(both["small"], 1.0 / ratio, camera)
+        both["large"] = scale_square(both["small"], 1.0 / small_to_large_side, camera)
     return both
 
 
@@ -147,30 +150,32 @@ class RefinedCorners:
 
     corners_px: Array
     sigma_px: float
-    refined: bool
-    edge_shift_sigma_px: float = 0.0
+    is_fitted: bool
+    remaining_edge_shift_sigma_px: float = 0.0
     blur_px: float = 0.0
-    edge_shift: EdgeShift | None = None
+    corrected_edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = 0.0
     sharpest_side_blur_px: float = math.inf
 
 
-def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells_per_side: int) -> RefinedCorners:
+def refine_subpix(
+    image: NDArray[np.uint8], raw_corners_px: Array, cells_per_side: int
+) -> RefinedCorners:
     """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep the raw corners if one leaves its
     window.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
     extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,
-    so that the target seems too far away. The result's `refined` is therefore False.
+    so that the target seems too far away. The result's `is_fitted` is therefore False.
     """
-    side_px = float(side_lengths_px(raw_px).min())
+    side_px = float(side_lengths_px(raw_corners_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))
-    points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)
+    points = np.ascontiguousarray(raw_corners_px, dtype=np.float32).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
     cv2.cornerSubPix(image, points, (half, half), (-1, -1), criteria)
     moved = points.reshape(4, 2).astype(np.float64)
-    moved_px = np.linalg.norm(moved - raw_px, axis=1).max()
+    moved_px = np.linalg.norm(moved - raw_corners_px, axis=1).max()
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
-        return RefinedCorners(raw_px, DETECTOR_CORNER_SIGMA_PX, False)
+        return RefinedCorners(raw_corners_px, DETECTOR_CORNER_SIGMA_PX, False)
     return RefinedCorners(moved, SUBPIX_CORNER_SIGMA_PX, False)

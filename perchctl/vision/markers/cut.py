@@ -41,7 +41,12 @@ from perchctl.vision.markers.corners import (
     apply_homography,
     is_inside_picture,
 )
-from perchctl.vision.markers.detector import HiddenMask, Picture, is_hidden, make_detector_setup
+from perchctl.vision.markers.detector import (
+    HiddenMask,
+    Picture,
+    is_any_part_hidden,
+    make_detector_setup,
+)
 from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS, sample_profiles
 from perchctl.vision.markers.pattern import Drawing, Pattern, render_cells
 from perchctl.vision.markers.photometric_fit import fit_correlation, make_grid
@@ -50,11 +55,13 @@ from perchctl.vision.types import CameraModel, MarkerName
 MAX_CUT_FIT_AGE_S = 0.5
 """Largest time since the target was last measured, s; after it, a visible part of the target is no
 evidence."""
-_MAX_EDGE_DISTANCE_PX = 40  # from the edge of the picture, where a marker may just have been cut
+_MAX_CORNER_TO_PICTURE_EDGE_PX = (
+    40  # from the edge of the picture, where a marker may just have been cut
+)
 # cell of the small marker; if it is smaller, the large marker is in view
 _MIN_SMALL_CELL_PX = 8.0
-_MIN_OVERVIEW_CORRELATION = 0.6  # correlation required at the moved prediction
-_SUFFICIENT_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
+_MIN_COARSE_CORRELATION = 0.6  # correlation required at the moved prediction
+_SUFFICIENT_COARSE_CORRELATION = 0.95  # correlation at which no other size is tried
 _SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_CUT_GAIN = 0.9, 20.0
 _MIN_FOUND_POINT_FRACTION = 0.75  # share of the edge points in view
@@ -62,7 +69,9 @@ _MAX_CUT_RESIDUAL_PX = 1.2
 _MAX_CENTRE_SIGMA_HALF_SIDES = 0.04  # of the centre, in half sides
 _MIN_CORNER_SIGMA_PX = 0.02
 _MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
-_MAX_LENS_INVERSION_ERROR = 1e-3  # normalised; the lens model is valid where its inverse exists
+_MAX_LENS_INVERSION_ERROR_NORMALISED = (
+    1e-3  # normalised; the lens model is valid where its inverse exists
+)
 # rotation from a marker's own coordinates to its axes
 _R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 
@@ -75,16 +84,16 @@ def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: Camer
 def is_target_cut(
     expected_corners_px: Mapping[MarkerName, Array],
     shape: tuple[int, ...],
-    hidden: HiddenMask | None = None,
+    hidden_mask: HiddenMask | None = None,
 ) -> bool:
     """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden by the
     vehicle's gear."""
     whole = [
         corners
         for corners in expected_corners_px.values()
-        if is_inside_picture(corners, shape, _MAX_EDGE_DISTANCE_PX)
+        if is_inside_picture(corners, shape, _MAX_CORNER_TO_PICTURE_EDGE_PX)
     ]
-    return bool(expected_corners_px) and all(is_hidden(hidden, c) for c in whole)
+    return bool(expected_corners_px) and all(is_any_part_hidden(hidden_mask, c) for c in whole)
 
 
 def can_whole_marker_be_in_view(
@@ -92,7 +101,7 @@ def can_whole_marker_be_in_view(
 ) -> bool:
     """True if at least one expected marker (4, 2) px may be completely in the picture."""
     return any(
-        is_inside_picture(corners, shape, -_MAX_EDGE_DISTANCE_PX)
+        is_inside_picture(corners, shape, -_MAX_CORNER_TO_PICTURE_EDGE_PX)
         for corners in expected_corners_px.values()
     )
 
@@ -104,44 +113,47 @@ def fit_cut_markers(
     fails. `expected_corners_px` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
-    ratio, centre = drawing.small_to_large_side, drawing.small_cell_whiteness
-    start = _initial_pose(expected_corners_px, ratio, camera)
+    small_to_large_side, centre = drawing.small_to_large_side, drawing.small_cell_whiteness
+    start = _initial_pose(expected_corners_px, small_to_large_side, camera)
     if start is None or centre is None:
         return {}
-    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t_cam_half_sides[2] < _MIN_SMALL_CELL_PX:
+    if (
+        2.0 * small_to_large_side / len(centre) * camera.K[0, 0] / start.t_cam_drawing_half_sides[2]
+        < _MIN_SMALL_CELL_PX
+    ):
         return {}
-    covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
-    overview, texture = make_overview(image, camera, covered), make_texture(drawing)
-    near = _search_near_pose(start, texture, overview)
+    covered = None if picture.hidden_mask is None else picture.hidden_mask.astype(np.uint8)
+    coarse_picture, texture = make_coarse_picture(image, camera, covered), make_texture(drawing)
+    near = _search_near_pose(start, texture, coarse_picture)
     if near is None:
         return {}
-    found = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
-    if found is None or not _is_reliable(found):
+    pose_fit = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
+    if pose_fit is None or not _is_reliable(pose_fit):
         return {}
-    like, gain = correlate_drawing(found.pose.H, texture, overview)
+    like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_picture)
     if like < _MIN_CORRELATION or gain < _MIN_CUT_GAIN:
         return {}
-    name = _select_measured_marker(found)
-    corners = _marker_corners(found, ratio if name == "small" else 1.0, camera)
+    name = _select_measured_marker(pose_fit)
+    corners = _marker_corners(pose_fit, small_to_large_side if name == "small" else 1.0, camera)
     return {} if corners is None else {name: corners}
 
 
 def shows_enough_of_target(
-    R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
+    R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
     """True if the visible part of the target suffices for a measurement, for a large marker with
     the rotation (3, 3) and centre (3,) in the camera frame."""
     patterns = _make_patterns(target)
-    pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, position_m / (target.large.side_m / 2.0))
-    found = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
-    if found is None or not _is_reliable(found):
+    pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
+    pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
+    if pose_fit is None or not _is_reliable(pose_fit):
         return False
-    half_side = (
+    side_to_large_side = (
         patterns["large"].drawing.small_to_large_side
-        if _select_measured_marker(found) == "small"
+        if _select_measured_marker(pose_fit) == "small"
         else 1.0
     )
-    return _marker_corners(found, half_side, camera) is not None
+    return _marker_corners(pose_fit, side_to_large_side, camera) is not None
 
 
 @lru_cache(maxsize=4)
@@ -158,21 +170,21 @@ def _make_target_outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
     )
 
 
-def _select_measured_marker(found: PoseFit) -> MarkerName:
+def _select_measured_marker(pose_fit: PoseFit) -> MarkerName:
     """Return the marker that was measured: the small one if enough of it was visible."""
-    return "small" if found.small_marker_points >= _MIN_SMALL_MARKER_POINTS else "large"
+    return "small" if pose_fit.small_marker_point_count >= _MIN_SMALL_MARKER_POINTS else "large"
 
 
 def _initial_pose(
-    expected_corners_px: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+    expected_corners_px: Mapping[MarkerName, Array], small_to_large_side: float, camera: CameraModel
 ) -> RigidPose | None:
     name: MarkerName = "small" if "small" in expected_corners_px else "large"
     rays = undistort_to_normalised(expected_corners_px[name], camera)
     if not np.isfinite(rays).all():
         return None
-    half_side = ratio if name == "small" else 1.0
+    side_to_large_side = small_to_large_side if name == "small" else 1.0
     H = cv2.getPerspectiveTransform(
-        (half_side * CENTRED_SQUARE).astype(np.float32), rays.astype(np.float32)
+        (side_to_large_side * CENTRED_SQUARE).astype(np.float32), rays.astype(np.float32)
     )
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
@@ -184,17 +196,20 @@ def _initial_pose(
 
 
 def _search_near_pose(
-    start: RigidPose, texture: DrawingTexture, overview: UndistortedOverview
+    start: RigidPose, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
 ) -> RigidPose | None:
     """Return the prediction moved to its best match in the picture; None without a match."""
-    best, pose, lattice = _MIN_OVERVIEW_CORRELATION, None, overview.lattice
+    best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_picture.lattice
     for growth in _SCALE_CANDIDATES:
-        t = start.t_cam_half_sides * (1.0, 1.0, 1.0 / growth)
+        t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
         wide = render_drawing(
-            RigidPose(start.R_cam_drawing, t).H, texture, lattice, _SEARCH_RANGE_NODES
+            RigidPose(start.R_cam_drawing, t).H_normalised_drawing,
+            texture,
+            lattice,
+            _SEARCH_RANGE_NODES,
         )
-        mask = overview.is_visible.astype(np.float32)
-        score = cv2.matchTemplate(wide, overview.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+        mask = coarse_picture.is_visible.astype(np.float32)
+        score = cv2.matchTemplate(wide, coarse_picture.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         drift = (
@@ -203,25 +218,32 @@ def _search_near_pose(
         if score[row, column] > best:
             best = float(score[row, column])
             pose = RigidPose(start.R_cam_drawing, t + np.append(drift * t[2], 0.0))
-        if best > _SUFFICIENT_OVERVIEW_CORRELATION:
+        if best > _SUFFICIENT_COARSE_CORRELATION:
             break
     return pose
 
 
-def _is_reliable(found: PoseFit) -> bool:
+def _is_reliable(pose_fit: PoseFit) -> bool:
     """True if nearly all edges were found and determine the position."""
-    spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
+    spread = math.sqrt(
+        max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
+    )
     return (
-        found.points_found >= _MIN_FOUND_POINT_FRACTION * found.points_in_view
-        and found.residual_px < _MAX_CUT_RESIDUAL_PX
+        pose_fit.found_point_count >= _MIN_FOUND_POINT_FRACTION * pose_fit.visible_point_count
+        and pose_fit.residual_px < _MAX_CUT_RESIDUAL_PX
         and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
     )
 
 
-def _marker_corners(found: PoseFit, half_side: float, camera: CameraModel) -> RefinedCorners | None:
+def _marker_corners(
+    pose_fit: PoseFit, side_to_large_side: float, camera: CameraModel
+) -> RefinedCorners | None:
     """Return the corners of the marker with this half side; None outside the lens model."""
-    r = np.column_stack([half_side * CENTRED_SQUARE, np.zeros(4)]) @ found.pose.R_cam_drawing.T
-    X = r + found.pose.t_cam_half_sides
+    r = (
+        np.column_stack([side_to_large_side * CENTRED_SQUARE, np.zeros(4)])
+        @ pose_fit.pose.R_cam_drawing.T
+    )
+    X = r + pose_fit.pose.t_cam_drawing_half_sides
     if X[:, 2].min() <= 0.0:
         return None  # one corner is next to or behind the camera
     x = X[:, :2] / X[:, 2:]
@@ -234,10 +256,10 @@ def _marker_corners(found: PoseFit, half_side: float, camera: CameraModel) -> Re
     corners_px = distort_to_px(x, camera)
     if (
         not np.abs(undistort_to_normalised(corners_px, camera) - x).max()
-        < _MAX_LENS_INVERSION_ERROR
+        < _MAX_LENS_INVERSION_ERROR_NORMALISED
     ):
         return None
-    cov_px2 = J @ found.cov @ J.T + _MIN_CORNER_SIGMA_PX**2 * np.eye(8)
+    cov_px2 = J @ pose_fit.rotation_translation_cov @ J.T + _MIN_CORNER_SIGMA_PX**2 * np.eye(8)
     sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
@@ -257,7 +279,7 @@ _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
 
 @dataclass(frozen=True, eq=False)
-class OverviewLattice:
+class CoarseLattice:
     """A regular grid of nodes in normalised image coordinates, at which pictures are sampled
     without lens distortion.
 
@@ -281,17 +303,17 @@ class OverviewLattice:
 
 
 @dataclass(frozen=True, eq=False)
-class UndistortedOverview:
+class CoarseUndistortedPicture:
     """A reduced picture without lens distortion: grey values (rows, columns) at the nodes of a
     lattice. `is_visible` is True for nodes in the picture that the vehicle does not cover."""
 
-    lattice: OverviewLattice
+    lattice: CoarseLattice
     grey: FloatImage
     is_visible: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=8)
-def make_lattice(camera: CameraModel) -> OverviewLattice:
+def make_lattice(camera: CameraModel) -> CoarseLattice:
     """Return the lattice over a camera's picture."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _POINTS_PER_PICTURE_SIDE)
@@ -319,7 +341,7 @@ def make_lattice(camera: CameraModel) -> OverviewLattice:
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
     shape = (int(nodes[1]), _SAMPLES_PER_NODE, int(nodes[0]), _SAMPLES_PER_NODE)
     flat = x.shape
-    return OverviewLattice(
+    return CoarseLattice(
         first_node_normalised=rays.min(axis=0) + step / 2.0,
         node_spacing_normalised=step,
         valid_radius_normalised=reach,
@@ -330,22 +352,20 @@ def make_lattice(camera: CameraModel) -> OverviewLattice:
     )
 
 
-def make_overview(
-    image: NDArray[np.uint8], camera: CameraModel, hidden_mask: NDArray[np.uint8] | None = None
-) -> UndistortedOverview:
+def make_coarse_picture(
+    image: NDArray[np.uint8], camera: CameraModel, hidden_mask_u8: NDArray[np.uint8] | None = None
+) -> CoarseUndistortedPicture:
     """Return the picture without lens distortion, reduced to the nodes of the camera's lattice.
-    Nodes where `hidden_mask` (h, w) is not zero are marked as not visible."""
+    Nodes where `hidden_mask_u8` (h, w) is not zero are marked as not visible."""
     lattice = make_lattice(camera)
     seen = lattice.is_in_picture
-    if hidden_mask is not None:
-        covered = (hidden_mask != 0).astype(np.float32)
+    if hidden_mask_u8 is not None:
+        covered = (hidden_mask_u8 != 0).astype(np.float32)
         seen = seen & (_sample_at_nodes(covered, lattice) < 1e-3)
-    return UndistortedOverview(lattice, _sample_at_nodes(image, lattice), seen)
+    return CoarseUndistortedPicture(lattice, _sample_at_nodes(image, lattice), seen)
 
 
-def _sample_at_nodes(
-    picture: NDArray[np.uint8] | FloatImage, lattice: OverviewLattice
-) -> FloatImage:
+def _sample_at_nodes(picture: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice) -> FloatImage:
     small = cv2.resize(picture, lattice.reduced_size_px, interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
@@ -359,7 +379,7 @@ def _downsample(fine: FloatImage) -> FloatImage:
 
 
 def render_drawing(
-    H: Array, texture: DrawingTexture, lattice: OverviewLattice, margin_nodes: int = 0
+    H: Array, texture: DrawingTexture, lattice: CoarseLattice, margin_nodes: int = 0
 ) -> FloatImage:
     """Return the whiteness, 0 to 1, of the drawing projected by H (3, 3), at the lattice's nodes
     and at `margin_nodes` more nodes on each side."""
@@ -399,12 +419,12 @@ class DrawingMatch(NamedTuple):
 
 
 def correlate_drawing(
-    H: Array, texture: DrawingTexture, overview: UndistortedOverview
+    H: Array, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
 ) -> DrawingMatch:
     """Compare the overview with the drawing projected by H (3, 3), under the light that fits
     best."""
-    lattice = overview.lattice
-    rows, columns = np.nonzero(overview.is_visible)
+    lattice = coarse_picture.lattice
+    rows, columns = np.nonzero(coarse_picture.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
         [columns, rows], axis=1
     ).astype(np.float64)
@@ -415,7 +435,7 @@ def correlate_drawing(
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return DrawingMatch(0.0, 0.0)
     white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
-    grey = overview.grey[rows[on], columns[on]].astype(np.float64)
+    grey = coarse_picture.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
@@ -438,14 +458,14 @@ class Outline:
     """Points along the edges of the target's drawing, in half sides of the large marker.
 
     Attributes:
-        points, normal: points (n, 2), and unit normals (n, 2) from black to white.
+        points_half_sides, normal: points (n, 2), and unit normals (n, 2) from black to white.
         line_index: index (n,) of the straight line that contains the point.
         print_sigma_half_sides: standard deviation (n,) of that line's print error.
         cell_width_half_sides: width (n,) of the adjacent cell.
         is_small_marker: True for edges of the small marker, (n,).
     """
 
-    points: Array
+    points_half_sides: Array
     normal: Array
     line_index: NDArray[np.intp]
     print_sigma_half_sides: Array
@@ -471,7 +491,7 @@ def make_outline(
     edges = [
         edge
         for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
-        if np.abs(edge.points).max(axis=1).min() > hidden
+        if np.abs(edge.points_half_sides).max(axis=1).min() > hidden
     ]
     large = len(edges)
     if drawing.small_cell_whiteness is not None:
@@ -484,7 +504,7 @@ def make_outline(
     cell = np.repeat(cells, points_per_edge)
     small = np.repeat(np.arange(len(edges)) >= large, points_per_edge)
     return Outline(
-        points=np.concatenate(at),
+        points_half_sides=np.concatenate(at),
         normal=np.repeat(normals, points_per_edge, axis=0),
         line_index=np.repeat([numbers[name] for name in names], points_per_edge),
         print_sigma_half_sides=np.where(
@@ -512,18 +532,18 @@ class _CellEdge(NamedTuple):
     """An edge between a black and a white cell: points (n, 2), unit normal from black to white, a
     key that is equal for edges on one straight line, and the width of the cell."""
 
-    points: Array
+    points_half_sides: Array
     normal: tuple[float, float]
     line_key: tuple[float, int, int]
     cell_width_half_sides: float
 
 
 def _iterate_cell_edges(
-    cells: Array, half_side: float, points_per_edge: int
+    cell_whiteness: Array, side_to_large_side: float, points_per_edge: int
 ) -> Iterator[_CellEdge]:
-    """Yield each edge between a black and a white cell of a marker with half the side `half_side`,
-    sampled at `points_per_edge` points."""
-    width = 2.0 * half_side / len(cells)
+    """Yield each edge between a black and a white cell of a marker with half the side
+    `side_to_large_side`, sampled at `points_per_edge` points."""
+    width = 2.0 * side_to_large_side / len(cell_whiteness)
     s = (
         _EDGE_END_MARGIN_CELLS
         + (1.0 - 2.0 * _EDGE_END_MARGIN_CELLS)
@@ -531,16 +551,16 @@ def _iterate_cell_edges(
         / points_per_edge
     )
     for across in (0, 1):
-        rows = cells if across == 0 else cells.T
+        rows = cell_whiteness if across == 0 else cell_whiteness.T
         padded = np.pad(rows, 1, constant_values=1.0)[1:-1]
         step = padded[:, 1:] - padded[:, :-1]
         for i, j in np.argwhere(step != 0.0).tolist():
             at = np.empty((points_per_edge, 2))
-            at[:, across] = width * j - half_side
-            at[:, 1 - across] = width * (i + s) - half_side
+            at[:, across] = width * j - side_to_large_side
+            at[:, 1 - across] = width * (i + s) - side_to_large_side
             towards = float(np.sign(step[i, j]))
             normal = (towards, 0.0) if across == 0 else (0.0, towards)
-            yield _CellEdge(at, normal, (half_side, across, j), width)
+            yield _CellEdge(at, normal, (side_to_large_side, across, j), width)
 
 
 # --- Pose of the target from the edges in view ---
@@ -552,7 +572,7 @@ def _iterate_cell_edges(
 
 # Half lengths of the profiles per round. An ascent blurs edges near the picture's border by several
 # pixels.
-_PROFILE_HALF_LENGTHS_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
+_PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
 # below the first, no further round; above the second, the fit has failed
 _CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
@@ -585,16 +605,16 @@ _PREDICTION_INFORMATION: Array = (
 @dataclass(frozen=True, eq=False)
 class RigidPose:
     """Pose of the drawing in the camera frame: rotation `R_cam_drawing` (3, 3), and translation
-    `t_cam_half_sides` (3,) in half sides of the large marker."""
+    `t_cam_drawing_half_sides` (3,) in half sides of the large marker."""
 
     R_cam_drawing: Array
-    t_cam_half_sides: Array
+    t_cam_drawing_half_sides: Array
 
     @property
-    def H(self) -> Array:
+    def H_normalised_drawing(self) -> Array:
         """Homography (3, 3) from the drawing's coordinates to normalised image coordinates."""
         return np.column_stack(
-            [self.R_cam_drawing[:, 0], self.R_cam_drawing[:, 1], self.t_cam_half_sides]
+            [self.R_cam_drawing[:, 0], self.R_cam_drawing[:, 1], self.t_cam_drawing_half_sides]
         )
 
 
@@ -604,18 +624,18 @@ class PoseFit:
 
     Attributes:
         pose: the pose of the drawing.
-        cov: covariance (6, 6) of rotation (rad) and translation (half sides).
-        points_in_view: number of edge points in the picture.
-        points_found: number of these points at which an edge was found.
-        small_marker_points: number of found points on the small marker.
+        rotation_translation_cov: covariance (6, 6) of rotation (rad) and translation (half sides).
+        visible_point_count: number of edge points in the picture.
+        found_point_count: number of these points at which an edge was found.
+        small_marker_point_count: number of found points on the small marker.
         residual_px: RMS distance of the found edges from the drawing's.
     """
 
     pose: RigidPose
-    cov: Array
-    points_in_view: int
-    points_found: int
-    small_marker_points: int
+    rotation_translation_cov: Array
+    visible_point_count: int
+    found_point_count: int
+    small_marker_point_count: int
     residual_px: float
 
 
@@ -624,14 +644,14 @@ class _EdgePoints:
     """Edge points of an outline that are in the picture.
 
     Attributes:
-        points, normal: points (n, 2) px, and unit normals (n, 2) from black to white.
+        points_px, normal: points (n, 2) px, and unit normals (n, 2) from black to white.
         J: derivative (n, 7) of each point's motion along its normal with respect to rotation (rad),
             translation (half sides) and the shift of all edges (px, white over black).
         px_per_half_side: scale (n,) across the edge.
         outline_index: index (n,) of the point in the outline.
     """
 
-    points: Array
+    points_px: Array
     normal: Array
     J: Array
     px_per_half_side: Array
@@ -642,7 +662,7 @@ class _FitStep(NamedTuple):
     """A Gauss-Newton step of the seven unknowns (7,), the inverse of their normal matrix (7, 7),
     the weights of the points (n,), and the variance of one point."""
 
-    step: Array
+    pose_and_shift_change: Array
     inverse_normal_matrix: Array
     weight: Array
     variance_px2: float
@@ -653,13 +673,13 @@ def fit_pose(
     start: RigidPose,
     outline: Outline,
     camera: CameraModel,
-    hidden_mask: NDArray[np.uint8] | None = None,
+    hidden_mask_u8: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
     """Fit the pose in which the drawing's edges match the picture's; None if the fit fails."""
-    pose, change_from_start, found, moved_px = start, np.zeros(7), None, math.inf
-    for profile_reach_px in _PROFILE_HALF_LENGTHS_PX:
+    pose, pose_and_shift_change_from_start, fit_step, moved_px = start, np.zeros(7), None, math.inf
+    for profile_reach_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
         edge_points = _edge_points_in_view(
-            pose, outline, profile_reach_px, image.shape, camera, hidden_mask
+            pose, outline, profile_reach_px, image.shape, camera, hidden_mask_u8
         )
         if len(edge_points.outline_index) < _MIN_EDGE_POINTS:
             return None
@@ -669,37 +689,41 @@ def fit_pose(
             * edge_points.px_per_half_side
         )
         profile_half_lengths_px = np.minimum(profile_reach_px, reach_cells_px)
-        offset_px, is_edge_found = _measure_offsets(image, edge_points, profile_half_lengths_px)
+        edge_from_expected_px, is_edge_found = _measure_offsets(
+            image, edge_points, profile_half_lengths_px
+        )
         if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
             return None
-        found = _solve_step(edge_points, offset_px, is_edge_found, change_from_start)
-        if found is None:
+        fit_step = _solve_step(
+            edge_points, edge_from_expected_px, is_edge_found, pose_and_shift_change_from_start
+        )
+        if fit_step is None:
             return None
-        step = found.step[:6]
+        step = fit_step.pose_and_shift_change[:6]
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
-        pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_half_sides + step[3:])
-        change_from_start[:6] += step
+        pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_drawing_half_sides + step[3:])
+        pose_and_shift_change_from_start[:6] += step
         moved_px = float(np.abs(edge_points.J[:, :6] @ step).max())
         if moved_px < _CONVERGED_FIT_PX:
             break
-    if found is None or not (
-        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t_cam_half_sides[2] > 0.0
+    if fit_step is None or not (
+        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t_cam_drawing_half_sides[2] > 0.0
     ):  # also for NaN
         return None
-    return _make_pose_fit(pose, found, edge_points, outline)
+    return _make_pose_fit(pose, fit_step, edge_points, outline)
 
 
 def predict_fit_accuracy(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
     """Return the result that `fit_pose` would have for a perfect picture taken at that pose; None
     if too little of the target is visible."""
     edge_points = _edge_points_in_view(
-        pose, outline, _PROFILE_HALF_LENGTHS_PX[0], camera.size_px[::-1], camera, None
+        pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )
     n = len(edge_points.outline_index)
     if n < _MIN_EDGE_POINTS:
         return None
-    found = _solve_step(edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
-    return None if found is None else _make_pose_fit(pose, found, edge_points, outline)
+    fit_step = _solve_step(edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    return None if fit_step is None else _make_pose_fit(pose, fit_step, edge_points, outline)
 
 
 def _edge_points_in_view(
@@ -708,12 +732,13 @@ def _edge_points_in_view(
     profile_reach_px: float,
     shape: tuple[int, ...],
     camera: CameraModel,
-    hidden_mask: NDArray[np.uint8] | None,
+    hidden_mask_u8: NDArray[np.uint8] | None,
 ) -> _EdgePoints:
     h, w = shape[:2]
     X = (
-        np.column_stack([outline.points, np.zeros(len(outline.points))]) @ pose.R_cam_drawing.T
-        + pose.t_cam_half_sides
+        np.column_stack([outline.points_half_sides, np.zeros(len(outline.points_half_sides))])
+        @ pose.R_cam_drawing.T
+        + pose.t_cam_drawing_half_sides
     )
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
@@ -747,12 +772,12 @@ def _edge_points_in_view(
     px = (normal * towards).sum(axis=1)
     normal *= np.sign(px)[:, None]
     move = np.einsum("ni,nij->nj", normal, A)
-    turn = np.cross(X - pose.t_cam_half_sides, move)  # (w x r) . m = w . (r x m)
+    turn = np.cross(X - pose.t_cam_drawing_half_sides, move)  # (w x r) . m = w . (r x m)
     free = np.ones(len(near), dtype=np.bool_)
-    if hidden_mask is not None:
+    if hidden_mask_u8 is not None:
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
             x_px, y_px = np.rint(at + fraction * profile_reach_px * normal).astype(np.intp).T
-            free &= hidden_mask[y_px, x_px] == 0
+            free &= hidden_mask_u8[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
     return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
@@ -765,7 +790,7 @@ def _measure_offsets(
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
     grey = sample_profiles(
         image,
-        edge_points.points[:, None],
+        edge_points.points_px[:, None],
         edge_points.normal[:, None],
         profile_half_lengths_px,
     )[:, 0]
@@ -776,22 +801,25 @@ def _measure_offsets(
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
     least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
     is_edge_found = (contrast > least) & (total > 0.25 * least)
-    offset_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
-    return np.clip(offset_px, -profile_half_lengths_px, profile_half_lengths_px), is_edge_found
+    edge_from_expected_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
+    return np.clip(
+        edge_from_expected_px, -profile_half_lengths_px, profile_half_lengths_px
+    ), is_edge_found
 
 
 def _solve_step(
     edge_points: _EdgePoints,
-    offset_px: Array,
+    edge_from_expected_px: Array,
     is_edge_found: NDArray[np.bool_],
-    change_from_start: Array,
+    pose_and_shift_change_from_start: Array,
 ) -> _FitStep | None:
     """Return one robust Gauss-Newton step of the seven unknowns; None if too few edges count.
-    `change_from_start` (7,), the sum of the previous steps, is pulled back to zero by the prior."""
+    `pose_and_shift_change_from_start` (7,), the sum of the previous steps, is pulled back to zero
+    by the prior."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
-        error = offset_px - J @ step
+        error = edge_from_expected_px - J @ step
         size = np.abs(error)
         scale = max(1.4826 * float(np.median(size[is_edge_found])), _MIN_TUKEY_SCALE_PX)
         weight = (
@@ -804,15 +832,16 @@ def _solve_step(
         N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (
-            J.T @ (weight * offset_px) / variance - _PREDICTION_INFORMATION * change_from_start
+            J.T @ (weight * edge_from_expected_px) / variance
+            - _PREDICTION_INFORMATION * pose_and_shift_change_from_start
         )
     return _FitStep(step, inverse, weight, variance)
 
 
 def _make_pose_fit(
-    pose: RigidPose, found: _FitStep, edge_points: _EdgePoints, outline: Outline
+    pose: RigidPose, fit_step: _FitStep, edge_points: _EdgePoints, outline: Outline
 ) -> PoseFit:
-    J, (_, inverse, w, variance) = edge_points.J, found
+    J, (_, inverse, w, variance) = edge_points.J, fit_step
     line = outline.line_index[edge_points.outline_index]
     common_px = np.hypot(
         outline.print_sigma_half_sides[edge_points.outline_index] * edge_points.px_per_half_side,
@@ -825,10 +854,10 @@ def _make_pose_fit(
     shown = w > 0.0
     return PoseFit(
         pose=pose,
-        cov=cov[:6, :6],
-        points_in_view=len(shown),
-        points_found=int(np.count_nonzero(shown)),
-        small_marker_points=int(
+        rotation_translation_cov=cov[:6, :6],
+        visible_point_count=len(shown),
+        found_point_count=int(np.count_nonzero(shown)),
+        small_marker_point_count=int(
             np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_index])
         ),
         residual_px=math.sqrt(variance),

@@ -43,7 +43,7 @@ from perchctl.vision.markers.detector import (
     DetectorSetup,
     Picture,
     fill_hidden_pixels,
-    is_hidden,
+    is_any_part_hidden,
     make_hidden_mask,
 )
 from perchctl.vision.markers.edge_fit import refine_corners_by_lines
@@ -61,7 +61,7 @@ from perchctl.vision.markers.pattern import (
     is_correlated_with_pattern,
 )
 from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size
-from perchctl.vision.target_selection import OwnTargetOffset
+from perchctl.vision.target_selection import OwnTargetDistanceFunction
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -89,27 +89,28 @@ class Prior:
     Attributes:
         expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
             expected.
-        expected_both_corners_px: the same, with a missing marker derived from the other one.
+        expected_corners_of_both_markers_px: the same, with a missing marker derived from the other
+            one.
         search_mode: the kinds of search for this frame.
-        start_blur_index: selects the blur with which blurred fits start (see
+        start_blur_counter: selects the blur with which blurred fits start (see
             `find_expected_blurred`).
-        was_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; always
-            False if edge fits are disabled.
-        was_target_cut: `was_seen_recently` is True, and no marker can have been completely in that
-            picture.
-        edge_shift: the shift of all edges measured in the last frames; None measures it.
-        own_target_offset_m: function that selects one of several targets if none is expected; None
-            uses the picture alone.
+        was_target_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame;
+            always False if edge fits are disabled.
+        was_target_cut: `was_target_seen_recently` is True, and no marker can have been completely
+            in that picture.
+        previous_edge_shift: the shift of all edges measured in the last frames; None measures it.
+        measure_own_target_distance_m: function that selects one of several targets if none is
+            expected; None uses the picture alone.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
-    expected_both_corners_px: Mapping[MarkerName, Array]
+    expected_corners_of_both_markers_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    start_blur_index: int | None
-    was_seen_recently: bool
+    start_blur_counter: int | None
+    was_target_seen_recently: bool
     was_target_cut: bool
-    edge_shift: EdgeShift | None
-    own_target_offset_m: OwnTargetOffset | None
+    previous_edge_shift: EdgeShift | None
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +130,9 @@ class CornerMethod:
         name: its heading in ``docs/corners.md``.
         needs: its requirements.
         cost_text: typical time for a picture of 640x480 on one core.
-        used_when: `is_used` in words.
-        is_used: function that returns True if the method applies to the picture, the prior and the
-            findings so far.
+        used_when: `should_run` in words.
+        should_run: function that returns True if the method applies to the picture, the prior and
+            the findings so far.
         find: function that returns the findings that replace the previous ones.
     """
 
@@ -139,14 +140,14 @@ class CornerMethod:
     needs: str
     cost_text: str
     used_when: str
-    is_used: Callable[[Picture, Prior, CornerFindings], bool]
+    should_run: Callable[[Picture, Prior, CornerFindings], bool]
     find: Callable[[Picture, Prior, CornerFindings], CornerFindings]
 
 
 def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     return (
-        prior.search_mode != "fits"
-        and bool(prior.expected_both_corners_px)
+        prior.search_mode != "expected_fits"
+        and bool(prior.expected_corners_of_both_markers_px)
         and picture.setup.is_line_fit_enabled
     )
 
@@ -154,7 +155,9 @@ def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -
 def _fit_edges(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     return replace(
         found,
-        corners=refine_expected_markers(picture, prior.expected_both_corners_px, prior.edge_shift),
+        corners=refine_expected_markers(
+            picture, prior.expected_corners_of_both_markers_px, prior.previous_edge_shift
+        ),
     )
 
 
@@ -164,7 +167,7 @@ def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) ->
 
 def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     # If no side was found, a close target has usually moved further than a profile reaches.
-    searched = search_half_size(picture, prior.expected_both_corners_px)
+    searched = search_half_size(picture, prior.expected_corners_of_both_markers_px)
     if searched is None:
         return found
     corners = _refine_found(picture, searched)
@@ -177,7 +180,7 @@ def _is_half_size_search_empty(picture: Picture, prior: Prior, found: CornerFind
 
 def _fit_visible_part(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     corners = add_partly_visible(
-        picture, prior.expected_both_corners_px, found.corners, prior.edge_shift
+        picture, prior.expected_corners_of_both_markers_px, found.corners, prior.previous_edge_shift
     )
     return replace(found, corners=corners)
 
@@ -194,9 +197,11 @@ def _fit_drawing(picture: Picture, prior: Prior, found: CornerFindings) -> Corne
 
 
 def _can_be_cut(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    if found.corners or not prior.was_seen_recently:
+    if found.corners or not prior.was_target_seen_recently:
         return False
-    return is_target_cut(prior.expected_both_corners_px, picture.image.shape, picture.hidden)
+    return is_target_cut(
+        prior.expected_corners_of_both_markers_px, picture.image.shape, picture.hidden_mask
+    )
 
 
 def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
@@ -204,11 +209,13 @@ def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> Co
 
 
 def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    if prior.search_mode in ("blurred", "fits"):
+    if prior.search_mode in ("whole_blurred", "expected_fits"):
         return False
     if not found.corners and (
         not prior.was_target_cut
-        or can_whole_marker_be_in_view(prior.expected_both_corners_px, picture.image.shape)
+        or can_whole_marker_be_in_view(
+            prior.expected_corners_of_both_markers_px, picture.image.shape
+        )
     ):
         return True
     return _is_marker_missing(picture, found.corners, prior.expected_corners_px)
@@ -216,7 +223,7 @@ def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> boo
 
 def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     searched = search(
-        picture, prior.expected_corners_px, prior.search_mode, prior.own_target_offset_m
+        picture, prior.expected_corners_px, prior.search_mode, prior.measure_own_target_distance_m
     )
     if len(searched.corners_px) < len(found.corners):
         return replace(found, search_result=searched)
@@ -224,15 +231,15 @@ def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFind
 
 
 def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    allowed = prior.search_mode not in ("sharp", "window")
+    allowed = prior.search_mode not in ("whole_sharp", "expected_window")
     return not found.corners and allowed and picture.setup.is_line_fit_enabled
 
 
 def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    bare = replace(picture, hidden=None)
+    bare = replace(picture, hidden_mask=None)
     if prior.expected_corners_px:
         found_corners = find_expected_blurred(
-            bare, prior.expected_corners_px, prior.start_blur_index
+            bare, prior.expected_corners_px, prior.start_blur_counter
         )
     else:
         found_corners = find_blurred(bare)
@@ -245,7 +252,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         needs="an expected marker, whole, with cells of 2.5 px and straight sides",
         cost_text="0.7 ms",
         used_when="the target is expected; after a loss, in three of four pictures",
-        is_used=_is_target_expected,
+        should_run=_is_target_expected,
         find=_fit_edges,
     ),
     CornerMethod(
@@ -253,7 +260,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         needs="both markers expected, those in view with sides above 60 px",
         cost_text="5 ms, with the measurement of what it finds",
         used_when="the edge fit was tried and found no marker",
-        is_used=_is_edge_fit_empty,
+        should_run=_is_edge_fit_empty,
         find=_search_half_size,
     ),
     CornerMethod(
@@ -262,7 +269,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="3 ms for each marker",
         used_when="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
-        is_used=_is_half_size_search_empty,
+        should_run=_is_half_size_search_empty,
         find=_fit_visible_part,
     ),
     CornerMethod(
@@ -271,7 +278,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="1.3 ms for each marker",
         used_when="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
         "than 6 px or than six times the blur; not if the half-size search found one",
-        is_used=_needs_photometric_fit,
+        should_run=_needs_photometric_fit,
         find=_fit_drawing,
     ),
     CornerMethod(
@@ -279,7 +286,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         needs="a measurement at most 0.5 s old, and small-marker cells of 8 px",
         cost_text="7 ms",
         used_when="nothing was found, and each expected marker may be cut by the picture or hidden",
-        is_used=_can_be_cut,
+        should_run=_can_be_cut,
         find=_fit_cut_target,
     ),
     CornerMethod(
@@ -288,7 +295,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="4 to 9 ms, with the measurement of what it finds",
         used_when="nothing was found, unless the target was cut and still is; or an expected "
         "marker with sides above 13 px is missing; after a loss, in three of four pictures",
-        is_used=_should_search,
+        should_run=_should_search,
         find=_search,
     ),
     CornerMethod(
@@ -296,7 +303,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         needs="a whole marker with sides of 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
         used_when="nothing was found; after a loss, in one of four pictures",
-        is_used=_can_be_blurred,
+        should_run=_can_be_blurred,
         find=_search_blurred,
     ),
 )
@@ -311,7 +318,7 @@ def find_corners(picture: Picture, prior: Prior) -> CornerFindings:
     """
     found = CornerFindings()
     for method in CORNER_METHODS:
-        if method.is_used(picture, prior, found):
+        if method.should_run(picture, prior, found):
             found = method.find(picture, prior, found)
     return found
 
@@ -322,19 +329,24 @@ def detect_markers(
     setup: DetectorSetup,
     camera: CameraModel,
     expected_corners_px: Mapping[MarkerName, Array] | None = None,
-    empty_frames: int | None = None,
-    own_target_offset_m: OwnTargetOffset | None = None,
+    frames_without_markers: int | None = None,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
     The search starts at `expected_corners_px`, each (4, 2), predicted from the vehicle's motion, or
-    otherwise near the `previous` detections. `empty_frames`, the number of successive frames
-    without markers, alternates the kinds of search; None applies all kinds. If no target is
-    expected, `own_target_offset_m` selects one of several. For a frame of two fields, the result is
-    the mean of the fields.
-    """
+    otherwise near the `previous` detections. `frames_without_markers`, the number of successive
+    frames without markers, alternates the kinds of search; None applies all kinds. If no target is
+    expected, `measure_own_target_distance_m` selects one of several. For a frame of two fields, the
+    result is the mean of the fields."""
     prior = make_prior(
-        frame, previous, setup, camera, expected_corners_px, empty_frames, own_target_offset_m
+        frame,
+        previous,
+        setup,
+        camera,
+        expected_corners_px,
+        frames_without_markers,
+        measure_own_target_distance_m,
     )
     if frame.picture_kind == "woven":
         first, second = (_detect(each, setup, camera, prior) for each in interpolate_fields(frame))
@@ -348,8 +360,8 @@ def make_prior(
     setup: DetectorSetup,
     camera: CameraModel,
     expected_corners_px: Mapping[MarkerName, Array] | None = None,
-    empty_frames: int | None = None,
-    own_target_offset_m: OwnTargetOffset | None = None,
+    frames_without_markers: int | None = None,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> Prior:
     """Return the knowledge before the frame; arguments as in `detect_markers`."""
     expected_corners_px = (
@@ -358,65 +370,73 @@ def make_prior(
         else extrapolate_corners(previous, frame.t_s)
     )
     search_mode = _choose_search_mode(
-        empty_frames, bool(expected_corners_px), setup.is_line_fit_enabled
+        frames_without_markers, bool(expected_corners_px), setup.is_line_fit_enabled
     )
-    start_blur_index = None
-    if empty_frames is not None and search_mode in ("near", "fits"):
-        start_blur_index = (empty_frames + 2) // 4
+    start_blur_counter = None
+    if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
+        start_blur_counter = (frames_without_markers + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_CUT_FIT_AGE_S
     was_recent = was_recent and setup.is_line_fit_enabled and bool(last)
-    shift = None if previous is None else previous.edge_shift
-    if shift is not None:
-        age = shift.age_frames + 1
-        shift = replace(shift, age_frames=age) if age < _MAX_EDGE_SHIFT_AGE_FRAMES else None
+    previous_edge_shift = None if previous is None else previous.edge_shift
+    if previous_edge_shift is not None:
+        age = previous_edge_shift.age_frames + 1
+        previous_edge_shift = (
+            replace(previous_edge_shift, age_frames=age)
+            if age < _MAX_EDGE_SHIFT_AGE_FRAMES
+            else None
+        )
     return Prior(
         expected_corners_px=expected_corners_px,
-        expected_both_corners_px=add_missing_marker(
+        expected_corners_of_both_markers_px=add_missing_marker(
             expected_corners_px, setup.small_to_large_side, camera
         ),
         search_mode=search_mode,
-        start_blur_index=start_blur_index,
-        was_seen_recently=was_recent,
+        start_blur_counter=start_blur_counter,
+        was_target_seen_recently=was_recent,
         was_target_cut=was_recent and not can_whole_marker_be_in_view(last, frame.image.shape),
-        edge_shift=shift,
-        own_target_offset_m=own_target_offset_m,
+        previous_edge_shift=previous_edge_shift,
+        measure_own_target_distance_m=measure_own_target_distance_m,
     )
 
 
 def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prior) -> Detections:
-    hidden = make_hidden_mask(frame, setup.hidden_mask)
-    image = frame.image if hidden is None else fill_hidden_pixels(frame.image, hidden)
-    found = find_corners(Picture(image, hidden, setup, camera), prior)
+    hidden_mask = make_hidden_mask(frame, setup.hidden_mask)
+    image = frame.image if hidden_mask is None else fill_hidden_pixels(frame.image, hidden_mask)
+    found = find_corners(Picture(image, hidden_mask, setup, camera), prior)
     found_corners = found.corners
-    shifts = (r.edge_shift for r in found_corners.values())
+    shifts = (r.corrected_edge_shift for r in found_corners.values())
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
         large=_make_detection("large", found_corners, frame.picture_kind),
         small=_make_detection("small", found_corners, frame.picture_kind),
-        mirrored=found.search_result.mirrored and not found_corners,
+        mirrored=found.search_result.is_mirrored_marker_seen and not found_corners,
         target_count=found.search_result.target_count,
         edge_shift=next((each for each in shifts if each is not None), None),
     )
 
 
 def _choose_search_mode(
-    empty_frames: int | None, is_target_expected: bool, is_line_fit_enabled: bool
+    frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
     """Return the kind of search for this frame. After a loss, the kinds alternate."""
-    if empty_frames is None:
+    if frames_without_markers is None:
         return "all"
-    if not is_line_fit_enabled or (is_target_expected and empty_frames % 2):
-        return "sharp"
+    if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
+        return "whole_sharp"
     if is_target_expected:
-        if empty_frames == 0:
-            return "near"
-        return "fits" if empty_frames % 4 else "window"
+        if frames_without_markers == 0:
+            return "near_expected"
+        return "expected_fits" if frames_without_markers % 4 else "expected_window"
     # At 0, something was seen, but not at the expected position.
     every = DetectorConfig.blurred_every
-    return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
+    return (
+        "whole_blurred"
+        if frames_without_markers and frames_without_markers % every == 0
+        else "whole_sharp"
+    )
 
 
 def _is_marker_missing(
@@ -426,7 +446,7 @@ def _is_marker_missing(
         name not in found_corners
         and is_inside_picture(corners, picture.image.shape)
         and side_lengths_px(corners).min() > _MIN_SEARCHED_SIDE_PX
-        and not is_hidden(picture.hidden, corners)
+        and not is_any_part_hidden(picture.hidden_mask, corners)
         for name, corners in expected_corners_px.items()
     )
 
@@ -447,19 +467,19 @@ def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
         return found_corners
     fitted, small = dict(found_corners), found_corners.get("small")
     for name, r in found_corners.items():
-        if r.refined and is_fully_visible(picture, r):
+        if r.is_fitted and is_fully_visible(picture, r):
             continue
         starts = [r.corners_px]
-        if name == "large" and not r.refined and small is not None and small.refined:
-            starts.insert(0, picture.derive_from_other_marker(small.corners_px, "large"))
+        if name == "large" and not r.is_fitted and small is not None and small.is_fitted:
+            starts.insert(0, picture.corners_from_other_marker_px(small.corners_px, "large"))
         identified_by: IdentifiedBy = "other" if len(found_corners) == 2 else "bits"
         tried = (fit_partly_visible(picture, name, start, identified_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not is_inside_picture(r.corners_px, image.shape, PICTURE_MARGIN_PX) or is_hidden(
-            picture.hidden, r.corners_px, 1.0
-        ):
+        elif not is_inside_picture(
+            r.corners_px, image.shape, PICTURE_MARGIN_PX
+        ) or is_any_part_hidden(picture.hidden_mask, r.corners_px, 1.0):
             del fitted[name]
     return refine_photometrically(picture, fitted, is_from_search=True)
 
@@ -475,8 +495,8 @@ def _make_detection(
         name,
         r.corners_px,
         r.sigma_px,
-        r.refined,
-        r.edge_shift_sigma_px,
+        r.is_fitted,
+        r.remaining_edge_shift_sigma_px,
         cov_px2=r.cov_px2,
         row_jitter_sigma_px=r.row_jitter_sigma_px,
         horizontal_side_extra_sigma_px=interpolated_edge_sigma_px(r.sharpest_side_blur_px)
@@ -543,7 +563,7 @@ def is_line_fit_sufficient(corners: RefinedCorners, pattern: Pattern) -> bool:
     """True if the corners come from an edge fit that is as accurate as a photometric fit: with
     cells of at least 6 px and 6 times the blur."""
     cell_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
-    return corners.refined and cell_px >= max(
+    return corners.is_fitted and cell_px >= max(
         _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_BLURS * corners.blur_px
     )
 
@@ -567,7 +587,7 @@ def refine_photometrically(
         if (
             start is None
             or not is_inside_picture(start, image.shape)
-            or is_hidden(picture.hidden, start)
+            or is_any_part_hidden(picture.hidden_mask, start)
         ):
             continue
         is_single = _OTHER_MARKER[name] not in better
@@ -596,7 +616,7 @@ def refine_photometrically(
 def _blur_px(corners: RefinedCorners | None) -> float:
     """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
     fitted."""
-    if corners is None or not corners.refined or corners.blur_px <= 0.0:
+    if corners is None or not corners.is_fitted or corners.blur_px <= 0.0:
         return _DEFAULT_BLUR_PX
     return min(
         math.sqrt(max(corners.blur_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX
@@ -613,56 +633,62 @@ def _initial_corners(
         # Small cells matter only if no larger ones were measured.
         enough = is_line_fit_sufficient(this, picture.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
-        return None if this.refined and enough else this.corners_px
-    if name == "small" and other is not None and other.refined:
-        return picture.derive_from_other_marker(other.corners_px, "small")
+        return None if this.is_fitted and enough else this.corners_px
+    if name == "small" and other is not None and other.is_fitted:
+        return picture.corners_from_other_marker_px(other.corners_px, "small")
     return None
 
 
 # --- Markers at their expected positions: no search, only verification ---
 
 
-_MIN_LINE_CELL_PX = 2.5  # least cell size for line fits
+_MIN_LINE_FIT_CELL_PX = 2.5  # least cell size for line fits
 _MAX_CENTRE_OFFSET_SIDES = 0.12  # share of the small marker's side
 
 
 def fit_lines(
-    picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+    picture: Picture,
+    start_corners_px: Mapping[MarkerName, Array],
+    known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Fit the four sides of each marker near corners `places` (4, 2) px, and return those with four
-    straight sides. The cells are not examined.
+    """Fit the four sides of each marker near corners `start_corners_px` (4, 2) px, and return those
+    with four straight sides. The cells are not examined.
 
     All markers are fitted together, because blooming and gamma move all edges of a picture by the
-    same number of pixels. `shift` is that shift if it is known; None measures it.
+    same number of pixels. `known_edge_shift` is that shift if it is known; None measures it.
     """
-    if not places:
+    if not start_corners_px:
         return {}
-    rims = [picture.setup.patterns[name].border_cells for name in places]
-    raw = np.array(list(places.values()))
-    fitted = refine_corners_by_lines(picture.image, raw, rims, picture.camera, shift)
-    return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
+    rims = [picture.setup.patterns[name].border_cells for name in start_corners_px]
+    raw = np.array(list(start_corners_px.values()))
+    fitted = refine_corners_by_lines(picture.image, raw, rims, picture.camera, known_edge_shift)
+    return {
+        name: found
+        for name, found in zip(start_corners_px, fitted, strict=True)
+        if found is not None
+    }
 
 
 def refine_expected_markers(
     picture: Picture,
     expected_corners_px: Mapping[MarkerName, Array],
-    shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
     measured by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
     or hidden markers, and markers with cells below 2.5 px are omitted."""
     image, patterns = picture.image, picture.setup.patterns
-    places = {
+    start_corners_px = {
         name: expected_corners_px[name]
         for name in MARKERS
         if name in expected_corners_px
         and is_inside_picture(expected_corners_px[name], image.shape, PICTURE_MARGIN_PX)
         and side_lengths_px(expected_corners_px[name]).min()
-        > _MIN_LINE_CELL_PX * patterns[name].border_cells.cells_per_side
+        > _MIN_LINE_FIT_CELL_PX * patterns[name].border_cells.cells_per_side
     }
     return {
         name: found
-        for name, found in fit_lines(picture, places, shift).items()
+        for name, found in fit_lines(picture, start_corners_px, known_edge_shift).items()
         if is_fully_visible(picture, found)
         and has_matching_cells(image, found.corners_px, patterns[name])
     }
@@ -672,27 +698,29 @@ def add_partly_visible(
     picture: Picture,
     expected_corners_px: Mapping[MarkerName, Array],
     found_corners: _FoundCorners,
-    shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Return the markers in `found_corners`, plus the expected markers of which a visible part
     could be fitted.
 
     If the small marker was found, the large one is expected around it.
     """
-    places, found_corners = dict(expected_corners_px), dict(found_corners)
+    start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:
-        places["large"] = picture.derive_from_other_marker(
+        start_corners_px["large"] = picture.corners_from_other_marker_px(
             found_corners["small"].corners_px, "large"
         )
     for name in MARKERS:
-        if name in places and name not in found_corners:
-            partly = fit_partly_visible(picture, name, places[name], "track", shift)
+        if name in start_corners_px and name not in found_corners:
+            partly = fit_partly_visible(
+                picture, name, start_corners_px[name], "track", known_edge_shift
+            )
             if partly is not None:
                 found_corners[name] = partly
     if "large" in found_corners and "small" not in found_corners:
         # Too small for lines, but its position follows from the large marker: a similar pattern is
         # enough.
-        small_px = picture.derive_from_other_marker(found_corners["large"].corners_px, "small")
+        small_px = picture.corners_from_other_marker_px(found_corners["large"].corners_px, "small")
         if mean_side_px(small_px) > MIN_MARKER_SIDE_PX and is_correlated_with_pattern(
             picture.image, small_px, picture.setup.patterns["small"]
         ):
@@ -706,12 +734,12 @@ def find_large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners
     """Return the large marker around a detected small one; the large one may be partly covered or
     cut. None if the picture does not confirm it."""
     image, pattern = picture.image, picture.setup.patterns["large"]
-    start = picture.derive_from_other_marker(small.corners_px, "large")
+    start = picture.corners_from_other_marker_px(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        centre = picture.derive_from_other_marker(large.corners_px, "small")
+        centre = picture.corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_MAX_CENTRE_OFFSET_SIDES * mean_side_px(small.corners_px), 1.0)
 
@@ -767,8 +795,8 @@ def _average_detections(a: Detection, b: Detection) -> Detection:
         a.marker,
         (a.corners_px + b.corners_px) / 2.0,
         half(a.sigma_px, b.sigma_px),
-        a.refined and b.refined,
-        max(a.edge_shift_sigma_px, b.edge_shift_sigma_px),
+        a.is_fitted and b.is_fitted,
+        max(a.remaining_edge_shift_sigma_px, b.remaining_edge_shift_sigma_px),
         cov_px2=cov_px2,
         row_jitter_sigma_px=half(a.row_jitter_sigma_px, b.row_jitter_sigma_px),
         horizontal_side_extra_sigma_px=half(

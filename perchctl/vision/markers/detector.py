@@ -60,11 +60,11 @@ class DetectorSetup:
 
 
 def make_detector_setup(
-    config: DetectorConfig, target: TargetConfig, mask: HiddenMask | None = None
+    config: DetectorConfig, target: TargetConfig, static_hidden_mask: HiddenMask | None = None
 ) -> DetectorSetup:
     """Return the setup for a target, with dictionaries that contain only its markers' ids."""
     large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
-    ratio = target.small.side_m / target.large.side_m
+    small_to_large_side = target.small.side_m / target.large.side_m
     return DetectorSetup(
         large_and_small_dictionaries=(
             _make_dictionary(large_bits, config.correction_bits_large),
@@ -75,7 +75,7 @@ def make_detector_setup(
                 make_border_cells(
                     large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
                 ),
-                make_drawing(large_bits, small_bits, ratio),
+                make_drawing(large_bits, small_bits, small_to_large_side),
             ),
             "small": make_pattern(
                 make_border_cells(
@@ -84,9 +84,9 @@ def make_detector_setup(
                 make_drawing(small_bits),
             ),
         },
-        small_to_large_side=ratio,
+        small_to_large_side=small_to_large_side,
         is_line_fit_enabled=config.refinement == "line",
-        hidden_mask=mask,
+        hidden_mask=static_hidden_mask,
     )
 
 
@@ -148,49 +148,52 @@ _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
 _MEAN_GREY_FILL_WEIGHT = 1e-4
 
 
-def make_hidden_mask(frame: Frame, mask: HiddenMask | None) -> HiddenMask | None:
+def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
     """Return the mask (h, w) of the vehicle in a frame; widened for a single field because the
     missing rows are interpolated."""
-    if mask is None or frame.picture_kind not in ("top", "bottom"):
-        return mask
-    return cv2.dilate(mask.astype(np.uint8), np.ones((_MASK_SPREAD_ROWS, 1), np.uint8)) > 0
+    if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
+        return static_hidden_mask
+    return (
+        cv2.dilate(static_hidden_mask.astype(np.uint8), np.ones((_MASK_SPREAD_ROWS, 1), np.uint8))
+        > 0
+    )
 
 
-def fill_hidden_pixels(image: NDArray[np.uint8], hidden: HiddenMask) -> NDArray[np.uint8]:
+def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDArray[np.uint8]:
     """Return the picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
-    free = (~hidden).astype(np.float32)
+    free = (~hidden_mask).astype(np.float32)
     size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
 
     def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
         reduced = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA), np.float32)
 
-    mean = cv2.mean(image, (~hidden).astype(np.uint8))[0]
+    mean = cv2.mean(image, (~hidden_mask).astype(np.uint8))[0]
     grey = (around(image * free) + _MEAN_GREY_FILL_WEIGHT * mean) / (
         around(free) + _MEAN_GREY_FILL_WEIGHT
     )
     smooth = cv2.resize(grey, (w, h), interpolation=cv2.INTER_LINEAR)
-    return np.where(hidden, np.rint(smooth).astype(np.uint8), image)
+    return np.where(hidden_mask, np.rint(smooth).astype(np.uint8), image)
 
 
-def is_hidden(
-    hidden: HiddenMask | None,
+def is_any_part_hidden(
+    hidden_mask: HiddenMask | None,
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
     """True if any pixel within `reach_half_sides` (in half sides of the marker) of the marker's
     centre is hidden by the vehicle."""
-    if hidden is None:
+    if hidden_mask is None:
         return False
-    h, w = hidden.shape
+    h, w = hidden_mask.shape
     centre = corners_px.mean(axis=0)
     wide = centre + reach_half_sides * (corners_px - centre)
     if not np.isfinite(wide).all():
         return False
     low = np.clip(np.floor(wide.min(axis=0)), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(wide.max(axis=0)), 0, (w - 1, h - 1)).astype(int)
-    part = hidden[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    part = hidden_mask[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not part.any():
         return False
     inside = np.zeros(part.shape, np.uint8)
@@ -200,20 +203,22 @@ def is_hidden(
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture with the setup and camera for measuring markers in it. `hidden` (h, w) marks the
-    pixels where the vehicle covers the view."""
+    """A picture with the setup and camera for measuring markers in it. `hidden_mask` (h, w) marks
+    the pixels where the vehicle covers the view."""
 
     image: NDArray[np.uint8]
-    hidden: HiddenMask | None
+    hidden_mask: HiddenMask | None
     setup: DetectorSetup
     camera: CameraModel
 
-    def derive_from_other_marker(self, corners_px: Array, name: MarkerName) -> Array:
+    def corners_from_other_marker_px(
+        self, other_corners_px: Array, derived_name: MarkerName
+    ) -> Array:
         """Return marker `name`'s corners (4, 2), derived from `corners_px` (4, 2) of the other
         marker."""
-        ratio = (
+        scaled_to_given_side = (
             self.setup.small_to_large_side
-            if name == "small"
+            if derived_name == "small"
             else 1.0 / self.setup.small_to_large_side
         )
-        return scale_square(corners_px, ratio, self.camera)
+        return scale_square(other_corners_px, scaled_to_given_side, self.camera)

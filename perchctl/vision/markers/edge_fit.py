@@ -110,7 +110,7 @@ def make_side_profiles(
 
 
 def sample_profiles(
-    image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array
+    image: NDArray[np.uint8], origin: Array, normal: Array, profile_half_length_px: Array
 ) -> Floats:
     """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, with the picture's
     border pixels repeated outside.
@@ -120,7 +120,7 @@ def sample_profiles(
     deviation.
     """
     h, w = image.shape
-    reach = float(half_px.max()) + 2.0
+    reach = float(profile_half_length_px.max()) + 2.0
     flat = origin.reshape(-1, 2)
     (x0, y0), (x1, y1) = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
     left, top = min(max(int(x0 - reach), 0), w - 2), min(max(int(y0 - reach), 0), h - 2)
@@ -131,11 +131,15 @@ def sample_profiles(
     lines = np.empty((2, rows, n, 2), dtype=np.float32)  # x and y: origin, and direction
     np.subtract(origin[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
     np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
-    np.multiply(normal[..., 0], half_px[:, None], out=lines[0, ..., 1], casting="same_kind")
-    np.multiply(normal[..., 1], half_px[:, None], out=lines[1, ..., 1], casting="same_kind")
+    np.multiply(
+        normal[..., 0], profile_half_length_px[:, None], out=lines[0, ..., 1], casting="same_kind"
+    )
+    np.multiply(
+        normal[..., 1], profile_half_length_px[:, None], out=lines[1, ..., 1], casting="same_kind"
+    )
     x, y = (lines.reshape(-1, 2) @ _PROFILE_BASIS).reshape(2, rows, n * (SAMPLES_PER_PROFILE + 1))
-    grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grey, dtype=np.float32).reshape(rows, n, SAMPLES_PER_PROFILE + 1)
+    profile_greys = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(profile_greys, dtype=np.float32).reshape(rows, n, SAMPLES_PER_PROFILE + 1)
 
 
 # --- Lines fitted to a marker's sides, and their intersections ---
@@ -151,7 +155,7 @@ _MIN_INLIER_FRACTION = 0.5
 _ROBUST_LINE_VARIANCE_FACTOR = 1.7
 # bend of an edge by the next one, a cell away, in units of blur
 _NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
-_EDGE_ERROR_PER_CUBED_BLUR_PX2 = (
+_EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = (
     0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
 )
 CLIPPED_CORNER_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
@@ -160,7 +164,9 @@ MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
 _MAX_EDGE_OFFSET_PX = 4.0
-_MIN_ROW_JITTER_VARIANCE_RATIO = 2.0  # ratio of variances of the sides that shows jittering rows
+_MIN_UPRIGHT_TO_LEVEL_SIDE_VARIANCE = (
+    2.0  # ratio of variances of the sides that shows jittering rows
+)
 _MIN_SIDE_SLANT_VARIANCE = (
     0.05  # variance of the sides' slants (0 to 1) required to distinguish them
 )
@@ -182,7 +188,7 @@ _MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
 
 def refine_corners_by_lines(
     image: NDArray[np.uint8],
-    raw_px: Array,
+    raw_corners_px: Array,
     border_cells: Sequence[BorderCells],
     camera: CameraModel,
     known_edge_shift: EdgeShift | None = None,
@@ -194,17 +200,17 @@ def refine_corners_by_lines(
     unless `known_edge_shift` is given. A marker with wide edges, or with edges near the ends of the
     profiles, is fitted again with the profiles centred on its edges.
     """
-    found = _refine_lines_once(image, raw_px, border_cells, camera, known_edge_shift)
-    centred = raw_px.copy()
+    found = _refine_lines_once(image, raw_corners_px, border_cells, camera, known_edge_shift)
+    centred = raw_corners_px.copy()
     for i, each in enumerate(found):
         if each is None:
             continue
-        off_px = float(np.abs(each.corners_px - raw_px[i]).max())
+        off_px = float(np.abs(each.corners_px - raw_corners_px[i]).max())
         if off_px > (
             _MAX_WIDE_EDGE_OFFSET_PX if each.blur_px > _MIN_WIDE_BLUR_PX else _MAX_EDGE_OFFSET_PX
         ):
             centred[i] = each.corners_px
-    if (centred == raw_px).all():
+    if (centred == raw_corners_px).all():
         return found
     again = _refine_lines_once(image, centred, border_cells, camera, known_edge_shift)
     return [second or first for first, second in zip(found, again, strict=True)]
@@ -212,44 +218,47 @@ def refine_corners_by_lines(
 
 def _refine_lines_once(
     image: NDArray[np.uint8],
-    raw_px: Array,
+    raw_corners_px: Array,
     border_cells: Sequence[BorderCells],
     camera: CameraModel,
     known_edge_shift: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    found: list[RefinedCorners | None] = [None] * len(raw_px)
-    markers = prepare_marker_sides(raw_px, border_cells, camera)
+    found: list[RefinedCorners | None] = [None] * len(raw_corners_px)
+    markers = prepare_marker_sides(raw_corners_px, border_cells, camera)
     if markers is None:
         return found
     outer_edges, inner_edges = measure_edges(
         image, markers, camera, with_inner_edges=known_edge_shift is None
     )
     glaring = (
-        np.count_nonzero(outer_edges.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES_PER_SIDE
+        np.count_nonzero(outer_edges.profile_greys[:, :, -1] > CLIPPED_GREY, axis=1)
+        / PROFILES_PER_SIDE
     )
-    clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
-    if known_edge_shift is not None and clipped.any():
+    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
+    if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light.
-        return _refine_lines_once(image, raw_px, border_cells, camera, None)
-    lines, residual_px = _fit_lines(markers, outer_edges)
+        return _refine_lines_once(image, raw_corners_px, border_cells, camera, None)
+    line_coefficients, residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
     if shift is None:
-        corners = _intersect(lines)
+        corners = _intersect(line_coefficients)
         if not is_finite(corners):
             return found
-        shift = _measure_edge_shift(markers, outer_edges, inner_edges, lines, residual_px, corners)
-    applied = shift or EdgeShift(
-        0.0, edge_shift_prior_sigma_px(float(outer_edges.grey[:, :, -1].mean()))
-    )
-    if applied.shift_px != 0.0:
-        lines = lines.copy()
-        lines[:, 2] += _outward_signs(markers, lines) * (
-            applied.shift_px / markers.px_per_normalised
+        shift = _measure_edge_shift(
+            markers, outer_edges, inner_edges, line_coefficients, residual_px, corners
         )
-    corners = _intersect(lines)
+    applied = shift or EdgeShift(
+        0.0, edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean()))
+    )
+    if applied.white_growth_px != 0.0:
+        line_coefficients = line_coefficients.copy()
+        line_coefficients[:, 2] += _outward_signs(markers, line_coefficients) * (
+            applied.white_growth_px / markers.px_per_normalised
+        )
+    corners = _intersect(line_coefficients)
     if not is_finite(corners):
         return found
-    corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
+    corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
     accepted = _is_accepted(markers, outer_edges, residual_px, corners_px)
     # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
     independent = np.maximum(
@@ -258,7 +267,7 @@ def _refine_lines_once(
     line_end_variances_px2 = (
         4.0 * _ROBUST_LINE_VARIANCE_FACTOR * residual_px * residual_px / independent
     ).tolist()
-    blurs_px, normals_x = outer_edges.blur_px.tolist(), lines[:, 0].tolist()
+    blurs_px, normals_x = outer_edges.blur_px.tolist(), line_coefficients[:, 0].tolist()
     for i, rim in enumerate(border_cells):
         if not accepted[i]:
             continue
@@ -268,12 +277,16 @@ def _refine_lines_once(
         found[i] = RefinedCorners(
             corners_px=corners_px[i],
             sigma_px=_corner_sigma_px(
-                cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.print_tolerance_cells
+                cell_px,
+                blur_px,
+                sum(ends) / 4.0,
+                bool(is_white_clipped[i]),
+                rim.print_tolerance_cells,
             ),
-            refined=True,
-            edge_shift_sigma_px=applied.sigma_px,
+            is_fitted=True,
+            remaining_edge_shift_sigma_px=applied.sigma_px,
             blur_px=max(blurs),
-            edge_shift=shift,
+            corrected_edge_shift=shift,
             row_jitter_sigma_px=_row_jitter_sigma_px(normals_x[four], ends),
             sharpest_side_blur_px=min(blurs),
         )
@@ -284,7 +297,7 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
     """Return the normalised lines (4m, 3): nx, ny, c with n.x = c and |n| = 1; and the weighted RMS
     distance of the points from them, px (4m,)."""
     w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
-    x, y = outer_edges.points[..., 0], outer_edges.points[..., 1]
+    x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
@@ -296,14 +309,18 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
-    lines = np.empty((len(w), 3))
-    lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
-    return lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
+    line_coefficients = np.empty((len(w), 3))
+    line_coefficients[:, 0], line_coefficients[:, 1], line_coefficients[:, 2] = (
+        nx,
+        ny,
+        nx * cx + ny * cy,
+    )
+    return line_coefficients, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
 
 
-def _intersect(lines: Array) -> Array:
+def _intersect(line_coefficients: Array) -> Array:
     """Return the intersections of side i - 1 and side i of each marker: (m, 4, 2)."""
-    sides = lines.reshape(-1, 4, 3)
+    sides = line_coefficients.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
     bx, by, bc = sides[..., 0], sides[..., 1], sides[..., 2]
@@ -328,7 +345,7 @@ def _measure_edge_shift(
     markers: MarkerSides,
     outer_edges: EdgeData,
     inner_edges: EdgeData | None,
-    lines: Array,
+    line_coefficients: Array,
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
@@ -343,7 +360,7 @@ def _measure_edge_shift(
         return None
     k, prior_px = (
         markers.widest_marker_index,
-        edge_shift_prior_sigma_px(float(outer_edges.grey[:, :, -1].mean())),
+        edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean())),
     )
     rim, depth_px, cell_px = (
         markers.border_cells[k],
@@ -351,7 +368,7 @@ def _measure_edge_shift(
         float(markers.cell_px[k]),
     )
     r = 1.0 - 2.0 / rim.cells_per_side
-    own = apply_homography(homography_to_centred_square(corners[k]), inner_edges.points)
+    own = apply_homography(homography_to_centred_square(corners[k]), inner_edges.points_normalised)
     far = np.matmul(own, OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = inner_edges.weight * (inner_edges.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
@@ -362,7 +379,10 @@ def _measure_edge_shift(
         return EdgeShift(0.0, prior_px)
     # A curled sheet moves outer edges further than inner ones, and ends further than middles.
     bent_px = (
-        8.0 * r / (3.0 * rim.cells_per_side) * _bow_px(markers, outer_edges, lines, residual_px)
+        8.0
+        * r
+        / (3.0 * rim.cells_per_side)
+        * _bow_px(markers, outer_edges, line_coefficients, residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -379,17 +399,22 @@ def _measure_edge_shift(
     variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.print_tolerance_cells * cell_px) ** 2
     prior = prior_px**2
     return EdgeShift(
-        shift_px=shift * prior / (prior + variance),
+        white_growth_px=shift * prior / (prior + variance),
         sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
     )
 
 
-def _bow_px(markers: MarkerSides, outer_edges: EdgeData, lines: Array, residual_px: Array) -> float:
+def _bow_px(
+    markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, residual_px: Array
+) -> float:
     """Return the bow of the widest marker's sides, px: how far their ends are further out than
     their middles. 0 if noise may explain it."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
-    away = np.matmul(outer_edges.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
-    scale = _outward_signs(markers, lines)[four] * markers.px_per_normalised[four]
+    away = (
+        np.matmul(outer_edges.points_normalised[four], line_coefficients[four, :2, None])[..., 0]
+        - line_coefficients[four, 2:]
+    )
+    scale = _outward_signs(markers, line_coefficients)[four] * markers.px_per_normalised[four]
     mass = np.maximum(outer_edges.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
     bow_px = scale * ((outer_edges.weight[four] * away) @ _PARABOLA) / mass
     mean_px = float(bow_px @ _MEAN_OF_FOUR)
@@ -397,11 +422,13 @@ def _bow_px(markers: MarkerSides, outer_edges: EdgeData, lines: Array, residual_
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
 
-def _outward_signs(markers: MarkerSides, lines: Array) -> Array:
+def _outward_signs(markers: MarkerSides, line_coefficients: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners_normalised
     out = (corners - (_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
-    return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
+    return np.asarray(
+        np.sign(line_coefficients[:, 0] * out[:, 0] + line_coefficients[:, 1] * out[:, 1])
+    )
 
 
 def _is_accepted(
@@ -409,7 +436,9 @@ def _is_accepted(
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
-    contrast = np.abs(outer_edges.grey[:, :, -3] - outer_edges.grey[:, :, 2]).dot(_PROFILE_ONES_F32)
+    contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
+        _PROFILE_ONES_F32
+    )
     lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
     lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
         outer_edges.blur_px < 0.9 * outer_edges.window_half_px
@@ -421,18 +450,22 @@ def _is_accepted(
 
 
 def _corner_sigma_px(
-    cell_px: float, blur_px: float, noise_px2: float, clipped: bool, print_tolerance_cells: float
+    cell_px: float,
+    blur_px: float,
+    line_end_variance_px2: float,
+    is_white_clipped: bool,
+    print_tolerance_cells: float,
 ) -> float:
     blur_px = max(blur_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = (
         _NEIGHBOUR_BEND * blur_px * math.exp(-cell_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
     )
-    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PX2 * blur_px**3
-    clipped_px = CLIPPED_CORNER_SIGMA_PX if clipped else 0.0
+    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_px**3
+    clipped_px = CLIPPED_CORNER_SIGMA_PX if is_white_clipped else 0.0
     # Printed edges deviate from their nominal positions.
     print_px = print_tolerance_cells * cell_px
-    noise_px = max(math.sqrt(noise_px2), MIN_LINE_SIGMA_PX)
+    noise_px = max(math.sqrt(line_end_variance_px2), MIN_LINE_SIGMA_PX)
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
@@ -455,7 +488,7 @@ def _row_jitter_sigma_px(
     still = sum(line_end_variances_px2) / 4.0 - slope * mean
     return (
         math.sqrt(slope)
-        if slope > (_MIN_ROW_JITTER_VARIANCE_RATIO - 1.0) * max(still, 0.0)
+        if slope > (_MIN_UPRIGHT_TO_LEVEL_SIDE_VARIANCE - 1.0) * max(still, 0.0)
         else 0.0
     )
 
@@ -464,7 +497,7 @@ def _row_jitter_sigma_px(
 # Rows 4 i to 4 i + 3 belong to marker i; then the inner edges of one marker's border may follow.
 
 
-_MIN_SHIFT_CELL_PX = 6.0  # cell of a border whose inner edge is measured too
+_MIN_EDGE_SHIFT_CELL_PX = 6.0  # cell of a border whose inner edge is measured too
 _SIDE_INDICES = np.arange(4)[:, None]
 
 
@@ -500,29 +533,31 @@ class EdgeData:
     """Edges measured on n profiles across each side.
 
     Attributes:
-        grey: grey values along the profiles, (rows, n, steps + 1).
+        profile_greys: grey values along the profiles, (rows, n, steps + 1).
         window_half_px: half length of the window around the edge, (rows,).
-        points: edge points in normalised image coordinates, (rows, n, 2).
+        points_normalised: edge points in normalised image coordinates, (rows, n, 2).
         weight: weight of each point, 0 for outliers, (rows, n).
         blur_px: standard deviation of the blur, (rows,).
     """
 
-    grey: Floats
+    profile_greys: Floats
     window_half_px: Array
-    points: Array
+    points_normalised: Array
     weight: Array
     blur_px: Array
 
 
 def prepare_marker_sides(
-    raw_px: Array, border_cells: Sequence[BorderCells], camera: CameraModel
+    raw_corners_px: Array, border_cells: Sequence[BorderCells], camera: CameraModel
 ) -> MarkerSides | None:
     """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
     quadrilateral."""
-    sides_px = side_lengths_px(raw_px)
+    sides_px = side_lengths_px(raw_corners_px)
     cells = np.array([rim.cells_per_side for rim in border_cells], dtype=np.float64)
-    corners = undistort_to_normalised(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
-    turn = np.sign(signed_double_area(raw_px))
+    corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
+        raw_corners_px.shape
+    )
+    turn = np.sign(signed_double_area(raw_corners_px))
     is_square = turn.all() and sides_px.min() > 1e-6
     if not (is_square and is_finite(corners)):
         return None
@@ -530,7 +565,7 @@ def prepare_marker_sides(
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
     cell_px = sides_px @ _MEAN_OF_FOUR / cells
     return MarkerSides(
-        raw_corners_px=raw_px,
+        raw_corners_px=raw_corners_px,
         border_cells=border_cells,
         corners_normalised=corners,
         side_lengths_px=sides_px,
@@ -557,7 +592,7 @@ def measure_edges(
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest_marker_index
     rim = markers.border_cells[widest]
-    with_inner_edges = with_inner_edges and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
+    with_inner_edges = with_inner_edges and float(markers.cell_px[widest]) > _MIN_EDGE_SHIFT_CELL_PX
     if with_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
         inner = apply_homography(
@@ -575,12 +610,14 @@ def measure_edges(
     ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    window_half_px, half_px = (
+    window_half_px, profile_half_length_px = (
         each[of] for each in window_and_profile_half_lengths_px(markers.cell_px)
     )
-    grey = sample_profiles(image, origin, normal, half_px)
+    profile_greys = sample_profiles(image, origin, normal, profile_half_length_px)
     around = find_neighbour_edges(s, markers.border_cells, rim, depth_px.ravel())
-    offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
+    offset_px, weight, blur_px = locate_edges(
+        profile_greys, profile_half_length_px, window_half_px, around
+    )
     points = undistort_to_normalised(
         (origin + offset_px[..., None] * normal).reshape(-1, 2), camera
     )
@@ -588,7 +625,9 @@ def measure_edges(
     points = points if is_finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_corners_px)
     outer_edges, inner_edges = (
-        EdgeData(grey[part], window_half_px[part], points[part], weight[part], blur_px[part])
+        EdgeData(
+            profile_greys[part], window_half_px[part], points[part], weight[part], blur_px[part]
+        )
         for part in (slice(0, n), slice(n, None))
     )
     return outer_edges, inner_edges if with_inner_edges else None
@@ -610,14 +649,14 @@ def find_neighbour_edges(
     """Return the neighbours of edges at `positions_along_side` (rows, n), as shares of a side: four
     rows for each marker in `border_cells`, then, if there are more rows, four for the inner edges
     of the border of `inner_border_cells`."""
-    has_inner_neighbour, has_outer_neighbour = (
+    inner_neighbour_count, outer_neighbour_count = (
         np.zeros(positions_along_side.shape, np.float32),
         np.zeros(positions_along_side.shape, np.float32),
     )
     can_be_located = np.ones(positions_along_side.shape, np.bool_)
     for i, rim in enumerate(border_cells):
         four = slice(4 * i, 4 * i + 4)
-        has_inner_neighbour[four] = rim.is_white[
+        inner_neighbour_count[four] = rim.is_cell_inside_border_white[
             _SIDE_INDICES, (positions_along_side[four] * rim.cells_per_side).astype(np.intp)
         ]
     if len(positions_along_side) > 4 * len(border_cells):
@@ -625,15 +664,19 @@ def find_neighbour_edges(
             inner_border_cells.cells_per_side - 2
         )  # in cells from the border's corner
         # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
-        free = inner_border_cells.is_white_two_cells_deep[_SIDE_INDICES, (at - 0.3).astype(np.intp)]
+        free = inner_border_cells.are_two_cells_inside_border_white[
+            _SIDE_INDICES, (at - 0.3).astype(np.intp)
+        ]
         free = (
             free
-            * inner_border_cells.is_white_two_cells_deep[_SIDE_INDICES, (at + 0.3).astype(np.intp)]
+            * inner_border_cells.are_two_cells_inside_border_white[
+                _SIDE_INDICES, (at + 0.3).astype(np.intp)
+            ]
         )
         can_be_located[-4:] = free > 0.0
-        has_outer_neighbour[-4:] = 1.0
+        outer_neighbour_count[-4:] = 1.0
     return NeighbourEdges(
-        neighbour_distance_px, has_inner_neighbour, has_outer_neighbour, can_be_located
+        neighbour_distance_px, inner_neighbour_count, outer_neighbour_count, can_be_located
     )
 
 
@@ -658,7 +701,7 @@ _MIN_FRACTION_OF_MEAN_GRADIENT = (
 )
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # for a scatter that counts as noise
 _MAX_WIDE_WINDOW_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
-_CONVERGED_LINE_PX = 0.06
+_MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
 _OUT_OF_RANGE = 1e6
 _QUARTER_PROFILES = PROFILES_PER_SIDE // 4
@@ -682,29 +725,33 @@ class NeighbourEdges:
     Attributes:
         neighbour_distance_px: distance to a neighbouring edge, the size of a cell across the edge,
             (rows,).
-        has_inner_neighbour, has_outer_neighbour: 1 if another edge with the same contrast is one
-            cell further in or out, otherwise 0, (rows, n).
+        inner_neighbour_count, outer_neighbour_count: 1 if another edge with the same contrast is
+            one cell further in or out, otherwise 0, (rows, n).
         can_be_located: False if no edge can be found on the profile, (rows, n).
     """
 
     neighbour_distance_px: Array
-    has_inner_neighbour: Floats
-    has_outer_neighbour: Floats
+    inner_neighbour_count: Floats
+    outer_neighbour_count: Floats
     can_be_located: NDArray[np.bool_]
 
 
 def locate_edges(
-    grey: Floats, half_px: Array, window_half_px: Array, neighbours: NeighbourEdges
+    profile_greys: Floats,
+    profile_half_length_px: Array,
+    window_half_px: Array,
+    neighbours: NeighbourEdges,
 ) -> tuple[Array, Array, Array]:
     """Locate the dark-to-bright edge on each profile. Return its offset from the middle of the
     profile, px (rows, n), its weight, 0 for outliers (rows, n), and the blur of each row, standard
     deviation in px (rows,).
 
     Args:
-        grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
-        half_px, window_half_px: half length of the profiles and of the windows, (rows,).
+        profile_greys: (rows, n, steps + 1), the profile from -half_px to +half_px.
+        profile_half_length_px, window_half_px: half length of the profiles and of the windows,
+            (rows,).
     """
-    profiles = _Profiles(grey, half_px, window_half_px, neighbours)
+    profiles = _Profiles(profile_greys, profile_half_length_px, window_half_px, neighbours)
     edge_offsets_px, usable = profiles.locate_in_wide_window()
     blur_px2 = np.ones(len(window_half_px), dtype=np.float32)
     line = weight = _fit_line_to_half_midmeans(edge_offsets_px, usable)
@@ -717,7 +764,7 @@ def locate_edges(
             edge_offsets_px, usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
         )
         moved_px, line = float(np.abs(centre - line).max()), centre
-        if moved_px < _CONVERGED_LINE_PX:
+        if moved_px < _MAX_CONVERGED_LINE_CHANGE_PX:
             break
     return (
         edge_offsets_px.astype(np.float64),
@@ -730,10 +777,16 @@ class _Profiles:
     """The gradients along all profiles, and the values that every window over them needs."""
 
     def __init__(
-        self, grey: Floats, half_px: Array, window_half_px: Array, around: NeighbourEdges
+        self,
+        profile_greys: Floats,
+        profile_half_length_px: Array,
+        window_half_px: Array,
+        around: NeighbourEdges,
     ) -> None:
-        self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
-        self.u = half_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS  # position, (rows, steps)
+        self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
+        self.u = (
+            profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS
+        )  # position, (rows, steps)
         self.near, self.depth = (
             window_half_px.astype(np.float32),
             around.neighbour_distance_px.astype(np.float32),
@@ -741,8 +794,8 @@ class _Profiles:
         self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
         # Neighbouring edges on the flanks: number on both, and outside minus inside.
         self.both, self.side = (
-            around.has_inner_neighbour + around.has_outer_neighbour,
-            around.has_outer_neighbour - around.has_inner_neighbour,
+            around.inner_neighbour_count + around.outer_neighbour_count,
+            around.outer_neighbour_count - around.inner_neighbour_count,
         )
         self.can = around.can_be_located.astype(np.float32)
         # Factor for the sum over a row's profiles: a share of the mean over the possible ones.

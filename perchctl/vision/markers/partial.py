@@ -43,7 +43,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.detector import Picture, is_hidden
+from perchctl.vision.markers.detector import Picture, is_any_part_hidden
 from perchctl.vision.markers.edge_fit import (
     MIN_LINE_SIGMA_PX,
     PROFILES_PER_SIDE,
@@ -59,7 +59,7 @@ from perchctl.vision.markers.edge_fit import (
     window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    CELL_MARGIN_PER_CONTRAST,
+    MIN_CELL_TO_THRESHOLD_PER_CONTRAST,
     MIN_CONTRAST_GREY,
     MIN_MATCHING_CELL_FRACTION,
     Pattern,
@@ -69,7 +69,7 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side contains no information
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
-_MAX_BLUR_WINDOW_FRACTION = 0.9  # share of the window
+_MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9  # share of the window
 _MAX_CORNER_SIGMA_SIDES = 0.02  # share of the side: less certain corners are no measurement
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
@@ -82,37 +82,42 @@ _MAX_MOTION_FROM_START_PX = (
 def fit_partly_visible(
     picture: Picture,
     name: MarkerName,
-    start_px: Array,
+    start_corners_px: Array,
     identified_by: IdentifiedBy,
     known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """Fit the whole marker near corners `start_px` (4, 2), which may be outside the picture.
+    """Fit the whole marker near corners `start_corners_px` (4, 2), which may be outside the
+    picture.
 
     `identified_by` says what identifies the marker; `known_edge_shift` is the shift of all edges,
     if measured before. None if the visible part does not determine the corners, or if its cells are
     not the marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
-    if not mean_side_px(start_px) / pattern.border_cells.cells_per_side >= MIN_PARTIAL_CELL_PX:
+    if (
+        not mean_side_px(start_corners_px) / pattern.border_cells.cells_per_side
+        >= MIN_PARTIAL_CELL_PX
+    ):
         return None
     # Enough cells must be in the picture, wherever the fit may end.
     in_picture = _is_point_in_picture(
-        _project_sample_points_px(start_px, pattern, camera),
+        _project_sample_points_px(start_corners_px, pattern, camera),
         picture.image.shape,
         _MAX_MOTION_FROM_START_PX,
     )
     if not _has_enough_known_cells(_is_cell_known(in_picture, pattern), pattern, identified_by):
         return None
-    start = undistort_px(start_px, camera)
+    start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = homography_from_centred_square(start)
     for k in range(_PARTIAL_FIT_ITERATIONS):
-        seen = find_visible_edges(picture, H, pattern)
-        if seen is None:
+        visible_edges = find_visible_edges(picture, H, pattern)
+        if visible_edges is None:
             return None
         A, N, g = _linearize_edges(
-            seen, known_edge_shift or EdgeShift(0.0, edge_shift_prior_sigma_px(seen.white_grey))
+            visible_edges,
+            known_edge_shift or EdgeShift(0.0, edge_shift_prior_sigma_px(visible_edges.white_grey)),
         )
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
@@ -121,12 +126,15 @@ def fit_partly_visible(
         H = increment_homography(H, p)
         if (
             k > 0
-            and float(np.abs(p[:6]).max() * seen.px_per_half_side.mean()) < _CONVERGED_PARTIAL_PX
+            and float(np.abs(p[:6]).max() * visible_edges.px_per_half_side.mean())
+            < _CONVERGED_PARTIAL_PX
         ):
             break
-    assert seen is not None
-    residual_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
-    found = _make_refined_corners(H, seen, residual_px, N, pattern, camera)
+    assert visible_edges is not None
+    residual_px = visible_edges.edge_from_model_px - (step @ A).reshape(
+        visible_edges.edge_from_model_px.shape
+    )
+    found = _make_refined_corners(H, visible_edges, residual_px, N, pattern, camera)
     if found is None or not _has_matching_visible_cells(
         picture, found.corners_px, pattern, identified_by
     ):
@@ -137,45 +145,52 @@ def fit_partly_visible(
 def is_fully_visible(picture: Picture, found: RefinedCorners) -> bool:
     """True if no part of the marker is hidden or outside the picture."""
     margin_px = PICTURE_MARGIN_PX + found.blur_px
-    return is_inside_picture(found.corners_px, picture.image.shape, margin_px) and not is_hidden(
-        picture.hidden, found.corners_px
-    )
+    return is_inside_picture(
+        found.corners_px, picture.image.shape, margin_px
+    ) and not is_any_part_hidden(picture.hidden_mask, found.corners_px)
 
 
-def _linearize_edges(seen: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
+def _linearize_edges(visible_edges: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
     """Linearise the edges' offsets, px, in nine unknowns: the increment of the homography (8) and
     the shift of all edges.
 
     Returns the derivatives (9, rows * n), the normal matrix (9, 9) and its right-hand side (9,),
     for an edge with a variance of 1 px^2.
     """
-    u, v = seen.points[..., 0], seen.points[..., 1]
-    nx, ny = OUTWARD_NORMALS[seen.side_index].T[..., None] * seen.px_per_half_side[:, None]
+    u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
+    nx, ny = (
+        OUTWARD_NORMALS[visible_edges.side_index].T[..., None]
+        * visible_edges.px_per_half_side[:, None]
+    )
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the observed edge with the shift.
-    A[8] = np.where(seen.centre_distance_half_sides < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(visible_edges.centre_distance_half_sides < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles closer to each other than a pixel measure the same edge.
     worth = np.minimum(
-        1.0, 2.0 * seen.px_per_half_side * seen.centre_distance_half_sides / PROFILES_PER_SIDE
+        1.0,
+        2.0
+        * visible_edges.px_per_half_side
+        * visible_edges.centre_distance_half_sides
+        / PROFILES_PER_SIDE,
     )
-    weighted = A * (seen.weight * worth[:, None]).ravel()
-    N, g = weighted.dot(A.T), weighted.dot(seen.offset_px.ravel())
+    weighted = A * (visible_edges.weight * worth[:, None]).ravel()
+    N, g = weighted.dot(A.T), weighted.dot(visible_edges.edge_from_model_px.ravel())
     # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
     certain = (0.1 / prior.sigma_px) ** 2
     N[8, 8] += certain
-    g[8] += certain * prior.shift_px
+    g[8] += certain * prior.white_growth_px
     N[range(8), range(8)] += 1e-6
     return A, N, g
 
 
 def _make_refined_corners(
     H: Array,
-    seen: VisibleEdges,
+    visible_edges: VisibleEdges,
     residual_px: Array,
     normal_matrix: Array,
     pattern: Pattern,
@@ -184,10 +199,15 @@ def _make_refined_corners(
     """Return the corners of the marker projected by H (3, 3), with their covariance; None if they
     are too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit, and
     `normal_matrix` (9, 9) is that of the last step."""
-    w = seen.weight
+    w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
-    if not used.any() or (seen.blur_window_fraction[used] > _MAX_BLUR_WINDOW_FRACTION).any():
+    if (
+        not used.any()
+        or (
+            visible_edges.blur_per_window_half_length[used] > _MAX_BLUR_PER_WINDOW_HALF_LENGTH
+        ).any()
+    ):
         return None
     if float((w * residual_px**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
         return None
@@ -202,7 +222,8 @@ def _make_refined_corners(
     )
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.border_cells.cells_per_side
-    # The square alone; `edge_shift_sigma_px` covers the uncertainty of the shift of all edges.
+    # The square alone; `remaining_edge_shift_sigma_px` covers the uncertainty of the shift of all
+    # edges.
     J = projected_corners_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_px) ** 2
@@ -214,10 +235,10 @@ def _make_refined_corners(
     return RefinedCorners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
-        refined=True,
-        edge_shift_sigma_px=min(
+        is_fitted=True,
+        remaining_edge_shift_sigma_px=min(
             max(shift_sigma_px, _MIN_EDGE_SHIFT_SIGMA_PX),
-            edge_shift_prior_sigma_px(seen.white_grey),
+            edge_shift_prior_sigma_px(visible_edges.white_grey),
         ),
         cov_px2=cov_px2,
     )
@@ -241,34 +262,39 @@ def _has_matching_visible_cells(
 ) -> bool:
     """True if the visible cells without glare have their colours; `identified_by` decides how many
     must."""
-    image, hidden = picture.image, picture.hidden
+    image, hidden_mask = picture.image, picture.hidden_mask
     h, w = image.shape
     at = _project_sample_points_px(corners_px, pattern, picture.camera)
     near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
-    seen = _is_point_in_picture(at, image.shape, 0.0)
-    if hidden is not None:
-        seen &= ~hidden[near[:, 1], near[:, 0]]
+    is_sample_visible = _is_point_in_picture(at, image.shape, 0.0)
+    if hidden_mask is not None:
+        is_sample_visible &= ~hidden_mask[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
     white_samples = pattern.is_white[pattern.sample_cell_index]
-    if not ((seen & white_samples).any() and (seen & ~white_samples).any()):
+    if not (
+        (is_sample_visible & white_samples).any() and (is_sample_visible & ~white_samples).any()
+    ):
         return False
-    high = float(np.median(grey[seen & white_samples]))
-    low = float(np.median(grey[seen & ~white_samples]))
+    high = float(np.median(grey[is_sample_visible & white_samples]))
+    low = float(np.median(grey[is_sample_visible & ~white_samples]))
     contrast = high - low
     if contrast < MIN_CONTRAST_GREY:
         return False
-    seen &= grey <= high + _GLARE * contrast
+    is_sample_visible &= grey <= high + _GLARE * contrast
     if high < _BRIGHTEST_GREY - _GLARE * contrast:
-        seen &= grey < _BRIGHTEST_GREY
-    count = np.bincount(pattern.sample_cell_index, weights=seen)
-    means = np.bincount(pattern.sample_cell_index, weights=grey * seen) / np.maximum(count, 1.0)
-    known = _is_cell_known(seen, pattern)
+        is_sample_visible &= grey < _BRIGHTEST_GREY
+    count = np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
+    means = np.bincount(pattern.sample_cell_index, weights=grey * is_sample_visible) / np.maximum(
+        count, 1.0
+    )
+    known = _is_cell_known(is_sample_visible, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_white, 1.0, -1.0)
-    wrong = np.count_nonzero(known & (share < CELL_MARGIN_PER_CONTRAST))
+    wrong = np.count_nonzero(known & (share < MIN_CELL_TO_THRESHOLD_PER_CONTRAST))
     most_wrong = 0
     if identified_by == "other":
         most_wrong = math.floor(
-            (1.0 - MIN_MATCHING_CELL_FRACTION) * np.count_nonzero(known & pattern.is_inner)
+            (1.0 - MIN_MATCHING_CELL_FRACTION)
+            * np.count_nonzero(known & pattern.is_cell_inside_border)
         )
     return bool(wrong <= most_wrong) and _has_enough_known_cells(known, pattern, identified_by)
 
@@ -297,10 +323,11 @@ def _is_point_in_picture(
     return np.asarray(inside.all(axis=1))
 
 
-def _is_cell_known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
+def _is_cell_known(is_sample_visible: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
     """Return which cells (cells,) show at least half of their sample points (n,)."""
     known: NDArray[np.bool_] = (
-        np.bincount(pattern.sample_cell_index, weights=seen) >= 0.5 * pattern.samples_per_cell
+        np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
+        >= 0.5 * pattern.samples_per_cell
     )
     return known
 
@@ -310,7 +337,7 @@ def _has_enough_known_cells(
 ) -> bool:
     most_unknown = len(known) if identified_by == "other" else _MAX_UNKNOWN_BITS[identified_by]
     return bool(
-        np.count_nonzero(pattern.is_inner & ~known) <= most_unknown
+        np.count_nonzero(pattern.is_cell_inside_border & ~known) <= most_unknown
         and np.count_nonzero(known) >= _MIN_KNOWN_CELL_FRACTION * len(known)
     )
 
@@ -322,7 +349,7 @@ PICTURE_MARGIN_PX = 2.0
 """Distance to the picture's edge, px, within which blur would need pixels outside the picture."""
 _MIN_INNER_EDGE_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
 _BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5  # shares of the contrast: black inside, white outside
-_MIN_PARTIAL_CONTRAST = 10.0
+_MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
 _MIN_SIDE_WEIGHT_SUM = 3.0  # of a side's profiles
 _MIN_VISIBLE_EDGES = 4  # a square has eight unknowns, and an edge determines two
 _OUT_OF_RANGE_PX = 1e6
@@ -335,25 +362,25 @@ class VisibleEdges:
     edge.
 
     Attributes:
-        points: measured points (rows, n, 2) in the marker's own coordinates.
-        offset_px: outward distance (rows, n) of each point from the model's edge.
+        points_half_sides: measured points (rows, n, 2) in the marker's own coordinates.
+        edge_from_model_px: outward distance (rows, n) of each point from the model's edge.
         weight: weight (rows, n) of each profile.
         side_index: index of the edge's side, 0 to 3, (rows,).
         centre_distance_half_sides: distance of the edge from the marker's centre: 1 for a side,
             less for an inner edge of the border, (rows,).
         px_per_half_side: scale across the edge, (rows,).
-        blur_window_fraction: standard deviation of the blur over the half length of the window,
-            (rows,).
+        blur_per_window_half_length: standard deviation of the blur over the half length of the
+            window, (rows,).
         white_grey: grey level of white paper.
     """
 
-    points: Array
-    offset_px: Array
+    points_half_sides: Array
+    edge_from_model_px: Array
     weight: Array
     side_index: NDArray[np.intp]
     centre_distance_half_sides: Array
     px_per_half_side: Array
-    blur_window_fraction: Array
+    blur_per_window_half_length: Array
     white_grey: float
 
 
@@ -383,7 +410,9 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     # White is outside the marker, and inside its border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
-    window_half_px, half_px = window_and_profile_half_lengths_px(np.full(len(at), cell_px))
+    window_half_px, profile_half_length_px = window_and_profile_half_lengths_px(
+        np.full(len(at), cell_px)
+    )
     depth_px = 2.0 * scale_px / cells
     around = find_neighbour_edges(s, [pattern.border_cells], pattern.border_cells, depth_px)
     is_unobstructed = around.can_be_located & _is_profile_in_view(
@@ -394,16 +423,20 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, is_unobstructed = origin[kept], normal[kept], is_unobstructed[kept]
-    window_half_px, half_px = window_half_px[kept], half_px[kept]
-    grey = sample_profiles(picture.image, origin, normal, half_px)
-    lit = _find_clean_profiles(grey, is_unobstructed, window_half_px, half_px)
+    window_half_px, profile_half_length_px = window_half_px[kept], profile_half_length_px[kept]
+    profile_greys = sample_profiles(picture.image, origin, normal, profile_half_length_px)
+    lit = _find_clean_profiles(
+        profile_greys, is_unobstructed, window_half_px, profile_half_length_px
+    )
     if lit is None:
         return None
     good, white = lit
     around = NeighbourEdges(
-        depth_px[kept], around.has_inner_neighbour[kept], around.has_outer_neighbour[kept], good
+        depth_px[kept], around.inner_neighbour_count[kept], around.outer_neighbour_count[kept], good
     )
-    offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
+    offset_px, weight, blur_px = locate_edges(
+        profile_greys, profile_half_length_px, window_half_px, around
+    )
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT_SUM] = 0.0
     found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
@@ -414,13 +447,13 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         return None
     far = np.einsum("rni,ri->rn", own, OUTWARD_NORMALS[side]) - at[:, None]
     return VisibleEdges(
-        points=own,
-        offset_px=far * scale_px[:, None],
+        points_half_sides=own,
+        edge_from_model_px=far * scale_px[:, None],
         weight=weight,
         side_index=side,
         centre_distance_half_sides=at,
         px_per_half_side=scale_px,
-        blur_window_fraction=blur_px / window_half_px,
+        blur_per_window_half_length=blur_px / window_half_px,
         white_grey=white,
     )
 
@@ -428,7 +461,7 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
 def _is_profile_in_view(
     picture: Picture, origin: Array, normal: Array, window_half_px: Array
 ) -> NDArray[np.bool_]:
-    hidden, (h, w) = picture.hidden, picture.image.shape
+    hidden_mask, (h, w) = picture.hidden_mask, picture.image.shape
     # A profile is in the picture if both of its ends are.
     reach, last = (
         window_half_px[:, None, None] * np.abs(normal),
@@ -436,30 +469,38 @@ def _is_profile_in_view(
     )
     x_and_y = (origin - reach >= PICTURE_MARGIN_PX) & (origin + reach <= last)
     seen = x_and_y[..., 0] & x_and_y[..., 1]
-    if hidden is not None and seen.any():
+    if hidden_mask is not None and seen.any():
         at = (
             origin[:, :, None]
             + window_half_px[:, None, None, None] * _WINDOW_SAMPLE_OFFSETS * normal[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
-        seen &= ~hidden[pixel[..., 1], pixel[..., 0]].any(axis=2)
+        seen &= ~hidden_mask[pixel[..., 1], pixel[..., 0]].any(axis=2)
     return np.asarray(seen)
 
 
 def _find_clean_profiles(
-    grey: Floats, is_unobstructed: NDArray[np.bool_], window_half_px: Array, half_px: Array
+    profile_greys: Floats,
+    is_unobstructed: NDArray[np.bool_],
+    window_half_px: Array,
+    profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return which profiles (rows, n) change from black to white, and the grey level of white
     paper."""
     # At half the window from the edge, blur has ended and no neighbour begins.
-    off = max(1, round(0.5 * SAMPLES_PER_PROFILE * float((0.6 * window_half_px / half_px)[0])))
+    off = max(
+        1,
+        round(
+            0.5 * SAMPLES_PER_PROFILE * float((0.6 * window_half_px / profile_half_length_px)[0])
+        ),
+    )
     dark, bright = (
-        grey[:, :, SAMPLES_PER_PROFILE // 2 - off],
-        grey[:, :, SAMPLES_PER_PROFILE // 2 + off],
+        profile_greys[:, :, SAMPLES_PER_PROFILE // 2 - off],
+        profile_greys[:, :, SAMPLES_PER_PROFILE // 2 + off],
     )
     black, white = (float(np.median(each[is_unobstructed])) for each in (dark, bright))
     contrast = white - black
-    if contrast < _MIN_PARTIAL_CONTRAST:
+    if contrast < _MIN_PARTIAL_MARKER_CONTRAST_GREY:
         return None
     good = (dark < black + _BLACK_MARGIN * contrast) & (bright > white - _WHITE_MARGIN * contrast)
     return is_unobstructed & good, white

@@ -20,7 +20,9 @@ from perchctl.vision.markers.corners import (
 
 MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a blob
 MIN_CONTRAST_GREY = 10.0  # grey levels
-CELL_MARGIN_PER_CONTRAST = 0.1  # margin of a cell to the threshold, as a share of the contrast
+MIN_CELL_TO_THRESHOLD_PER_CONTRAST = (
+    0.1  # margin of a cell to the threshold, as a share of the contrast
+)
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
@@ -33,18 +35,19 @@ class BorderCells:
     """The cells just inside a marker's border, along its four sides in the order of the corners.
 
     Attributes:
-        is_white: 1 for a white cell, (4, n); the first and last ones belong to the border.
-        is_white_two_cells_deep: 1 if the next cell further in is white, too, (4, n).
+        is_cell_inside_border_white: 1 for a white cell, (4, n); the first and last ones belong to
+            the border.
+        are_two_cells_inside_border_white: 1 if the next cell further in is white, too, (4, n).
         print_tolerance_cells: standard deviation of the position of a printed edge.
     """
 
-    is_white: Array
-    is_white_two_cells_deep: Array
+    is_cell_inside_border_white: Array
+    are_two_cells_inside_border_white: Array
     print_tolerance_cells: float = 0.0
 
     @property
     def cells_per_side(self) -> int:
-        return int(self.is_white.shape[1])
+        return int(self.is_cell_inside_border_white.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +61,10 @@ class Pattern:
             `perchctl.vision.markers.corners`).
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
-        templates: expected grey (4, n) at the sample points with a blur of half a cell, zero-mean
-            and of unit norm, for corners rolled by 0 to 3.
-        is_white, is_inner: True for a white cell, for a cell within the border, (cells,).
+        rotated_sample_templates: expected grey (4, n) at the sample points with a blur of half a
+            cell, zero-mean and of unit norm, for corners rolled by 0 to 3.
+        is_white, is_cell_inside_border: True for a white cell, for a cell within the border,
+            (cells,).
     """
 
     border_cells: BorderCells
@@ -68,9 +72,9 @@ class Pattern:
     sample_points: Array
     sample_cell_index: NDArray[np.intp]
     samples_per_cell: Array
-    templates: Array
+    rotated_sample_templates: Array
     is_white: NDArray[np.bool_]
-    is_inner: NDArray[np.bool_]
+    is_cell_inside_border: NDArray[np.bool_]
 
 
 def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0) -> BorderCells:
@@ -118,9 +122,9 @@ def make_pattern(border_cells: BorderCells, drawing: Drawing) -> Pattern:
         sample_points=np.ascontiguousarray(sample_points[free]),
         sample_cell_index=own,
         samples_per_cell=np.bincount(own).astype(np.float64),
-        templates=np.stack(turns),
+        rotated_sample_templates=np.stack(turns),
         is_white=drawing.cell_whiteness.ravel()[kept] > 0.5,
-        is_inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
+        is_cell_inside_border=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
 
 
@@ -134,7 +138,7 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), CELL_MARGIN_PER_CONTRAST * contrast
+    middle, margin = 0.5 * (high + low), MIN_CELL_TO_THRESHOLD_PER_CONTRAST * contrast
     return bool(
         contrast >= MIN_CONTRAST_GREY
         and white.min() > middle + margin
@@ -173,7 +177,7 @@ def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Patt
     # If half of the samples are black and half are white, they differ by two standard deviations.
     if spread < 0.5 * MIN_CONTRAST_GREY * math.sqrt(len(grey)):
         return np.zeros(4)
-    return np.asarray(pattern.templates @ grey / spread)
+    return np.asarray(pattern.rotated_sample_templates @ grey / spread)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
@@ -227,7 +231,7 @@ class Drawing:
     paper_half_side: float | None = None
 
     @property
-    def compared_half_side(self) -> float:
+    def photometric_fit_reach_half_sides(self) -> float:
         """Half the side of the square that the photometric fit compares with the picture, in the
         marker's own coordinates."""
         return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
@@ -274,13 +278,15 @@ def _add_margin_nodes(node_positions: Array, half_node_spacing: float) -> Array:
 
 
 @lru_cache(maxsize=64)
-def render_layers(drawing: Drawing, nodes_per_side: int) -> tuple[NDArray[np.float32], ...]:
+def render_whiteness_and_beyond_paper(
+    drawing: Drawing, nodes_per_side: int
+) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing at n by n nodes and the margin around them.
 
     Returns the whiteness of each node, 0 to 1. If the paper ends inside the compared square, a
     second layer contains the fraction of each node outside the paper.
     """
-    half_node_spacing = drawing.compared_half_side / nodes_per_side
+    half_node_spacing = drawing.photometric_fit_reach_half_sides / nodes_per_side
     node_positions: Array = half_node_spacing * (
         2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
     )
@@ -300,7 +306,9 @@ def render_layers(drawing: Drawing, nodes_per_side: int) -> tuple[NDArray[np.flo
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
     """Return the whiteness of a black square with the size of a marker that has `cells_per_side`
     cells, at n by n nodes."""
-    return render_layers(Drawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side)[0]
+    return render_whiteness_and_beyond_paper(
+        Drawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
+    )[0]
 
 
 def render_cells(

@@ -45,7 +45,7 @@ from perchctl.vision.markers.pattern import (
     blur_nodes,
     blurred_cell_coverage,
     render_black_square,
-    render_layers,
+    render_whiteness_and_beyond_paper,
 )
 from perchctl.vision.types import CameraModel
 
@@ -126,7 +126,7 @@ class _Equations:
     """One linearised round of the fit.
 
     Attributes:
-        gain: grey levels from black to white.
+        contrast_grey: grey levels from black to white.
         grey_residual: the picture's grey values minus the drawing's under the light that fits best,
             (n * n,).
         J: derivatives of the drawing's grey values with respect to the unknowns (k, n * n).
@@ -134,7 +134,7 @@ class _Equations:
         N, g: normal equations N x = g of the next increment, divided by that variance.
     """
 
-    gain: float
+    contrast_grey: float
     grey_residual: Array
     J: Array
     noise_variance_grey2: float
@@ -144,20 +144,20 @@ class _Equations:
 
 def align_drawing(
     image: NDArray[np.uint8],
-    start_px: Array,
+    start_corners_px: Array,
     drawing: Drawing,
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Fit the drawing to the picture, starting at `start_px` (4, 2) and `blur_px`.
+    """Fit the drawing to the picture, starting at `start_corners_px` (4, 2) and `blur_px`.
 
     Returns None if the marker leaves the picture, looks different, or the fit diverges.
     """
-    start = undistort_px(start_px, camera)
+    start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all():
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
-    side_px, reach = float(sides.mean()), drawing.compared_half_side
+    side_px, reach = float(sides.mean()), drawing.photometric_fit_reach_half_sides
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
     n = int(
@@ -165,8 +165,8 @@ def align_drawing(
     )
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
     grid, H = make_grid(n, reach), homography_from_centred_square(start)
-    node_shift_px = lens_shift_px(grid, H, camera)
-    patch = _extract_patch(image, grid, H, node_shift_px)
+    node_lens_shift_px = lens_shift_px(grid, H, camera)
+    patch = _extract_patch(image, grid, H, node_lens_shift_px)
     if patch is None:
         return None
     around, first = patch
@@ -177,13 +177,17 @@ def align_drawing(
     def limit_blur_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
 
-    seen = drawn(limit_blur_px(blur_px))
-    offset_px, since_lens_px, increment_from_start = node_shift_px - first, 0.0, np.zeros(8)
+    rendered_drawing = drawn(limit_blur_px(blur_px))
+    lens_shift_in_patch_px, since_lens_px, increment_from_start = (
+        node_lens_shift_px - first,
+        0.0,
+        np.zeros(8),
+    )
     for k in range(_MAX_ITERATIONS):
         if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
-            offset_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
-        grey = _sample_patch(around, grid, H, offset_px)
-        equations = _linearize_greys(grey, seen, increment_from_start)
+            lens_shift_in_patch_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
+        grey = _sample_patch(around, grid, H, lens_shift_in_patch_px)
+        equations = _linearize_greys(grey, rendered_drawing, increment_from_start)
         if equations is None:
             return None
         if (
@@ -198,30 +202,36 @@ def align_drawing(
         H, increment_from_start = increment_homography(H, p), increment_from_start + p
         motion_px = 0.5 * side_px * float(np.abs(p[:6]).max())
         since_lens_px += motion_px
-        sigma2 = seen.blur_sigma_nodes**2
+        sigma2 = rendered_drawing.blur_sigma_nodes**2
         most = max(1.0, _MAX_BLUR_VARIANCE_STEP_FRACTION * sigma2)
         squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
         wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
-        drawn_px = seen.blur_sigma_nodes * node_px
+        drawn_px = rendered_drawing.blur_sigma_nodes * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
-            seen = drawn(wanted_px)
+            rendered_drawing = drawn(wanted_px)
         elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_LENS_REUSE_MOTION_PX:
             break
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
-    gain, grey_residual = equations.gain, equations.grey_residual
+    contrast_grey, grey_residual = equations.contrast_grey, equations.grey_residual
     corners_px = distort_px(apply_homography(H, CENTRED_SQUARE).T, camera).T
-    pattern_correlation, pattern_contrast = _measure_inner_pattern_match(seen, grey, gain)
-    correlated_nodes = _estimate_correlated_nodes(grey_residual.reshape(n, n))
+    pattern_correlation, pattern_contrast = _measure_inner_pattern_match(
+        rendered_drawing, grey, contrast_grey
+    )
+    nodes_per_independent_sample = _estimate_nodes_per_independent_sample(
+        grey_residual.reshape(n, n)
+    )
     inverse_normal_matrix = np.asarray(np.linalg.inv(equations.N))
     bit_flip_fraction, bit_flip_fraction_sigma = _measure_bit_flip_fraction(
-        seen, equations, inverse_normal_matrix, correlated_nodes
+        rendered_drawing, equations, inverse_normal_matrix, nodes_per_independent_sample
     )
     J = projected_corners_jacobian(H)
     variance = (
         float(
             np.trace(
-                J @ (inverse_normal_matrix[_SHAPE_SLICE, _SHAPE_SLICE] * correlated_nodes) @ J.T
+                J
+                @ (inverse_normal_matrix[_SHAPE_SLICE, _SHAPE_SLICE] * nodes_per_independent_sample)
+                @ J.T
             )
         )
         / 8.0
@@ -233,40 +243,42 @@ def align_drawing(
         pattern_correlation=pattern_correlation,
         pattern_contrast=pattern_contrast,
         cell_deviation_per_contrast=_cell_deviation(
-            grey_residual / gain, grid, len(drawing.cell_whiteness)
+            grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
         bit_flip_fraction=bit_flip_fraction,
         bit_flip_fraction_sigma=bit_flip_fraction_sigma,
-        blur_px=seen.blur_sigma_nodes * node_px,
-        motion_from_start_px=float(np.abs(corners_px - start_px).max()),
+        blur_px=rendered_drawing.blur_sigma_nodes * node_px,
+        motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
     )
 
 
 def _linearize_greys(
-    grey: Array, seen: RenderedDrawing, increment_from_start: Array
+    grey: Array, rendered_drawing: RenderedDrawing, increment_from_start: Array
 ) -> _Equations | None:
     """Return the equations of the next increment; None without contrast. `increment_from_start`
     (8,) is the sum of the increments so far."""
-    rows, products = seen.illumination_basis
+    rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
-    gain = float(illumination[GAIN])
-    if gain < _MIN_GAIN_GREY:
+    contrast_grey = float(illumination[GAIN])
+    if contrast_grey < _MIN_GAIN_GREY:
         return None
     grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
-    J = np.concatenate([_illuminated_jacobian(seen, illumination), rows, grey_residual[None]])
+    J = np.concatenate(
+        [_illuminated_jacobian(rendered_drawing, illumination), rows, grey_residual[None]]
+    )
     noise = max(float((grey_residual**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT_INDEX + BEND
     N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # about a node's width per round
-    N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * gain) ** -2.0
-    g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * gain) ** -2.0
+    N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
+    g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _INCREMENT_PRIOR_INFORMATION
     g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * increment_from_start
-    return _Equations(gain, grey_residual, J, noise, N, g)
+    return _Equations(contrast_grey, grey_residual, J, noise, N, g)
 
 
 # --- How well the picture matches a fitted drawing ---
@@ -280,31 +292,35 @@ def fit_correlation(grey: Array, grey_residual: Array) -> float:
 
 
 def _measure_bit_flip_fraction(
-    seen: RenderedDrawing,
+    rendered_drawing: RenderedDrawing,
     equations: _Equations,
     inverse_normal_matrix: Array,
-    correlated_nodes: float,
+    nodes_per_independent_sample: float,
 ) -> tuple[float, float]:
     """Return `bit_flip_fraction` and `bit_flip_fraction_sigma` of an `Alignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped one. `correlated_nodes` is the result of `_estimate_correlated_nodes`.
-    """
-    soft, noise, gain = seen.blurred_cell_coverage, equations.noise_variance_grey2, equations.gain
+    1 for a flipped one. `nodes_per_independent_sample` is the result of
+    `_estimate_nodes_per_independent_sample`."""
+    soft, noise, contrast_grey = (
+        rendered_drawing.blurred_cell_coverage,
+        equations.noise_variance_grey2,
+        equations.contrast_grey,
+    )
     n, m = soft.shape
-    found = gain * (soft.T @ equations.grey_residual.reshape(n, n) @ soft).ravel()
-    shared = gain * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
+    found = contrast_grey * (soft.T @ equations.grey_residual.reshape(n, n) @ soft).ravel()
+    shared = contrast_grey * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
     squared = (soft**2).sum(axis=0)
-    energy = gain**2 * np.outer(squared, squared).ravel()
+    energy = contrast_grey**2 * np.outer(squared, squared).ravel()
     taken = np.einsum("ij,ij->j", shared, (inverse_normal_matrix / noise).dot(shared))
     own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
-    flips = np.where(seen.drawing.cell_whiteness.ravel() > 0.5, -1.0, 1.0) * found / own
-    return float(flips.max()), math.sqrt(correlated_nodes * noise / float(own.min()))
+    flips = np.where(rendered_drawing.drawing.cell_whiteness.ravel() > 0.5, -1.0, 1.0) * found / own
+    return float(flips.max()), math.sqrt(nodes_per_independent_sample * noise / float(own.min()))
 
 
 def _measure_inner_pattern_match(
-    drawing: RenderedDrawing, grey: Array, gain: float
+    drawing: RenderedDrawing, grey: Array, contrast_grey: float
 ) -> tuple[float, float]:
     """Return the correlation and the contrast of the inner pattern in `grey` (n * n,)."""
     rows, products = drawing.black_square_illumination_basis
@@ -317,10 +333,10 @@ def _measure_inner_pattern_match(
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
         return 0.0, 0.0
-    return product / scale, product / max(energy, 1e-9) / gain
+    return product / scale, product / max(energy, 1e-9) / contrast_grey
 
 
-def _estimate_correlated_nodes(grey_residual: Array) -> float:
+def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     """Return how many neighbouring nodes share one independent residual, from the correlation of
     `grey_residual` (n, n) between neighbours. The variance of a fit is larger by this factor."""
     energy = max(float((grey_residual * grey_residual).mean()), 1e-9)
@@ -359,10 +375,10 @@ def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
     """Return the derivatives (9, n * n) of the drawing's grey values under `illumination` with
     respect to the homography's increment (8) and the variance of the blur."""
-    gain, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
-    (white, changes), *others = drawing.blurred_layers
-    bend = min(max(float(illumination[BEND]) / gain, -0.9), 0.9)
-    slope = gain + illumination[GAIN_U] * u + illumination[GAIN_V] * v
+    contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
+    (white, changes), *others = drawing.blurred_whiteness_and_beyond_paper
+    bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
+    slope = contrast_grey + illumination[GAIN_U] * u + illumination[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
     for (_, more), height in zip(others, illumination[BEYOND:], strict=True):
@@ -437,12 +453,12 @@ def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
 
 
 def _extract_patch(
-    image: NDArray[np.uint8], grid: Grid, H: Array, node_shift_px: Array
+    image: NDArray[np.uint8], grid: Grid, H: Array, node_lens_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the part of the picture that contains all nodes, and its top left pixel (2, 1); None
     if a node is outside the picture."""
     h, w = image.shape
-    x, y = project_nodes(H, grid.uv1) + node_shift_px
+    x, y = project_nodes(H, grid.uv1) + node_lens_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
@@ -453,9 +469,11 @@ def _extract_patch(
     return part, low[:, None].astype(np.float64)
 
 
-def _sample_patch(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
+def _sample_patch(
+    patch: NDArray[np.float32], grid: Grid, H: Array, lens_shift_in_patch_px: Array
+) -> Array:
     """Return the grey values (n * n,) at the nodes of a patch, shifted by the lens (2, n * n)."""
-    at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
+    at = (project_nodes(H, grid.uv1) + lens_shift_in_patch_px).astype(np.float32)
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
@@ -496,11 +514,11 @@ class RenderedDrawing:
     blur_sigma_nodes: float
 
     @cached_property
-    def blurred_layers(self) -> tuple[tuple[Array, Array], ...]:
-        """The layers of `render_layers` after the blur. Each is a pair: its values at the nodes (n
-        * n,), and their derivatives (9, n * n) with respect to the homography's increment (8) and
-        the variance of the blur."""
-        sharp = render_layers(self.drawing, self.grid.nodes_per_side)
+    def blurred_whiteness_and_beyond_paper(self) -> tuple[tuple[Array, Array], ...]:
+        """The layers of `render_whiteness_and_beyond_paper` after the blur. Each is a pair: its
+        values at the nodes (n * n,), and their derivatives (9, n * n) with respect to the
+        homography's increment (8) and the variance of the blur."""
+        sharp = render_whiteness_and_beyond_paper(self.drawing, self.grid.nodes_per_side)
         return tuple(
             _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions)
             for each in sharp
@@ -512,7 +530,7 @@ class RenderedDrawing:
         matrix. The eighth row, for the grey beyond the paper, exists only if the paper ends inside
         the compared square."""
         u, v, one = self.grid.uv1
-        (white, _), *others = self.blurred_layers
+        (white, _), *others = self.blurred_whiteness_and_beyond_paper
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
         return stacked, gram_matrix(stacked)
@@ -535,7 +553,7 @@ class RenderedDrawing:
     @cached_property
     def blurred_cell_coverage(self) -> Array:
         """Fraction of each node's width that each row (or column) of cells covers, (n, cells)."""
-        half_node = self.drawing.compared_half_side / self.grid.nodes_per_side
+        half_node = self.drawing.photometric_fit_reach_half_sides / self.grid.nodes_per_side
         return blurred_cell_coverage(
             self.drawing, self.grid.node_positions, half_node, self.blur_sigma_nodes
         )
@@ -548,7 +566,7 @@ def render_blurred(drawing: Drawing, nodes_per_side: int, blur_table_index: int)
     can be cached."""
     return RenderedDrawing(
         drawing,
-        make_grid(nodes_per_side, drawing.compared_half_side),
+        make_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),
         math.exp(_LOG_BLUR_TABLE_STEP * blur_table_index),
     )
 

@@ -29,13 +29,15 @@ from perchctl.vision.markers.detector import (
     ThresholdWindowRange,
     make_aruco_detector,
 )
-from perchctl.vision.target_selection import OwnTargetOffset
+from perchctl.vision.target_selection import OwnTargetDistanceFunction
 from perchctl.vision.types import MARKERS, MarkerName
 
-SearchMode = Literal["near", "window", "fits", "sharp", "blurred", "all"]
-"""Kinds of search: near the expected position by a search ("window"), by fits to a blurred target
-("fits"), or by both ("near"); in the whole picture for a "sharp" or a "blurred" target; or
-"all"."""
+SearchMode = Literal[
+    "near_expected", "expected_window", "expected_fits", "whole_sharp", "whole_blurred", "all"
+]
+"""Kinds of search: near the expected position by a search ("expected_window"), by fits to a blurred
+target ("expected_fits"), or by both ("near_expected"); in the whole picture for a "whole_sharp" or
+a "whole_blurred" target; or "all"."""
 _WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
@@ -56,7 +58,7 @@ class FoundMarkers:
     was found, and the number of complete targets to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
-    mirrored: bool = False
+    is_mirrored_marker_seen: bool = False
     target_count: int = 0
 
 
@@ -64,19 +66,18 @@ def search(
     picture: Picture,
     expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
-    own_target_offset_m: OwnTargetOffset | None = None,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
     """Search the window around the expected markers, then the whole picture if the window shows too
     little.
 
-    With `search_mode` "near" or "window", only the window is searched; with "sharp", only the whole
-    picture; otherwise both. If several targets are found and none is expected, the closest by
-    `own_target_offset_m` is chosen.
-    """
+    With `search_mode` "near_expected" or "expected_window", only the window is searched; with
+    "whole_sharp", only the whole picture; otherwise both. If several targets are found and none is
+    expected, the closest by `measure_own_target_distance_m` is chosen."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
-    if setup.is_line_fit_enabled and expected_corners_px and search_mode != "sharp":
-        quickly = search_half_size(picture, expected_corners_px, own_target_offset_m)
+    if setup.is_line_fit_enabled and expected_corners_px and search_mode != "whole_sharp":
+        quickly = search_half_size(picture, expected_corners_px, measure_own_target_distance_m)
         if quickly is not None:
             return quickly
         window = make_search_window(expected_corners_px, setup.small_to_large_side, shape) or whole
@@ -87,7 +88,7 @@ def search(
                 window,
                 expected_corners_px,
                 QUICK_THRESHOLD_WINDOWS_PX,
-                own_target_offset_m,
+                measure_own_target_distance_m,
             )
         if len(found.corners_px) < 2 and window != whole:
             found = _search_once(
@@ -95,21 +96,25 @@ def search(
                 window,
                 expected_corners_px,
                 OPENCV_THRESHOLD_WINDOWS_PX,
-                own_target_offset_m,
+                measure_own_target_distance_m,
             )
         if len(found.corners_px) >= (2 if window == whole else 1) or (
-            search_mode in ("near", "window") and window != whole
+            search_mode in ("near_expected", "expected_window") and window != whole
         ):
             return found
     return _search_once(
-        picture, whole, expected_corners_px, OPENCV_THRESHOLD_WINDOWS_PX, own_target_offset_m
+        picture,
+        whole,
+        expected_corners_px,
+        OPENCV_THRESHOLD_WINDOWS_PX,
+        measure_own_target_distance_m,
     )
 
 
 def search_half_size(
     picture: Picture,
     expected_corners_px: Mapping[MarkerName, Array],
-    own_target_offset_m: OwnTargetOffset | None = None,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
     """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
     shape = picture.image.shape
@@ -127,14 +132,16 @@ def search_half_size(
         window,
         expected_corners_px,
         QUICK_THRESHOLD_WINDOWS_PX,
-        own_target_offset_m,
+        measure_own_target_distance_m,
         halved=True,
     )
     return found if len(found.corners_px) >= len(in_view) else None
 
 
 def make_search_window(
-    expected_corners_px: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
+    expected_corners_px: Mapping[MarkerName, Array],
+    small_to_large_side: float,
+    shape: tuple[int, ...],
 ) -> Window | None:
     """Return the part of the picture to search; None if a window would save little time. The window
     contains the whole large marker if that may be in the picture."""
@@ -144,7 +151,7 @@ def make_search_window(
     else:
         small = expected_corners_px["small"]
         centre = small.mean(axis=0)
-        whole = centre + (small - centre) / ratio
+        whole = centre + (small - centre) / small_to_large_side
         inside = (whole >= 0).all() and (whole < (w, h)).all()
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -162,7 +169,7 @@ def _search_once(
     window: Window,
     expected_corners_px: Mapping[MarkerName, Array],
     threshold_windows_px: ThresholdWindowRange,
-    own_target_offset_m: OwnTargetOffset | None,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None,
     halved: bool = False,
 ) -> FoundMarkers:
     setup, part = picture.setup, picture.image[window]
@@ -175,10 +182,10 @@ def _search_once(
     rows, columns = window
     first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
-    mirrored = False
+    is_mirrored_marker_seen = False
     for quad, index, dictionary in zip(corners, ids.ravel(), which.ravel(), strict=True):
         if index == MIRRORED_MARKER_ID:
-            mirrored = True
+            is_mirrored_marker_seen = True
             continue
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
@@ -186,29 +193,29 @@ def _search_once(
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_pair_markers(candidates, setup.small_to_large_side))
     chosen = choose_markers(
-        candidates, expected_corners_px, setup.small_to_large_side, own_target_offset_m
+        candidates, expected_corners_px, setup.small_to_large_side, measure_own_target_distance_m
     )
-    return FoundMarkers(chosen, mirrored, targets)
+    return FoundMarkers(chosen, is_mirrored_marker_seen, targets)
 
 
 def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
     expected_corners_px: Mapping[MarkerName, Array],
-    ratio: float,
-    own_target_offset_m: OwnTargetOffset | None = None,
+    small_to_large_side: float,
+    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
     A small marker in the centre of a large one, with the right size and rotation, verifies both.
     Markers at expected positions take precedence over a pair elsewhere; among single markers, the
-    closest by `own_target_offset_m` is chosen.
+    closest by `measure_own_target_distance_m` is chosen.
     """
-    if own_target_offset_m is not None and not expected_corners_px:
-        candidates = _sort_by_distance(candidates, own_target_offset_m)
+    if measure_own_target_distance_m is not None and not expected_corners_px:
+        candidates = _sort_by_own_target_distance(candidates, measure_own_target_distance_m)
     large, small = candidates["large"], candidates["small"]
-    wholes = _pair_markers(candidates, ratio)
-    near_large = _nearest_candidate("large", large, expected_corners_px, ratio)
-    near_small = _nearest_candidate("small", small, expected_corners_px, ratio)
+    wholes = _pair_markers(candidates, small_to_large_side)
+    near_large = _nearest_candidate("large", large, expected_corners_px, small_to_large_side)
+    near_small = _nearest_candidate("small", small, expected_corners_px, small_to_large_side)
     if wholes:
         _, i, j = wholes[0]
         if expected_corners_px:
@@ -217,16 +224,19 @@ def choose_markers(
                 float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes
             ]
             _, i, j = wholes[int(np.argmin(distances_px))]
-        elif own_target_offset_m is not None:
+        elif measure_own_target_distance_m is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
-        elsewhere = _nearest_candidate("large", [large[i]], expected_corners_px, ratio) is None
+        elsewhere = (
+            _nearest_candidate("large", [large[i]], expected_corners_px, small_to_large_side)
+            is None
+        )
         if not (elsewhere and (near_large is not None or near_small is not None)):
             return {"large": large[i], "small": small[j]}
     if near_large is not None:
         return {"large": near_large}
     if near_small is not None:
         return {"small": near_small}
-    if own_target_offset_m is not None and not expected_corners_px:
+    if measure_own_target_distance_m is not None and not expected_corners_px:
         large, small = large[:1], small[:1]
     # A small marker next to a complete large one does not belong to the target.
     if len(large) == 1:
@@ -236,8 +246,9 @@ def choose_markers(
     return {}
 
 
-def _sort_by_distance(
-    candidates: Mapping[MarkerName, list[Array]], own_target_offset_m: OwnTargetOffset
+def _sort_by_own_target_distance(
+    candidates: Mapping[MarkerName, list[Array]],
+    measure_own_target_distance_m: OwnTargetDistanceFunction,
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates sorted by their distance, without those that are too far away.
 
@@ -247,19 +258,21 @@ def _sort_by_distance(
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
     for name, quads in candidates.items():
-        distances_m = [own_target_offset_m(name, quad) for quad in quads]
+        distances_m = [measure_own_target_distance_m(name, quad) for quad in quads]
         order = np.argsort(distances_m, kind="stable").tolist()
         kept[name] = [quads[k] for k in order if math.isfinite(distances_m[k])]
     return kept if any(kept.values()) else candidates
 
 
 def _pair_markers(
-    candidates: Mapping[MarkerName, list[Array]], ratio: float
+    candidates: Mapping[MarkerName, list[Array]], small_to_large_side: float
 ) -> list[tuple[float, int, int]]:
     """Return the pairs of markers that form a target: error and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
-        (nesting_error(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)
+        (nesting_error(a, b, small_to_large_side), i, j)
+        for i, a in enumerate(large)
+        for j, b in enumerate(small)
     ]
     best: dict[int, tuple[float, int, int]] = {}
     for pair in sorted(pairs):
@@ -268,10 +281,10 @@ def _pair_markers(
     return list(best.values())
 
 
-def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
+def nesting_error(large_px: Array, small_px: Array, small_to_large_side: float) -> float:
     """Return the distance of the small marker from its position in the large one, in units of the
     tolerance."""
-    mapped = scale_square(large_px, ratio)
+    mapped = scale_square(large_px, small_to_large_side)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
     return float(np.linalg.norm(mapped - small_px, axis=1).max()) / allowed_px
@@ -281,7 +294,7 @@ def _nearest_candidate(
     name: MarkerName,
     quads: list[Array],
     expected_corners_px: Mapping[MarkerName, Array],
-    ratio: float,
+    small_to_large_side: float,
 ) -> Array | None:
     if not expected_corners_px or not quads:
         return None
@@ -290,9 +303,11 @@ def _nearest_candidate(
     else:
         other = next(iter(expected_corners_px.values()))
         centre = other.mean(axis=0)
-        guess = centre + (ratio if name == "small" else 1.0 / ratio) * (other - centre)
+        guess = centre + (small_to_large_side if name == "small" else 1.0 / small_to_large_side) * (
+            other - centre
+        )
     side_px = max(mean_side_px(guess), 1e-6)
-    reach_px = max(2.0 * side_px * (1.0 if name == "small" else ratio), 40.0)
+    reach_px = max(2.0 * side_px * (1.0 if name == "small" else small_to_large_side), 40.0)
     best: Array | None = None
     for quad in quads:
         distance_px = float(np.linalg.norm(quad.mean(axis=0) - guess.mean(axis=0)))

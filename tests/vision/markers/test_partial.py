@@ -25,7 +25,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
     Picture,
-    is_hidden,
+    is_any_part_hidden,
     make_detector_setup,
     make_hidden_mask,
 )
@@ -42,13 +42,13 @@ LARGE = SETUP.patterns["large"]
 
 def partly(
     image: Grey,
-    start_px: Array,
+    start_corners_px: Array,
     identified_by: IdentifiedBy,
     hidden: NDArray[np.bool_] | None = None,
 ) -> RefinedCorners | None:
     """The large marker by what is seen of it."""
     return fit_partly_visible(
-        Picture(image, hidden, SETUP, CAMERA), "large", start_px, identified_by
+        Picture(image, hidden, SETUP, CAMERA), "large", start_corners_px, identified_by
     )
 
 
@@ -174,7 +174,7 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
 
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
-    black = np.flatnonzero(LARGE.is_inner & ~LARGE.is_white)[0]
+    black = np.flatnonzero(LARGE.is_cell_inside_border & ~LARGE.is_white)[0]
     spots = apply_homography(
         homography_from_centred_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
     )
@@ -241,7 +241,7 @@ LEGS = {
 def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
-    assert is_hidden(covered, TRUE)
+    assert is_any_part_hidden(covered, TRUE)
     bare, at = render(*POSE, noise=2.0), homography_from_centred_square(undistort_px(TRUE, CAMERA))
     seen = [
         find_visible_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE)
@@ -292,13 +292,13 @@ def profile_with(folder: Path, image: Grey | str | None, **camera: object) -> Pr
 def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     drawn = np.zeros((H, W), np.uint8)
     drawn[:40, :70] = 255
-    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.hidden_mask
+    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector_setup.hidden_mask
     assert np.array_equal(mask, drawn > 0)
     turned = make_pipeline(
         profile_with(tmp_path, drawn, mirrored="true"), CAMERA
-    ).detector.hidden_mask
+    ).detector_setup.hidden_mask
     assert np.array_equal(turned, drawn[:, ::-1] > 0)
-    assert make_pipeline(Profile(), CAMERA).detector.hidden_mask is None
+    assert make_pipeline(Profile(), CAMERA).detector_setup.hidden_mask is None
 
 
 WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
