@@ -21,11 +21,12 @@ from perchctl.vision.types import FieldState, Frame
 
 GreyImage = NDArray[np.uint8]
 
-# threshold of the ratio of differences; exceeded by fields one pixel apart
+# energy of the strong differences between the two fields over that within the fields; exceeded by
+# fields one pixel apart
 _MIN_ACROSS_TO_WITHIN_FIELD_ENERGY = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
-# multiple of the mean difference within a field above which a difference counts
+# a pixel's difference counts above this multiple of the mean difference within the fields
 _MIN_PIXEL_TO_MEAN_FIELD_DIFFERENCE = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
@@ -104,7 +105,7 @@ def interpolated_edge_sigma_px(blur_px: float) -> float:
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """Return the frame with `fields` set to ``woven`` or ``whole`` if it was None."""
+    """Return the frame with `picture_kind` set to ``woven`` or ``whole`` if it was None."""
     if frame.picture_kind is not None:
         return frame
     return replace(frame, picture_kind="woven" if is_combed(frame.image) else "whole")
@@ -122,9 +123,9 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
 
 def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
     """Return the new state, and the pictures of a stream's frame in time order: the frame itself,
-    or its two fields, a quarter of a period before and after the frame's time.
+    or its two fields, a quarter of the frame period before and after the frame's time.
 
-    In a stream without fields so far, only every third frame is examined.
+    Until a frame was found to be woven, only every third frame is examined for combing.
     """
     skip = (
         frame.picture_kind is None

@@ -64,10 +64,10 @@ class ProcessNoise:
     Attributes:
         acceleration_sigma_mps2: of the target along each axis.
         heading_acceleration_sigma_radps2: of the target's heading.
-        level_frame_acceleration_sigma_radps2: of the rotation of the level frame about its origin,
-            which moves a target in proportion to its distance.
-        is_world_frame_drifting: True if the tracks are in the world frame, whose origin drifts with
-            the state estimate.
+        level_frame_acceleration_sigma_radps2: angular acceleration of the level frame about its
+            origin, the gear; it moves a target in proportion to its distance.
+        is_world_frame_drifting: True if the tracks are in the world frame of the state estimate,
+            which drifts against the room.
     """
 
     acceleration_sigma_mps2: float
@@ -92,15 +92,17 @@ class FilterSetup:
         R, Q: noise of a measurement (4, 4) and of a step (8, 8): ``k1 I`` and ``k2 I`` of the paper
             (cm^2, deg^2), converted to SI.
         P0: covariance (8, 8) after the first measurement.
-        velocity_factor_per_unseen_frame: factor on all rates in a frame without a measurement,
-            ``kalman.alpha`` of the profile (equation 3).
+        velocity_factor_per_unseen_frame: factor on the velocity and the yaw rate in a frame without
+            a measurement, ``kalman.alpha`` of the profile (equation 3).
         max_unseen_frames: frames without a measurement after which a track ends, ``kalman.n_max``
             of the profile.
-        acceleration_noise: if not None, it replaces Q, and the covariance of each pose replaces R.
+        acceleration_noise: process noise that replaces Q, while the covariance of each pose
+            replaces R; None: Q and R are used.
         tilt_sigma_rad: constant error of the vehicle's roll and pitch.
-        max_target_speed_mps: largest speed of the target in its frame while it is not measured.
-        max_nis_without_restart: limit of the normalized innovation squared (NIS), above which a
-            track restarts.
+        max_target_speed_mps: largest speed of the target in the track's frame while it is not
+            measured: that of the drift of the world frame, unlimited in the level frame.
+        max_nis_without_restart: largest normalized innovation squared (NIS) of a measurement that
+            updates the track; with a larger one, the track restarts.
 
     With the innovation v = z - H x of a measurement z and its covariance S = H P H^T + R, NIS is
     v^T S^-1 v. The motion model cannot explain a larger one, for example after lost frames, and an
@@ -126,9 +128,9 @@ class Measurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
     means the setup's R.
 
-    Column k of `shift_per_constant_error` (4, 4) is the change of z by one standard deviation of
-    constant error k: the vehicle's roll and pitch, the print's size and curl. None means no such
-    errors.
+    `shift_per_constant_error` (4, 4) has one row for each element of z and one column for each
+    constant error: the vehicle's roll and pitch, the print's size and curl. A column is the change
+    of z by one standard deviation of that error. None means no such errors.
     """
 
     z: Array
@@ -182,7 +184,8 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
 
 
 def vector_by_tilt_jacobian(vector_m: Array) -> Array:
-    """Return the derivative (3, 2), m/rad, of `vector_m` (3,) by rotations about level x and y."""
+    """Return the derivative (3, 2), m/rad, of a vector `vector_m` (3,) in level axes with respect
+    to small rotations about level x and y."""
     x, y, z = vector_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
@@ -193,8 +196,9 @@ def transition_matrix(dt_s: float) -> Array:
 
 
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
-    """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in its
-    frame."""
+    """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in the
+    track's frame, level (from the gear) or world; the rotation of the level frame moves a distant
+    target further."""
     noise = setup.acceleration_noise
     if noise is None:
         return setup.Q
@@ -341,7 +345,9 @@ def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
 def _predict_from_state(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen_frames: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """Return the track predicted from the state `x` to `t_s`, without a measurement."""
+    """Return the track at `t_s` without a measurement: its covariance is predicted over `dt_s`, and
+    its state is predicted from `x` (8,), which replaces the track's own: with slower velocities if
+    the target was not seen."""
     x = _limit_target_speed(x, setup)
     F = transition_matrix(dt_s)
     x, P = _import_filterpy_predict()(

@@ -34,7 +34,8 @@ def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
 
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
-    """Convert pixels (n, 2) of the lens to pixels (n, 2) of a pinhole camera with the same `K`."""
+    """Convert pixels (n, 2) of the distorted picture to those (n, 2) of an undistorted one, taken
+    by a pinhole camera with the same `K`."""
     return pinhole_px(undistort_to_normalised(points_px, camera), camera)
 
 
@@ -49,7 +50,8 @@ def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
 
 
 def distort_to_px(normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2); the inverse of `undistort`."""
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the distorted picture; the inverse
+    of `undistort_to_normalised`."""
     rays = np.ones((len(normalised), 1, 3))
     rays[:, 0, :2] = normalised
     return _project_points(rays, _ZERO_VECTOR, _ZERO_VECTOR, camera)

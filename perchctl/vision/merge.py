@@ -38,15 +38,16 @@ _STAGE_OF = {
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame.
+    """The target in the tracks' frame: relative to the gear in level axes, or in the world of the
+    state estimate.
 
     Attributes:
-        track_frame_xyz_yaw: position and yaw (4,).
-        track_frame_velocity_mps: velocity (3,).
+        track_frame_xyz_yaw: position and yaw of the target (4,).
+        track_frame_velocity_mps: velocity of that position (3,).
         cov_m2, var_yaw_rad2: covariance (3, 3) of the position, and variance of the yaw, without
             constant errors.
         shift_per_constant_error_m: change (3, 4) of the position by one standard deviation of each
-            constant error (see `Measurement`).
+            constant error, one column per error (see `Measurement`).
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
@@ -71,8 +72,9 @@ def measure_markers(
     """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
     `start_pose` is the last pose of the target, moved by the vehicle's motion since.
-    `previous_target_normal_cam` (3,) is the target's normal in the last pose, in the camera's axes
-    at that time."""
+    `previous_target_normal_cam` (3,) is the target's unit normal, out of the paper, in the last
+    pose, in the camera's axes at that time.
+    """
     seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
     joint = None
     if config.method == "joint" and len(seen) == 2:
@@ -118,8 +120,9 @@ def merge_tracks(
     poses_by_track: Mapping[str, MarkerPose],
     weights: WeightsConfig,
 ) -> MergedTarget | None:
-    """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    update, or otherwise from the tracks measured last; None without tracks."""
+    """Return the target as the mean of both markers' tracks, weighted by W (`make_weight_matrix`;
+    equations 5, 8, 12 of the paper), from the tracks that this frame's poses update, or otherwise
+    from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())
@@ -158,8 +161,8 @@ def merge_tracks(
 
 def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Return the target with a covariance that also covers a second possible position: that of a
-    contradicting rival with the state `rival_state` (8,). With the difference d between both, the
-    covariance grows by d d^T."""
+    rival, a target-like pattern at a place that contradicts the target's track, with the state
+    `rival_state` (8,). With the difference d between both, the covariance grows by d d^T."""
     off = rival_state[_POSITION_AND_YAW] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -224,7 +227,8 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 
 
 def detected_stage(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
-    """Return the stage of a frame from whether its large and its small marker were detected."""
+    """Return the stage (paper, section II-A.2) of a frame from whether its large and its small
+    marker were detected."""
     if is_large_detected:
         return VisibleMarkers.BOTH if is_small_detected else VisibleMarkers.LARGE
     return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
@@ -251,9 +255,9 @@ def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
 def is_pair_inconsistent(
     large: MarkerPose, small: MarkerPose, max_position_difference_m: float
 ) -> bool:
-    """True if the markers differ by more than `max_position_difference_m` and four standard
-    deviations on any axis. Errors of the print shift both markers alike, so they add no
-    tolerance."""
+    """True if the positions from the two markers differ on any axis by more than
+    `max_position_difference_m` and by more than four standard deviations. Errors of the print shift
+    both markers alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
         np.maximum(p.sigma_m**2 - (p.print_error_shifts_m**2).sum(axis=1), 0.0)

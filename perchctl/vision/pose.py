@@ -79,9 +79,12 @@ def estimate_pose(
     """Return the pose from one marker's corners, or from both markers' corners at once.
 
     `start`, the joint pose of the same frame, is refined with these corners instead of solving from
-    scratch, since its tilt is already decided. Without an attitude, `previous_target_normal_cam`
-    (3,) decides the tilt. Returns None if the corners yield no pose: no finite solution in front of
-    the camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`."""
+    scratch, since it has already chosen between the two tilts that a planar marker allows.
+    Otherwise the vehicle's roll and pitch choose, or, without an attitude, the tilt is chosen whose
+    normal is nearer to `previous_target_normal_cam` (3,). Returns None if the corners yield no
+    pose: no finite solution in front of the camera, or a reprojection error (RMS over the corners)
+    above `pose.max_reprojection_px`.
+    """
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_px):
@@ -169,8 +172,8 @@ def _make_marker_pose(
 
 
 def target_covariance_cam(pose: MarkerPose) -> Array:
-    """Return a pose's covariance (6, 6) as small rotations (rad) about and translations (m) along
-    the camera's x, y, z, without the errors of the print."""
+    """Return the covariance (6, 6) of the target's pose in the camera frame, as small rotations
+    (rad) about and translations (m) along the camera's x, y, z, without the errors of the print."""
     assert pose.rvec_tvec_cov is not None
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
     turns = dR.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
@@ -190,7 +193,8 @@ def rotation_vector(R: Array) -> Array:
 
 
 def target_normal_cam(pose: MarkerPose) -> Array:
-    """Return the marker's z axis (out of the paper) in camera axes, (3,)."""
+    """Return the target's unit normal, the marker's z axis out of the paper, in camera axes,
+    (3,)."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
@@ -242,8 +246,8 @@ class ScoredPose(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected normal (3,) of the marker in camera axes, None if unknown, and its standard
-    deviation."""
+    """Expected unit normal of the target, out of the paper, in camera axes, (3,), None if unknown,
+    and its standard deviation."""
 
     target_normal_cam: Array | None
     sigma_rad: float
@@ -315,7 +319,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 class PoseCovariance(NamedTuple):
     """Covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and the change
-    of the pose (6,) by one standard deviation of the sheet's curl."""
+    of (rvec, tvec), rad and m, (6,), by one standard deviation of the sheet's curl as a bowl."""
 
     cov: Array
     chi2: float
@@ -439,7 +443,8 @@ def _choose_likeliest(
 def curl_lift(object_m: Array, paper_curvature_per_m: float) -> Array:
     """Return the distances of corners (n, 3) from the flat sheet for one standard deviation of each
     mode of curl: a bowl, with all corners to one side, and a saddle, with neighbouring corners to
-    opposite sides. Shape (2n, 2), m, with each corner's row twice, for its x and y."""
+    opposite sides. `paper_curvature_per_m` is the lift per squared distance from the centre. Shape
+    (2n, 2), m, with each corner's row twice, for its x and y."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = paper_curvature_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -485,11 +490,13 @@ class WeightedCorners:
             camera `K` (3, 3).
         sigma_px: standard deviations (n,).
         whitening: matrix (2n, 2n) that makes the errors independent, with unit variance.
-        whitened_corner_shift_per_error: one standard deviation, whitened, of each error common to
-            several corners (2n, k): the shift of all edges, `rolling_shutter_error_shift_px` of the
-            detections, and the jitter of each detection's rows.
+        whitened_corner_shift_per_error: whitened shift of the corners by one standard deviation of
+            each error common to several of them, one column per error (2n, k): white grown over
+            black at all edges, `rolling_shutter_error_shift_px` of the detections, and the jitter
+            of each detection's rows.
         curl_lift_m: result (2n, 2) of `curl_lift`.
-        allows_for_curl: True if the sheet's curl changes the weights of the corners.
+        allows_for_curl: True if the sheet may be curled, so that corners which curl moves have less
+            weight; False: it is taken for flat.
     """
 
     object_m: Array
@@ -562,7 +569,8 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
-    """Return the standard deviation of each side, (4,): larger for a side along the rows."""
+    """Return the standard deviation, px, of each side's position across it, (4,): larger for a side
+    along the picture's rows, because a field has only every second row."""
     sides = corners.take(_SIDE_END, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])

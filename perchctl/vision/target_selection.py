@@ -23,9 +23,9 @@ _SEARCHED_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
 @dataclass(frozen=True)
 class OwnTargetPosition:
-    """Position (x, y) of the vehicle's own target in the world frame of the state estimate, None if
-    unknown. A target further than `max_distance_m` from this position belongs to another
-    vehicle."""
+    """Position `xy_world_m` of the vehicle's own target in the world frame of the state estimate;
+    None if unknown: the target nearest to the axis above the gear is taken. A target further than
+    `max_distance_m` from a known position belongs to another vehicle."""
 
     xy_world_m: tuple[float, float] | None = None
     max_distance_m: float = math.inf
@@ -65,8 +65,8 @@ def marker_to_own_target_m(
 def horizontal_distance_to_own_target_m(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
-    """Return a target's horizontal distance from the own target's position; from the gear if
-    unknown."""
+    """Return the horizontal distance of a seen target from the own target's position; from the gear
+    if that is unknown."""
     if own_target.xy_world_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -114,8 +114,8 @@ def target_world_to_level(
     attitude: VehicleState,
     setup: PoseSetup,
 ) -> tuple[Array, float]:
-    """Convert a target's position (3,) and heading in the world to the level frame, relative to the
-    gear; the inverse of `target_level_to_world`."""
+    """Convert a target's position (3,) and heading in the world frame of the state estimate to
+    those relative to the gear in the level frame; the inverse of `target_level_to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     body_to_target_m = (target_position_world_m - np.asarray(attitude.position_m)).dot(
         attitude.R_world_level

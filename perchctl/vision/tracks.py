@@ -40,8 +40,9 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The constants of the filters in the level and the world frame and of the pose estimation,
-    whether the gate is enabled, and the position of the vehicle's own target."""
+    """Constants of the filters in the level and the world frame and of the pose estimation; whether
+    poses that do not fit the tracked target are rejected (`has_gate`); and the position of the
+    vehicle's own target."""
 
     level_filter: FilterSetup
     world_filter: FilterSetup
@@ -56,8 +57,12 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks, lock and rival after a frame, and the verdict of the gate;
-    `measured.poses_by_track` is empty if the gate rejects the frame's pose."""
+    """Tracks after a frame; the target that is followed (`lock`) and a competing target-like
+    pattern (`rival`), None if there is none; and whether the pose was accepted as the target's
+    (`verdict`, the decision of the gate).
+
+    `measured.poses_by_track` is empty if the gate rejects the frame's pose.
+    """
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -186,8 +191,9 @@ _MAX_REMAINING_MISFIT_FRACTION = 0.25
 @dataclass(frozen=True, eq=False)
 class FramePose:
     """A frame's pose and its measurement for the filter, with whether both markers contributed and
-    whether the locked target's position is in the picture. `is_attitude_unknown` is True if the
-    camera is used alone, without a vehicle."""
+    whether the position of the target that is followed is in the picture
+    (`is_locked_target_in_view`). `is_attitude_unknown` is True if the camera is used alone, without
+    a vehicle."""
 
     t_s: float
     pose: MarkerPose
@@ -201,7 +207,8 @@ class FramePose:
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
-    restart at the pose, and whether they restart for the same target.
+    restart at the pose, and whether they restart for the target followed so far
+    (`restarts_for_locked_target`) instead of for the rival.
 
     `rival` is the rival track after this frame; `text` explains a rejection or a restart.
     """
@@ -220,7 +227,9 @@ def judge_pose(
     frame_pose: FramePose,
     filter_setup: FilterSetup,
 ) -> GateVerdict:
-    """Return the gate's verdict on a frame's pose, given the lock and the rival, if any."""
+    """Decide whether a frame's pose belongs to the target that is followed (`lock`), to a competing
+    target-like pattern (`rival`), or to neither, which begins a new rival; lock and rival are None
+    if there is none. A pose without a lock is accepted."""
     lock, rival = drop_expired(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
@@ -265,7 +274,9 @@ def judge_pose(
 def drop_expired(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
-    """Return the lock and the rival, with None for each that has expired at `t_s`."""
+    """Return lock and rival, each replaced by None if it has not been seen for too long at `t_s`: a
+    rival, or a lock in the level frame without a rival, for `MAX_TRACK_GAP_S`, any other lock for
+    `LOCK_TIMEOUT_S`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
@@ -329,8 +340,8 @@ def update_lock(
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """The difference of a pose from its prediction in (yaw, x, y, z), (4,), and its covariance (4,
-    4)."""
+    """A pose as measured minus its prediction in the track's frame, (yaw, x, y, z), rad and m,
+    (4,), and the covariance `S` (4, 4) of that difference."""
 
     measured_minus_predicted_yaw_xyz: Array
     S: Array
@@ -396,8 +407,8 @@ def _range_m(frame_pose: FramePose) -> float:
 
 
 def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
-    """Return the standard deviations of (yaw, x, y, z) at a range due to errors that no covariance
-    models."""
+    """Return the standard deviations of (yaw, x, y, z), rad and m, at a range due to errors that no
+    covariance models."""
     sideways_m, along_m = (
         _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
         _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
@@ -407,8 +418,8 @@ def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
 
 def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: Array) -> bool:
     """True if the target is where the vehicle saw it last, but not where the world frame predicts
-    it: the pose in the level frame has changed much less than its `world_residual`. Then the state
-    estimate has jumped."""
+    it: the pose relative to the gear has changed much less than `world_residual` (4,), measured
+    minus predicted (yaw, x, y, z) in the world, rad and m. Then the state estimate has jumped."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
@@ -507,8 +518,9 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 
 
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
-    """True if the rival is most likely the target, seen from another place because the camera moved
-    during lost frames."""
+    """True if the rival is most likely the target itself, and its distance from the track is due to
+    the camera's motion during lost frames: only the rival was seen for `MIN_RIVAL_ONLY_S`, since
+    after the last sight of the target, in enough frames and with as many markers as the target."""
     if rival.since_s < lock.track.t_s or frame_pose.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
         return False
     if not lock.has_both_markers:

@@ -23,7 +23,7 @@ GearToTargetInLevel = Array
 
 
 class VisibleMarkers(Enum):
-    """The markers of the target in view (paper, section II-A.2)."""
+    """The stage of the paper (section II-A.2): which of the target's markers are in view."""
 
     NONE = "none"
     LARGE = "large"  # stage 1, equation 5
@@ -142,10 +142,21 @@ class Detection:
     """One marker's corners in the image: (4, 2) px, TL TR BR BL in the order of cv2.aruco; pixel
     (0, 0) is the centre of the top-left pixel.
 
-    `sigma_px` is the standard deviation of the corners, from the residuals of the line fit, or a
-    default if no line could be fitted. Corners inferred from a part of the drawing may lie outside
-    the picture. They have a covariance `cov_px2` (8, 8) in pixels of a pinhole camera, with x and y
-    of each corner alternating.
+    Attributes:
+        sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
+            default if no line could be fitted.
+        is_fitted: True if the corners follow from a fit of lines or of the drawing, False if each
+            was located by itself.
+        remaining_edge_shift_sigma_px: standard deviation of the common outward shift of all edges
+            that remains after its correction.
+        rolling_shutter_error_shift_px: change (4, 2) of the corners by one standard deviation of
+            the error of the readout time, which is common to both markers; None: no such error.
+        cov_px2: covariance (8, 8) of corners inferred from a part of the drawing, which may lie
+            outside the picture: in pixels of a pinhole camera, with x and y of each corner
+            alternating.
+        row_jitter_sigma_px: standard deviation due to the jitter of rows in analogue video.
+        horizontal_side_extra_sigma_px: additional standard deviation of sides along the rows, if
+            every second row is interpolated.
     """
 
     marker: MarkerName
@@ -167,8 +178,9 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """How far white has grown over black at all edges of a picture, px, its standard deviation, px,
-    and the number of pictures since it was measured."""
+    """How far white has grown over black at all edges of a picture, `white_growth_px` (positive: a
+    marker's black square looks smaller), its standard deviation, px, and the number of pictures
+    since it was measured."""
 
     white_growth_px: float
     sigma_px: float
@@ -202,7 +214,7 @@ class Detections:
 
 @dataclass(frozen=True, eq=False)
 class VehicleState:
-    """The vehicle's attitude and position at a frame's time, world axes.
+    """The vehicle's attitude, position and velocity at a frame's time, in world axes.
 
     Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
     if unknown.
@@ -240,7 +252,7 @@ class MarkerPose:
         e_m: position of the target relative to the gear in the level frame, (3,).
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
-        rms_reprojection_px: RMS error of the corners.
+        rms_reprojection_px: RMS distance of the projected from the measured corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
         print_error_shifts_m: shift of `e_m` by one standard deviation of the print's size and of
@@ -294,24 +306,25 @@ class TargetEstimate:
 
     Attributes:
         t_s: time of the estimate: the frame's, or later by prediction.
-        measured_s, small_measured_s: exposure of the last frame that measured the target, and its
-            small marker.
+        measured_s, small_measured_s: time (on the clock of `t_s`) of the exposure of the last frame
+            that measured the target, and of the last one that measured its small marker.
         stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
-        measured: the newest frame contains a detection of the target.
-        tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
-            is the target's last position.
+        measured: True if the newest frame contains a detection of the target.
+        tracked: True if the target was measured at most `kalman.n_max` frames ago. If False, the
+            estimate is the target's last position.
         unseen: number of frames since the last detection.
-        e_m: target relative to the gear in the level frame, (3,) m.
+        e_m: vector from the gear to the target in the level frame, (3,).
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`. While only a
             rival is seen, which may be the target, sigma_m also covers the rival's position.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
-        velocity_mps: the filter's velocity of `e_m` (`kalman.frame: level`) or of the target in the
-            world (`kalman.frame: world`), in level axes, (3,).
+        velocity_mps: the filter's velocity, in level axes, (3,): of `e_m` (`kalman.frame: level`)
+            or of the target in the world (`kalman.frame: world`).
         measured_offset_m: vector from the gear to the target at `measured_s`, in axes of the state
             estimate's world, (3,); None without an attitude. Unlike `e_m`, it does not depend on
             how far the vehicle has moved since.
-        world_m, world_yaw_rad: the target in the world frame of the vehicle's state estimate; None
-            without an attitude. world_velocity_mps: drift of that frame relative to the target,
+        world_m, world_yaw_rad: position (3,) and heading of the target in the world frame of the
+            vehicle's state estimate; None without an attitude.
+        world_velocity_mps: velocity (3,) of the target in that frame, which is the frame's drift;
             None if the filter works in the level frame.
     """
 
@@ -335,8 +348,8 @@ class TargetEstimate:
 
 class MotionErrors(NamedTuple):
     """Recent mean square errors of the vehicle's estimated motion since the last pose, as angles
-    seen from the camera, rad^2: computed from the difference of two estimated positions, and from
-    velocity times time."""
+    seen from the camera, rad^2: of the motion computed from the difference of two estimated
+    positions, and of that computed from velocity times time."""
 
     from_positions_rad2: float = 0.0
     from_velocity_rad2: float = 0.0
@@ -370,7 +383,8 @@ class TargetLock:
 
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
-    """A track of something that looks like the target, at a position where the target cannot be.
+    """A track of something that looks like the target, at a position that the target's own track
+    does not explain. It may be another target, or the target itself after an error of its track.
 
     Attributes:
         track: its filter.
@@ -419,8 +433,8 @@ class FieldState:
     Attributes:
         kind: kind of the last frame that was examined for interlacing.
         frames_since_examined: number of frames since then.
-        top_first_votes: sum of the votes on the order: positive if the top field seems to be first,
-            negative if the bottom field does.
+        top_first_votes: sum of the votes on the order of the fields: positive if the top field
+            seems to be first, negative if the bottom field does.
         is_top_first: order of the fields; None until the votes decide.
         frame_periods_s: the last periods between frames.
         last_frame_t_s: time of the last frame.
@@ -476,9 +490,10 @@ class CameraErrors:
     """Errors of the profile's camera latency and mounting estimated in flight, each with one
     standard deviation.
 
-    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` is the rotation of the
-    mounting about body x, y and z. `mount_rotation_sigma_xyz_rad` includes the constant error of
-    the attitude, which moves the target just as an error in roll and pitch of the mounting does.
+    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` are the small
+    rotations of the mounting about body x, y and z relative to the profile's.
+    `mount_rotation_sigma_xyz_rad` includes the constant error of the attitude, which moves the
+    target just as an error in roll and pitch of the mounting does.
     """
 
     delay_s: float

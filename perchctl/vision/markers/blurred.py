@@ -65,8 +65,9 @@ def find_expected_blurred(
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first marker found near its expected corners (4, 2) px; empty if none is found.
 
-    `start_blur_counter` selects the blur with which the fits start: little blur if it is even, much
-    blur if it is odd, to save time; None tries both.
+    `start_blur_counter` is a counter that the caller increases with each frame, so that the fits
+    start with little blur (even) and much blur (odd) in turn, which saves time; None tries both in
+    this frame.
     """
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = (
@@ -91,8 +92,9 @@ def find_expected_blurred(
 
 
 def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker in the best of the picture's quadrilaterals; empty if none contains a
-    marker."""
+    """Return the marker in the first of the picture's quadrilaterals that the photometric fit
+    confirms, tried in the order of the correlation of their cells with a marker's; empty if none is
+    confirmed."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -132,7 +134,8 @@ def _rank_quads(
 
 
 def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the corners moved to the best correlation of the drawing with the picture."""
+    """Return the corners (4, 2) px shifted, all by the same vector, to where the marker's ideal
+    black-and-white pattern (its drawing) correlates best with the picture."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
@@ -165,7 +168,8 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
 def _render_template(
     pattern: Pattern, sample_points_half_sides: Array, side_px: float
 ) -> NDArray[np.float32]:
-    """Return the blurred drawing at the marker's own coordinates (n, n, 2)."""
+    """Return the marker's drawing at `sample_points_half_sides` (n, n, 2), in half sides from the
+    marker's centre, blurred for a marker whose side is `side_px` in the picture."""
     n = len(pattern.drawing.cell_whiteness)
     cell = np.floor((sample_points_half_sides + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -207,10 +211,12 @@ def align_marker(
     """Fit a marker's drawing to the picture and return its corners; None unless the picture matches
     the drawing.
 
-    `max_motion_from_start_sides` is the largest distance of the corners from `start_corners_px`,
-    and `max_corner_sigma_sides` their largest standard deviation, both in side lengths; `blur_px`
-    is a first guess. If `needs_distinctive_bits`, the picture must also exclude every other
-    codeword; this is not necessary if the other marker identifies this one."""
+    The fit starts at `start_corners_px` (4, 2) with a first guess of the blur, `blur_px`.
+    `max_motion_from_start_sides` is the largest distance of the fitted corners from those, and
+    `max_corner_sigma_sides` their largest standard deviation, both in side lengths. If
+    `needs_distinctive_bits`, the picture must also exclude every other codeword
+    (`has_distinctive_bits`); this is not necessary if the other marker identifies this one.
+    """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
         return None
@@ -268,8 +274,9 @@ def has_matching_drawing(
 
 
 def has_distinctive_bits(alignment: Alignment) -> bool:
-    """True if flipping any single bit of the codeword would fit the picture clearly worse. Of other
-    markers that `has_matching_drawing` accepted, all 36 had a `bit_flip_fraction` above 0.5."""
+    """True if flipping any single bit of the codeword would fit the picture clearly worse. In tests
+    with markers of other codewords, `has_matching_drawing` accepted 36 by mistake; each of them had
+    a `bit_flip_fraction` above 0.5."""
     return (
         alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
         and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA

@@ -65,7 +65,8 @@ def projected_corners_jacobian(homography: Array) -> Array:
 
 def increment_homography(H: Array, homography_increment: Array) -> Array:
     """Return H (I + P), scaled so that its last element is 1. `homography_increment` (8,) contains
-    the first eight elements of P (3, 3), row by row; the last one is 0."""
+    the first eight elements of P (3, 3), row by row; the last one is 0. P is composed with H, not
+    added to it."""
     H = H @ np.array(
         [
             [1 + homography_increment[0], homography_increment[1], homography_increment[2]],
@@ -105,8 +106,9 @@ def is_inside_picture(corners_px: Array, shape: tuple[int, ...], margin_px: floa
 def scale_square(
     corners_px: Array, scaled_to_given_side: float, camera: CameraModel | None = None
 ) -> Array:
-    """Return the corners (4, 2) of the square scaled by `scaled_to_given_side` about its centre, in
-    its plane; without a camera, lens distortion is ignored."""
+    """Return the corners (4, 2) px of a square with the same centre and plane as the given one,
+    whose side is `scaled_to_given_side` times the given side; without a camera, lens distortion is
+    ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_centred_square(straight),
@@ -118,8 +120,8 @@ def scale_square(
 def add_missing_marker(
     expected_corners_px: Mapping[MarkerName, Array], small_to_large_side: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Return both markers' corners; a missing marker follows from the other one and their
-    `small_to_large_side`."""
+    """Return both markers' corners (4, 2) px; a missing marker follows from the other one and
+    `small_to_large_side`, the side of the small marker over that of the large one."""
     both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], small_to_large_side, camera)
@@ -144,8 +146,15 @@ CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6  # derived from the other marker, not me
 class RefinedCorners:
     """Refined corners of a marker, with their uncertainty as in `Detection`.
 
-    `blur_px` and `sharpest_side_blur_px` are the largest and the smallest blur of a side, and
-    `edge_shift` is the shift of all edges that was corrected.
+    Attributes:
+        corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
+        is_fitted: True if the corners follow from a fit of lines or of the drawing; False if each
+            was located by itself (by OpenCV, or from the other marker), which is less accurate.
+        corrected_edge_shift: how far white has grown over black at all edges of the picture
+            (blooming, gamma), measured on this frame's markers or known before; the corners are
+            corrected for it. None: unknown, and not corrected.
+        remaining_edge_shift_sigma_px: standard deviation of that growth after the correction.
+        blur_px, sharpest_side_blur_px: largest and smallest blur of a side.
     """
 
     corners_px: Array

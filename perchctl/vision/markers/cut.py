@@ -141,8 +141,9 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """True if the visible part of the target suffices for a measurement, for a large marker with
-    the rotation (3, 3) and centre (3,) in the camera frame."""
+    """True if the visible part of the target suffices for a measurement, when the large marker has
+    the rotation `R_cam_marker` (3, 3) and its centre is at `t_cam_marker_m` (3,) in the camera
+    frame."""
     patterns = _make_patterns(target)
     pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
@@ -198,7 +199,9 @@ def _initial_pose(
 def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
 ) -> RigidPose | None:
-    """Return the prediction moved to its best match in the picture; None without a match."""
+    """Return the pose near `start`, shifted across the picture and along the line of sight, at
+    which the rendered drawing correlates best with the coarse picture; None if it correlates well
+    nowhere."""
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_picture.lattice
     for growth in _SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
@@ -238,7 +241,9 @@ def _is_reliable(pose_fit: PoseFit) -> bool:
 def _marker_corners(
     pose_fit: PoseFit, side_to_large_side: float, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners of the marker with this half side; None outside the lens model."""
+    """Return the corners (4, 2) px of the marker whose side is `side_to_large_side` times the large
+    marker's; None if a corner is so far from the optical axis that the lens model is not valid
+    there."""
     r = (
         np.column_stack([side_to_large_side * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
@@ -421,7 +426,7 @@ class DrawingMatch(NamedTuple):
 def correlate_drawing(
     H: Array, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
 ) -> DrawingMatch:
-    """Compare the overview with the drawing projected by H (3, 3), under the light that fits
+    """Compare the coarse picture with the drawing projected by H (3, 3), under the light that fits
     best."""
     lattice = coarse_picture.lattice
     rows, columns = np.nonzero(coarse_picture.is_visible)
@@ -455,10 +460,11 @@ _TEXTURE_SIZE_PX = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Points along the edges of the target's drawing, in half sides of the large marker.
+    """Points along the edges of the target's drawing.
 
     Attributes:
-        points_half_sides, normal: points (n, 2), and unit normals (n, 2) from black to white.
+        points_half_sides, normal: points (n, 2), in half sides of the large marker from the
+            target's centre, and unit normals (n, 2) from black to white.
         line_index: index (n,) of the straight line that contains the point.
         print_sigma_half_sides: standard deviation (n,) of that line's print error.
         cell_width_half_sides: width (n,) of the adjacent cell.
@@ -541,8 +547,9 @@ class _CellEdge(NamedTuple):
 def _iterate_cell_edges(
     cell_whiteness: Array, side_to_large_side: float, points_per_edge: int
 ) -> Iterator[_CellEdge]:
-    """Yield each edge between a black and a white cell of a marker with half the side
-    `side_to_large_side`, sampled at `points_per_edge` points."""
+    """Yield each edge between a black and a white cell of a marker with `cell_whiteness` (n, n),
+    sampled at `points_per_edge` points. The marker's side is `side_to_large_side` times the large
+    marker's."""
     width = 2.0 * side_to_large_side / len(cell_whiteness)
     s = (
         _EDGE_END_MARGIN_CELLS
@@ -624,7 +631,8 @@ class PoseFit:
 
     Attributes:
         pose: the pose of the drawing.
-        rotation_translation_cov: covariance (6, 6) of rotation (rad) and translation (half sides).
+        rotation_translation_cov: covariance (6, 6) of small rotations about (rad) and translations
+            along (half sides of the large marker) the camera's x, y, z.
         visible_point_count: number of edge points in the picture.
         found_point_count: number of these points at which an edge was found.
         small_marker_point_count: number of found points on the small marker.
@@ -659,8 +667,9 @@ class _EdgePoints:
 
 
 class _FitStep(NamedTuple):
-    """A Gauss-Newton step of the seven unknowns (7,), the inverse of their normal matrix (7, 7),
-    the weights of the points (n,), and the variance of one point."""
+    """A Gauss-Newton step: the change (7,) of rotation about the camera's axes (rad), translation
+    (half sides) and edge shift (px); the inverse (7, 7) of the normal matrix, the weights (n,) of
+    the points, and the variance of one point."""
 
     pose_and_shift_change: Array
     inverse_normal_matrix: Array
@@ -785,8 +794,8 @@ def _edge_points_in_view(
 def _measure_offsets(
     image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the offset of each point's edge along its normal, (n,) px, and whether an edge was
-    found."""
+    """Return the distance of each edge in the picture from its expected position along the point's
+    normal, positive towards white, (n,) px, and whether an edge was found."""
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
     grey = sample_profiles(
         image,
@@ -813,9 +822,9 @@ def _solve_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_shift_change_from_start: Array,
 ) -> _FitStep | None:
-    """Return one robust Gauss-Newton step of the seven unknowns; None if too few edges count.
-    `pose_and_shift_change_from_start` (7,), the sum of the previous steps, is pulled back to zero
-    by the prior."""
+    """Return one robust Gauss-Newton step of the seven unknowns of `_FitStep`; None if too few
+    edges count. `edge_from_expected_px` (n,) is the result of `_measure_offsets`. The prior pulls
+    `pose_and_shift_change_from_start` (7,), the sum of the previous steps, back to zero."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

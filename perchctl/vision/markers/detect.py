@@ -92,15 +92,17 @@ class Prior:
         expected_corners_of_both_markers_px: the same, with a missing marker derived from the other
             one.
         search_mode: the kinds of search for this frame.
-        start_blur_counter: selects the blur with which blurred fits start (see
+        start_blur_counter: counter that alternates the blur with which blurred fits start (see
             `find_expected_blurred`).
         was_target_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame;
             always False if edge fits are disabled.
         was_target_cut: `was_target_seen_recently` is True, and no marker can have been completely
             in that picture.
-        previous_edge_shift: the shift of all edges measured in the last frames; None measures it.
-        measure_own_target_distance_m: function that selects one of several targets if none is
-            expected; None uses the picture alone.
+        previous_edge_shift: how far white has grown over black, measured in one of the last frames;
+            None: measure it in this one.
+        measure_own_target_distance_m: function that returns a marker's distance, m, from where this
+            vehicle's own target is believed to be; it chooses one of several targets if none is
+            expected. None: choose by the picture alone.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
@@ -131,8 +133,8 @@ class CornerMethod:
         needs: its requirements.
         cost_text: typical time for a picture of 640x480 on one core.
         used_when: `should_run` in words.
-        should_run: function that returns True if the method applies to the picture, the prior and
-            the findings so far.
+        should_run: function that returns True if the method should be tried on the picture, given
+            the prior and the findings so far.
         find: function that returns the findings that replace the previous ones.
     """
 
@@ -335,10 +337,11 @@ def detect_markers(
     """Find and refine the target's markers in one frame.
 
     The search starts at `expected_corners_px`, each (4, 2), predicted from the vehicle's motion, or
-    otherwise near the `previous` detections. `frames_without_markers`, the number of successive
-    frames without markers, alternates the kinds of search; None applies all kinds. If no target is
-    expected, `measure_own_target_distance_m` selects one of several. For a frame of two fields, the
-    result is the mean of the fields."""
+    otherwise near the `previous` detections. `frames_without_markers`, the number of frames without
+    markers since the last marker, alternates the kinds of search; None, for the first frame,
+    applies all kinds. If no target is expected, `measure_own_target_distance_m` chooses one of
+    several. For a frame of two fields, the result is the mean of the fields.
+    """
     prior = make_prior(
         frame,
         previous,
@@ -421,7 +424,9 @@ def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prio
 def _choose_search_mode(
     frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
-    """Return the kind of search for this frame. After a loss, the kinds alternate."""
+    """Return the kind of search for this frame: with a marker in the previous frame, near the
+    expected corners; otherwise, to save time, the kinds alternate from frame to frame. None as
+    `frames_without_markers` selects all kinds."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -615,7 +620,7 @@ def refine_photometrically(
 
 def _blur_px(corners: RefinedCorners | None) -> float:
     """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
-    fitted."""
+    fitted to them, otherwise `_DEFAULT_BLUR_PX`, which is also the largest guess."""
     if corners is None or not corners.is_fitted or corners.blur_px <= 0.0:
         return _DEFAULT_BLUR_PX
     return min(
@@ -651,11 +656,12 @@ def fit_lines(
     start_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Fit the four sides of each marker near corners `start_corners_px` (4, 2) px, and return those
-    with four straight sides. The cells are not examined.
+    """Fit the four sides of each marker, starting at `start_corners_px` (4, 2), and return the
+    markers with four straight sides. The cells are not examined.
 
     All markers are fitted together, because blooming and gamma move all edges of a picture by the
-    same number of pixels. `known_edge_shift` is that shift if it is known; None measures it.
+    same number of pixels. `known_edge_shift` is how far white has grown over black, if measured
+    before; None measures it.
     """
     if not start_corners_px:
         return {}
@@ -675,8 +681,12 @@ def refine_expected_markers(
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
-    measured by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
-    or hidden markers, and markers with cells below 2.5 px are omitted."""
+    measured by edge fits.
+
+    Omitted are markers displaced by more than the window around a side reaches on the profiles, the
+    scan lines across it (0.85 cells, at most 7 px), cut or hidden markers, and markers with cells
+    below 2.5 px. `known_edge_shift` is how far white has grown over black; None measures it.
+    """
     image, patterns = picture.image, picture.setup.patterns
     start_corners_px = {
         name: expected_corners_px[name]
@@ -703,7 +713,8 @@ def add_partly_visible(
     """Return the markers in `found_corners`, plus the expected markers of which a visible part
     could be fitted.
 
-    If the small marker was found, the large one is expected around it.
+    If the small marker was found, the large one is expected around it. `known_edge_shift` is how
+    far white has grown over black at all edges; None measures it.
     """
     start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:

@@ -62,7 +62,8 @@ class DetectorSetup:
 def make_detector_setup(
     config: DetectorConfig, target: TargetConfig, static_hidden_mask: HiddenMask | None = None
 ) -> DetectorSetup:
-    """Return the setup for a target, with dictionaries that contain only its markers' ids."""
+    """Return the setup for a target, with dictionaries that contain only its markers' ids.
+    `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every picture."""
     large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
     small_to_large_side = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -93,7 +94,9 @@ def make_detector_setup(
 def make_aruco_detector(
     setup: DetectorSetup, size_px: tuple[int, int], threshold_windows_px: ThresholdWindowRange
 ) -> Any:
-    """Return OpenCV's marker detector for pictures of the size (width, height)."""
+    """Return OpenCV's marker detector for pictures of `size_px` (width, height);
+    `threshold_windows_px` is the smallest and the largest window over which the adaptive threshold
+    averages."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # makes maxCorrectionBits the limit itself
     parameters.minDistanceToBorder = 0
@@ -104,7 +107,8 @@ def make_aruco_detector(
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
+    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral: its
+    candidates are then compared with blurred markers, whose bits OpenCV cannot read."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_POLYGON_ACCURACY_RATE
@@ -149,8 +153,8 @@ _MEAN_GREY_FILL_WEIGHT = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
-    """Return the mask (h, w) of the vehicle in a frame; widened for a single field because the
-    missing rows are interpolated."""
+    """Return the mask of the vehicle in a frame, True where it covers the view, (h, w):
+    `static_hidden_mask`, widened for a single field because the missing rows are interpolated."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
@@ -182,8 +186,8 @@ def is_any_part_hidden(
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if any pixel within `reach_half_sides` (in half sides of the marker) of the marker's
-    centre is hidden by the vehicle."""
+    """True if the vehicle hides any pixel of the square that extends `reach_half_sides` (in half
+    sides of the marker) from the marker's centre. `hidden_mask` is True where it does."""
     if hidden_mask is None:
         return False
     h, w = hidden_mask.shape
@@ -203,8 +207,8 @@ def is_any_part_hidden(
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture with the setup and camera for measuring markers in it. `hidden_mask` (h, w) marks
-    the pixels where the vehicle covers the view."""
+    """A picture with the setup and camera for measuring markers in it. `hidden_mask` (h, w) is True
+    where the vehicle covers the view."""
 
     image: NDArray[np.uint8]
     hidden_mask: HiddenMask | None
@@ -214,8 +218,8 @@ class Picture:
     def corners_from_other_marker_px(
         self, other_corners_px: Array, derived_name: MarkerName
     ) -> Array:
-        """Return marker `name`'s corners (4, 2), derived from `corners_px` (4, 2) of the other
-        marker."""
+        """Return the corners (4, 2) px of the marker `derived_name`, derived from
+        `other_corners_px` (4, 2) of the other marker."""
         scaled_to_given_side = (
             self.setup.small_to_large_side
             if derived_name == "small"

@@ -81,8 +81,9 @@ _ROTATE_90_LEFT = np.array(-1j)
 
 
 def profile_positions(lengths_px: Array) -> Array:
-    """Return the positions of the profiles along sides of `lengths_px` (rows,), as shares (rows, n)
-    of a side. They keep away from the corners, where the next side blurs the edge."""
+    """Return where the profiles, short scan lines across the edge, cross each side: shares (rows,
+    n) of the side, for sides of `lengths_px` (rows,). They keep away from the corners, where the
+    next side blurs the edge."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + SIDE_POSITIONS))
 
@@ -95,8 +96,8 @@ def make_side_profiles(
     corners): each (rows, n, 2).
 
     `starts`, `ends` (rows, 2) are the normalised ends of the sides; `positions_along_side` (rows,
-    n) come from `profile_positions`. The image of a side through the lens is smooth, so a few nodes
-    define all of it.
+    n) come from `profile_positions`. The image of a side through the lens is a smooth curve, so it
+    is computed at five points and interpolated.
     """
     first, last = positions_along_side[:, :1], positions_along_side[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
@@ -112,12 +113,13 @@ def make_side_profiles(
 def sample_profiles(
     image: NDArray[np.uint8], origin: Array, normal: Array, profile_half_length_px: Array
 ) -> Floats:
-    """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, with the picture's
+    """Return the grey values along the profiles, (rows, n, steps + 1), from -profile_half_length_px
+    to +profile_half_length_px (rows,) about `origin` along `normal`: bilinear, with the picture's
     border pixels repeated outside.
 
     The picture is converted to float, on which OpenCV 5 interpolates at the exact position. Other
-    releases, on 8-bit pictures, round it to 1/32 px, which is as large as the intended standard
-    deviation.
+    releases, on 8-bit pictures, round it to 1/32 px, which is as large as the standard deviation
+    that the edge positions should have.
     """
     h, w = image.shape
     reach = float(profile_half_length_px.max()) + 2.0
@@ -294,8 +296,8 @@ def _refine_lines_once(
 
 
 def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Array]:
-    """Return the normalised lines (4m, 3): nx, ny, c with n.x = c and |n| = 1; and the weighted RMS
-    distance of the points from them, px (4m,)."""
+    """Return the coefficients (4m, 3) of the sides' lines in normalised coordinates: nx, ny, c with
+    n.x = c and |n| = 1; and the weighted RMS distance of the points from the lines, px (4m,)."""
     w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
     x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
@@ -319,7 +321,8 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
 
 
 def _intersect(line_coefficients: Array) -> Array:
-    """Return the intersections of side i - 1 and side i of each marker: (m, 4, 2)."""
+    """Return the intersections of side i - 1 and side i of each marker, (m, 4, 2), normalised.
+    `line_coefficients` (4m, 3) as from `_fit_lines`."""
     sides = line_coefficients.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -333,7 +336,8 @@ def _intersect(line_coefficients: Array) -> Array:
 
 
 def edge_shift_prior_sigma_px(white_grey: float) -> float:
-    """Return the standard deviation of an unmeasured edge shift, given white paper's grey level."""
+    """Return the standard deviation, px, to assume for how far white has grown over black while it
+    is not measured: larger if the white paper's grey level is so high that white is clipped."""
     return (
         _CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX
         if white_grey > CLIPPED_GREY
@@ -581,9 +585,9 @@ def prepare_marker_sides(
 def measure_edges(
     image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner_edges: bool
 ) -> tuple[EdgeData, EdgeData | None]:
-    """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
-    marker `markers.widest`; None without `with_inner_edges`, or if the marker's cells are too
-    narrow."""
+    """Return the edges of all sides (4m rows), and the four inner edges of the black border of the
+    marker with the widest cells (`widest_marker_index`); None without `with_inner_edges`, or if
+    that marker's cells are too narrow."""
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
         markers.side_lengths_px,
@@ -646,9 +650,12 @@ def find_neighbour_edges(
     inner_border_cells: BorderCells,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Return the neighbours of edges at `positions_along_side` (rows, n), as shares of a side: four
-    rows for each marker in `border_cells`, then, if there are more rows, four for the inner edges
-    of the border of `inner_border_cells`."""
+    """Return which parallel edges, one cell further in or out, blur into the edges measured at
+    `positions_along_side` (rows, n), in shares of a side.
+
+    The rows are the four outer edges of each marker in `border_cells`, then, if there are four
+    more, the inner edges of the border of the marker with `inner_border_cells`.
+    """
     inner_neighbour_count, outer_neighbour_count = (
         np.zeros(positions_along_side.shape, np.float32),
         np.zeros(positions_along_side.shape, np.float32),
@@ -725,8 +732,8 @@ class NeighbourEdges:
     Attributes:
         neighbour_distance_px: distance to a neighbouring edge, the size of a cell across the edge,
             (rows,).
-        inner_neighbour_count, outer_neighbour_count: 1 if another edge with the same contrast is
-            one cell further in or out, otherwise 0, (rows, n).
+        inner_neighbour_count, outer_neighbour_count: number, 0 or 1, of edges with the same
+            contrast one cell further in, and one cell further out, at each profile, (rows, n).
         can_be_located: False if no edge can be found on the profile, (rows, n).
     """
 

@@ -86,12 +86,13 @@ def fit_partly_visible(
     identified_by: IdentifiedBy,
     known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """Fit the whole marker near corners `start_corners_px` (4, 2), which may be outside the
+    """Fit the whole marker, starting at `start_corners_px` (4, 2), which may be outside the
     picture.
 
-    `identified_by` says what identifies the marker; `known_edge_shift` is the shift of all edges,
-    if measured before. None if the visible part does not determine the corners, or if its cells are
-    not the marker's.
+    `identified_by` tells how the marker is known to be this one: by its own cells alone ("bits"),
+    by the prediction ("track") or by the other marker ("other"); it sets how many visible cells
+    must match. `known_edge_shift` is how far white has grown over black, if measured before. None
+    if the visible part does not determine the corners, or if its cells are not the marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
     if (
@@ -260,8 +261,9 @@ _MAX_LENS_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse 
 def _has_matching_visible_cells(
     picture: Picture, corners_px: Array, pattern: Pattern, identified_by: IdentifiedBy
 ) -> bool:
-    """True if the visible cells without glare have their colours; `identified_by` decides how many
-    must."""
+    """True if the visible cells without glare have their colours. With `identified_by` "bits", at
+    most one inner cell may be invisible, with "track" four; with "other", any number, and a fifth
+    of the visible inner cells may have the wrong colour."""
     image, hidden_mask = picture.image, picture.hidden_mask
     h, w = image.shape
     at = _project_sample_points_px(corners_px, pattern, picture.camera)
@@ -324,7 +326,8 @@ def _is_point_in_picture(
 
 
 def _is_cell_known(is_sample_visible: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
-    """Return which cells (cells,) show at least half of their sample points (n,)."""
+    """Return which cells (cells,) show at least half of their sample points; `is_sample_visible`
+    (n,)."""
     known: NDArray[np.bool_] = (
         np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
         >= 0.5 * pattern.samples_per_cell
@@ -362,8 +365,9 @@ class VisibleEdges:
     edge.
 
     Attributes:
-        points_half_sides: measured points (rows, n, 2) in the marker's own coordinates.
-        edge_from_model_px: outward distance (rows, n) of each point from the model's edge.
+        points_half_sides: measured points (rows, n, 2), in half sides from the marker's centre.
+        edge_from_model_px: distance (rows, n) of each measured point from the model's edge,
+            positive out of the marker.
         weight: weight (rows, n) of each profile.
         side_index: index of the edge's side, 0 to 3, (rows,).
         centre_distance_half_sides: distance of the edge from the marker's centre: 1 for a side,

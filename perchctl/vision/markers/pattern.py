@@ -35,9 +35,10 @@ class BorderCells:
     """The cells just inside a marker's border, along its four sides in the order of the corners.
 
     Attributes:
-        is_cell_inside_border_white: 1 for a white cell, (4, n); the first and last ones belong to
-            the border.
-        are_two_cells_inside_border_white: 1 if the next cell further in is white, too, (4, n).
+        is_cell_inside_border_white: 1 for a white cell, 0 for a black one, a factor in sums, (4,
+            n); the first and last ones belong to the border.
+        are_two_cells_inside_border_white: 1 if this cell and the next one further in are white, (4,
+            n).
         print_tolerance_cells: standard deviation of the position of a printed edge.
     """
 
@@ -61,10 +62,11 @@ class Pattern:
             `perchctl.vision.markers.corners`).
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
-        rotated_sample_templates: expected grey (4, n) at the sample points with a blur of half a
-            cell, zero-mean and of unit norm, for corners rolled by 0 to 3.
-        is_white, is_cell_inside_border: True for a white cell, for a cell within the border,
-            (cells,).
+        rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
+            rotation of the marker (corners rolled by 0 to 3), with a blur of half a cell, zero-mean
+            and of unit norm.
+        is_white: True for a white cell, (cells,).
+        is_cell_inside_border: True for a cell within the border, (cells,).
     """
 
     border_cells: BorderCells
@@ -232,8 +234,8 @@ class Drawing:
 
     @property
     def photometric_fit_reach_half_sides(self) -> float:
-        """Half the side of the square that the photometric fit compares with the picture, in the
-        marker's own coordinates."""
+        """How far the square that the photometric fit compares with the picture extends from the
+        marker's centre, in half sides of the marker."""
         return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
@@ -258,8 +260,9 @@ def make_drawing(
 def _cell_coverage(
     node_positions: Array, half_node_spacing: float, n_cells: int, square_half_side: float
 ) -> Array:
-    """Return the fraction of each node's width that each cell covers, (nodes, cells), along one
-    axis. The cells fill a square from -square_half_side to square_half_side."""
+    """Return the fraction of each node's interval (half the spacing to each side) that each cell
+    covers, (nodes, cells), along one axis. Nodes and cells are in half sides from the marker's
+    centre; the cells fill a square from -square_half_side to square_half_side."""
     edges = square_half_side * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = (
         node_positions[:, None] - half_node_spacing,
@@ -283,8 +286,8 @@ def render_whiteness_and_beyond_paper(
 ) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing at n by n nodes and the margin around them.
 
-    Returns the whiteness of each node, 0 to 1. If the paper ends inside the compared square, a
-    second layer contains the fraction of each node outside the paper.
+    Returns the whiteness of each node, 0 to 1, as the first array. If the paper ends inside the
+    compared square, a second array contains the fraction of each node beyond the paper.
     """
     half_node_spacing = drawing.photometric_fit_reach_half_sides / nodes_per_side
     node_positions: Array = half_node_spacing * (

@@ -100,8 +100,8 @@ class Alignment:
         pattern_correlation: correlation of the inner bits with what a plain black square of the
             same size leaves unexplained in the picture.
         pattern_contrast: contrast of the inner bits relative to the border's.
-        cell_deviation_per_contrast: largest mean deviation of a cell, relative to the contrast of
-            black and white.
+        cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of the
+            fitted drawing, relative to the contrast of black and white.
         bit_flip_fraction: how far the worst cell has the opposite colour, from 0 (as drawn) to 1
             (wrong bit).
         bit_flip_fraction_sigma: standard deviation of that fraction for the least certain cell.
@@ -322,7 +322,8 @@ def _measure_bit_flip_fraction(
 def _measure_inner_pattern_match(
     drawing: RenderedDrawing, grey: Array, contrast_grey: float
 ) -> tuple[float, float]:
-    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,)."""
+    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,), the contrast
+    relative to `contrast_grey`, that of black and white."""
     rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.illumination_basis[0][GAIN], grey
@@ -373,8 +374,9 @@ def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], 
 
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
-    """Return the derivatives (9, n * n) of the drawing's grey values under `illumination` with
-    respect to the homography's increment (8) and the variance of the blur."""
+    """Return the derivatives (9, n * n) of the drawing's grey values with respect to the
+    homography's increment (8) and the variance of the blur, under the light whose coefficients
+    `illumination` (7 or 8,) belong to the rows of `illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.blurred_whiteness_and_beyond_paper
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
@@ -394,8 +396,8 @@ _CHEBYSHEV_NODES = 9  # per side
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, at `node_positions` (n,) in both directions; `uv1` (3, n * n) is (u, v, 1) of
-    each node."""
+    """Sampling grid on the marker: n by n nodes at `node_positions` (n,) in both directions, in
+    half sides from the marker's centre; `uv1` (3, n * n) is (u, v, 1) of each node."""
 
     nodes_per_side: int
     node_positions: Array
@@ -472,7 +474,9 @@ def _extract_patch(
 def _sample_patch(
     patch: NDArray[np.float32], grid: Grid, H: Array, lens_shift_in_patch_px: Array
 ) -> Array:
-    """Return the grey values (n * n,) at the nodes of a patch, shifted by the lens (2, n * n)."""
+    """Return the grey values (n * n,) of the patch at the nodes projected by H and moved by
+    `lens_shift_in_patch_px` (2, n * n): the lens's shift of each node minus the patch's top left
+    pixel."""
     at = (project_nodes(H, grid.uv1) + lens_shift_in_patch_px).astype(np.float32)
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -515,7 +519,7 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_whiteness_and_beyond_paper(self) -> tuple[tuple[Array, Array], ...]:
-        """The layers of `render_whiteness_and_beyond_paper` after the blur. Each is a pair: its
+        """The arrays of `render_whiteness_and_beyond_paper` after the blur. Each is a pair: its
         values at the nodes (n * n,), and their derivatives (9, n * n) with respect to the
         homography's increment (8) and the variance of the blur."""
         sharp = render_whiteness_and_beyond_paper(self.drawing, self.grid.nodes_per_side)
@@ -526,9 +530,10 @@ class RenderedDrawing:
 
     @cached_property
     def illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), and their Gram
-        matrix. The eighth row, for the grey beyond the paper, exists only if the paper ends inside
-        the compared square."""
+        """Basis of the drawing's grey values under any light, and the Gram matrix of its rows. The
+        rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast (gain) and
+        its slopes, and the bend of the tone curve; the eighth, the grey beyond the paper, exists
+        only if the paper ends inside the compared square."""
         u, v, one = self.grid.uv1
         (white, _), *others = self.blurred_whiteness_and_beyond_paper
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]

@@ -35,9 +35,10 @@ from perchctl.vision.types import MARKERS, MarkerName
 SearchMode = Literal[
     "near_expected", "expected_window", "expected_fits", "whole_sharp", "whole_blurred", "all"
 ]
-"""Kinds of search: near the expected position by a search ("expected_window"), by fits to a blurred
-target ("expected_fits"), or by both ("near_expected"); in the whole picture for a "whole_sharp" or
-a "whole_blurred" target; or "all"."""
+"""Kinds of search in one frame. At the expected position: by OpenCV in the window around it
+("expected_window"), by fits to a blurred target ("expected_fits"), or by both ("near_expected"). In
+the whole picture: by OpenCV, which needs a sharp target ("whole_sharp"), or by fits to a blurred
+target ("whole_blurred"). "all" is everything."""
 _WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
@@ -54,8 +55,9 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Raw corners (4, 2) px of at most one large and one small marker, whether a mirrored marker
-    was found, and the number of complete targets to choose from."""
+    """Raw corners (4, 2) px of at most one large and one small marker; whether a marker was decoded
+    as its mirror image, as by a mirrored camera; and the number of complete targets to choose
+    from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     is_mirrored_marker_seen: bool = False
@@ -68,12 +70,14 @@ def search(
     search_mode: SearchMode = "all",
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers, then the whole picture if the window shows too
-    little.
+    """Search the window around the expected markers with OpenCV's detector, then the whole picture
+    if the window shows too little.
 
-    With `search_mode` "near_expected" or "expected_window", only the window is searched; with
-    "whole_sharp", only the whole picture; otherwise both. If several targets are found and none is
-    expected, the closest by `measure_own_target_distance_m` is chosen."""
+    With `search_mode` "near_expected" or "expected_window", only the window is searched (they
+    differ in the fits to blurred markers that follow); with "whole_sharp", only the whole picture;
+    otherwise both. If several targets are found and none is expected, the one with the smallest
+    `measure_own_target_distance_m`, its distance from this vehicle's own target, is chosen.
+    """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.is_line_fit_enabled and expected_corners_px and search_mode != "whole_sharp":
@@ -143,8 +147,9 @@ def make_search_window(
     small_to_large_side: float,
     shape: tuple[int, ...],
 ) -> Window | None:
-    """Return the part of the picture to search; None if a window would save little time. The window
-    contains the whole large marker if that may be in the picture."""
+    """Return the part of the picture around the expected markers; None if it is nearly the whole
+    picture, which is then searched instead. `small_to_large_side` is the small marker's side over
+    the large one's. The window contains the whole large marker if that may be in the picture."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
@@ -250,9 +255,10 @@ def _sort_by_own_target_distance(
     candidates: Mapping[MarkerName, list[Array]],
     measure_own_target_distance_m: OwnTargetDistanceFunction,
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates sorted by their distance, without those that are too far away.
+    """Return the candidates sorted by their distance from this vehicle's own target, without those
+    that are too far away to be it.
 
-    A single candidate is left to the pipeline, which explains why it is refused.
+    A single candidate stays, however far: the pipeline refuses it and says why.
     """
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -282,8 +288,9 @@ def _pair_markers(
 
 
 def nesting_error(large_px: Array, small_px: Array, small_to_large_side: float) -> float:
-    """Return the distance of the small marker from its position in the large one, in units of the
-    tolerance."""
+    """Return how far the small marker's corners are from where `small_to_large_side` (side of the
+    small marker over that of the large one) places them inside the large one, divided by the
+    allowed distance: up to 1, the two form a target."""
     mapped = scale_square(large_px, small_to_large_side)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
