@@ -78,7 +78,7 @@ class FlightInputs:
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    is_logged: bool = False  # then with the pictures' checksums and the present's spread
+    is_logged: bool = False  # then with the pictures' checksums
     # Called with each frame as the source delivered it.
     on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
@@ -262,7 +262,7 @@ class FlightInputs:
         """The target's estimate at `now_s`; None before the target was first seen. `tracked` is
         False while no good frames arrive or the frames are not searched, because the filter counts
         its coasting in frames."""
-        target = self.perception.target(now_s, spread=self.is_logged)
+        target = self.perception.target(now_s)
         if self._positioning is not None:  # otherwise the estimate would run away
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s

@@ -108,12 +108,12 @@ class Perception:
         """True if the newest frames have shown only the target's mirror image."""
         return self._mirrored >= MIRRORED_FRAMES
 
-    def target(self, t_s: float, spread: bool = True) -> TargetEstimate | None:
+    def target(self, t_s: float) -> TargetEstimate | None:
         """Return the target at `t_s` (now) for the vehicle's newest attitude; None before the first
-        sighting. Without `spread`, the standard deviations remain those of the newest frame."""
+        sighting."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
-        return estimate(self.state, t_s, attitude, self.pipeline, with_sigma=spread)
+        return estimate(self.state, t_s, attitude, self.pipeline)
 
     @property
     def latency_sigma_s(self) -> float:

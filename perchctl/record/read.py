@@ -127,7 +127,7 @@ class FlightLog:
         for each in exact_fields(TickRecord):
             is_since_4 = each.owner == "Turn" and each.name in ("outcome", "reason", "error")
             # No log without ``turn_fields`` is as new as this one.
-            is_newer = (each.owner, each.name) == ("TargetEstimate", "measured_offset_m")
+            is_newer = each.owner == "TargetEstimate" and each.name.startswith("measured_offset")
             is_newer = is_newer or (is_since_4 and self.header["version"] < 4)
             if each.is_always_written or is_newer:
                 continue

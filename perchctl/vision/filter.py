@@ -19,7 +19,7 @@ import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.profile import KalmanConfig
-from perchctl.values import cached_property, replace
+from perchctl.values import cached_property
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
@@ -317,18 +317,12 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
     return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
 
-def predict_track(
-    track: MarkerTrack, t_s: float, setup: FilterSetup, with_cov: bool = True
-) -> MarkerTrack:
-    """Return the track predicted to `t_s`; without `with_cov`, the covariance does not change."""
+def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
+    """Return the track predicted to `t_s`."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
-    if with_cov:
-        return _predict_from_state(track, track.x, dt_s, t_s, track.unseen_frames, setup)
-    x = transition_matrix(dt_s).dot(_limit_target_speed(track.x, setup))
-    x[YAW] = wrap_rad(float(x[YAW]))
-    return replace(track, t_s=t_s, x=x)
+    return _predict_from_state(track, track.x, dt_s, t_s, track.unseen_frames, setup)
 
 
 def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:

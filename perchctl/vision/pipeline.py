@@ -319,29 +319,25 @@ def estimate(
     t_s: float,
     attitude: VehicleState | None,
     pipeline: Pipeline,
-    with_sigma: bool = True,
 ) -> TargetEstimate | None:
     """Return the target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
 
     A tracked target is predicted by its filter and by the vehicle's motion. A target that is no
     longer tracked stays at its last position in the world. Returns None before the first
-    measurement. Without `with_sigma`, the standard deviations stay those of the newest frame.
+    measurement.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:
         return target
     if state.tracks and state.are_tracks_in_world_frame:
         world = pipeline.track_setup.world_filter
-        tracks = {n: predict_track(t, t_s, world, with_sigma) for n, t in state.tracks.items()}
+        tracks = {n: predict_track(t, t_s, world) for n, t in state.tracks.items()}
         merged = merge_tracks(tracks, state.measured.poses_by_track, pipeline.merge.weights)
         assert merged is not None
         rival = predict_rival_state(state.lock, state.rival, True, t_s, world)
         merged = merged if rival is None else widen_covariance(merged, rival)
-        return replace(
-            target,
-            t_s=t_s,
-            **_express_in_level_and_world(merged, attitude, True, pipeline, with_sigma),
-        )
+        frames = _express_in_level_and_world(merged, attitude, True, pipeline)
+        return replace(target, t_s=t_s, **frames)
     if not state.tracks:
         nothing = np.zeros(3)
         target = replace(
@@ -384,9 +380,13 @@ def _estimate_at_frame(
     small = measured and merged.stage in (VisibleMarkers.BOTH, VisibleMarkers.SMALL)
     never = -np.inf
     frames = _express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline)
-    offset_m = None if previous_estimate is None else previous_estimate.measured_offset_m
-    if measured:
-        offset_m = None if attitude is None else attitude.R_world_level.dot(frames["e_m"])
+    offset_m, offset_sigma_m = None, math.inf
+    if not measured and previous_estimate is not None:
+        offset_m = previous_estimate.measured_offset_m
+        offset_sigma_m = previous_estimate.measured_offset_sigma_m
+    elif measured and attitude is not None:
+        offset_m = attitude.R_world_level.dot(frames["e_m"])
+        offset_sigma_m = float(frames["sigma_m"][:2].max())
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s
@@ -404,6 +404,7 @@ def _estimate_at_frame(
         tracked=True,
         unseen=merged.unseen_frames,
         measured_offset_m=offset_m,
+        measured_offset_sigma_m=offset_sigma_m,
         **frames,
     )
 
@@ -413,7 +414,6 @@ def _express_in_level_and_world(
     attitude: VehicleState | None,
     is_in_world_frame: bool,
     pipeline: Pipeline,
-    with_sigma: bool = True,
 ) -> dict[str, Any]:
     place_m, yaw_rad = merged.track_frame_xyz_yaw[:3], float(merged.track_frame_xyz_yaw[3])
     cov_m2, error_shifts_m = merged.cov_m2, merged.shift_per_constant_error_m
@@ -426,18 +426,16 @@ def _express_in_level_and_world(
         )
         seen["velocity_mps"] = turn.dot(merged.track_frame_velocity_mps)
         seen["world_velocity_mps"] = merged.track_frame_velocity_mps
-        if with_sigma:
-            cov_m2 = turn.dot(cov_m2).dot(turn.T)
-            error_shifts_m = gear_to_target_error_shifts_m(
-                error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose_setup
-            )
+        cov_m2 = turn.dot(cov_m2).dot(turn.T)
+        error_shifts_m = gear_to_target_error_shifts_m(
+            error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose_setup
+        )
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
         if attitude is not None:
             world = target_level_to_world(place_m, yaw_rad, attitude, pipeline.pose_setup)
             seen["world_m"], seen["world_yaw_rad"] = world
-    if with_sigma:
-        variance = cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)
-        seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-        seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
+    variance = cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)
+    seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
     return seen

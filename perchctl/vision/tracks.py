@@ -310,7 +310,7 @@ def predict_rival_state(
         return None
     if rival.track.t_s <= lock.track.t_s:
         return None
-    return predict_track(rival.track, t_s, filter_setup, with_cov=False).x
+    return predict_track(rival.track, t_s, filter_setup).x
 
 
 def update_lock(
@@ -395,7 +395,7 @@ def _is_clearly_consistent(
 ) -> bool:
     """True if errors that no covariance models, of lens, print and latency, already explain the
     misfit, as in most frames: a fast check that saves the full one."""
-    wanted = predict_track(track, frame_pose.t_s, filter_setup, with_cov=False)
+    wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measured.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))

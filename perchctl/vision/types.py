@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Literal, NamedTuple
@@ -319,9 +320,10 @@ class TargetEstimate:
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: the filter's velocity, in level axes, (3,): of `e_m` (`kalman.frame: level`)
             or of the target in the world (`kalman.frame: world`).
-        measured_offset_m: vector from the gear to the target at `measured_s`, in axes of the state
-            estimate's world, (3,); None without an attitude. Unlike `e_m`, it does not depend on
-            how far the vehicle has moved since.
+        measured_offset_m, measured_offset_sigma_m: vector from the gear to the target at
+            `measured_s`, in axes of the state estimate's world, (3,), and the larger standard
+            deviation of its x and y; None and infinite without an attitude. Unlike `e_m`, it does
+            not depend on how far the vehicle has moved since.
         world_m, world_yaw_rad: position (3,) and heading of the target in the world frame of the
             vehicle's state estimate; None without an attitude.
         world_velocity_mps: velocity (3,) of the target in that frame, which is the frame's drift;
@@ -344,6 +346,7 @@ class TargetEstimate:
     world_yaw_rad: float | None = None
     world_velocity_mps: Array | None = None
     measured_offset_m: Array | None = None
+    measured_offset_sigma_m: float = math.inf
 
 
 class MotionErrors(NamedTuple):

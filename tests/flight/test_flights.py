@@ -314,3 +314,12 @@ def test_beside_another_vehicle_it_perches_on_its_own_target(seed: int, tmp_path
     seen = xy[np.isfinite(xy[:, 0])]
     assert np.linalg.norm(seen - scenario.target_xy_m, axis=1).max() < APART_M / 4
     assert not any("reacquired" in (r["lock_note"] or "") for r in log.records)
+
+
+def test_a_logged_flight_is_the_same_as_one_that_is_not(tmp_path: Path) -> None:
+    """To the bit, within one process. The target's standard deviations were once computed for the
+    log alone, but the planner reads them, too."""
+    logged = fly_lockstep(short_profile(), 3, tmp_path / "flight.jsonl")
+    plain = fly_lockstep(short_profile(), 3)
+    assert logged.report.attempts > 0
+    assert (logged.report, logged.miss_m) == (plain.report, plain.miss_m)

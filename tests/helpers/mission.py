@@ -104,6 +104,7 @@ def target_at(
         world_yaw_rad=0.0,
         world_velocity_mps=np.zeros(3),
         measured_offset_m=np.array(world_m) - gear_m,
+        measured_offset_sigma_m=1e-3,
     )
     return replace(pose, **changes)  # type: ignore[arg-type]
 

@@ -148,7 +148,7 @@ def _update_target(b: Belief) -> Belief:
     if target.measured_offset_m is not None:
         x_m, y_m, _ = target.measured_offset_m.tolist()
         filtered = b.lateral_offset_filter.with_picture(
-            target.measured_s, (x_m, y_m), float(max(target.sigma_m[:2]))
+            target.measured_s, (x_m, y_m), target.measured_offset_sigma_m
         )
         b = replace(b, lateral_offset_filter=filtered)
     if target.world_m is None:
