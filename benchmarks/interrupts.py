@@ -37,7 +37,7 @@ from urllib.parse import urlsplit
 
 from perchctl.calibration import profile_camera
 from perchctl.link import Packet, Port
-from perchctl.mission.phase import PAPER_METHOD_PHASES
+from perchctl.mission.phase import PUBLISHED_METHOD_PHASES
 from perchctl.profile import load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -236,7 +236,7 @@ def main() -> int:
                 flush=True,
             )
         print(f"\n{'Ctrl-C in':<10} {'exit':>4}  {'ended':<8} locked")
-        for phase in PAPER_METHOD_PHASES:
+        for phase in PUBLISHED_METHOD_PHASES:
             code, ended, locked = interrupt_in(phase.value, options.seed, Path(folder))
             good = good and code == 130 and ended in ("LANDED", "PERCHED") and not locked
             print(f"{phase.value:<10} {code:>4}  {ended:<8} {locked}", flush=True)

@@ -116,7 +116,9 @@ class Filter:
 
     def add_velocity(self, b: Belief, dt_s: float) -> None:
         for i, axis in enumerate(self.axes):
-            pushed = b.is_positioned_by_target and not b.is_position_correcting_velocity and i < 2
+            pushed = (
+                b.is_positioned_by_target and not b.is_estimated_velocity_being_corrected and i < 2
+            )
             if not pushed:
                 v = b.telemetry.velocity_mps[i]
                 axis.update(1, v, axis.rv**2 / dt_s, 2.0 * MOST_SIGMAS)
@@ -175,7 +177,7 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         state, _ = step_mission(state, turn.observation, log.flown_profile)
         b, imu = state.belief, turn.observation.imu
         dt_s = 0.0 if before is None else imu.t_s - before.t_s
-        if before is None or imu.last_silence_end_s > before.t_s:
+        if before is None or imu.last_telemetry_gap_ended_at_s > before.t_s:
             filter_.begin(b.telemetry.velocity_mps)
         if before is not None and 0.0 < dt_s < 0.3:
             filter_.predict(np.subtract(imu.velocity_mps, before.velocity_mps), dt_s)
@@ -188,7 +190,14 @@ def moments(log: FlightLog) -> Iterator[Moment]:
             and dt_s > 0.0
         ):
             filter_.add_velocity(b, dt_s)
-        pose = next((turn.poses[n] for n in ("joint", "large", "small") if n in turn.poses), None)
+        pose = next(
+            (
+                turn.unfiltered_pose_by_marker[n]
+                for n in ("joint", "large", "small")
+                if n in turn.unfiltered_pose_by_marker
+            ),
+            None,
+        )
         if pose is not None and b.camera_imu_mismatch.camera_latency_error_s == 0.0:
             filter_.add_pose(pose)
         yield Moment(b, tuple(axis.copy(i) for i, axis in enumerate(filter_.axes)))
@@ -223,7 +232,9 @@ def _blind(
         dt_s = now.imu.t_s - imu.t_s
         if dt_s <= 0.0:
             continue
-        struck = now.imu.last_silence_end_s > imu.t_s or now.imu.last_impact_at_s > imu.t_s
+        struck = (
+            now.imu.last_telemetry_gap_ended_at_s > imu.t_s or now.imu.last_impact_at_s > imu.t_s
+        )
         if struck or now.height_m < FLOOR_M or not left:
             return
         gained = np.subtract(now.imu.velocity_mps, imu.velocity_mps)

@@ -139,12 +139,14 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     command = PositionSetpoint(0.1 + t_s / 97.0, 0.2, 1.1, 0.3)
     seen = None if frame is None else FrameRecord(frame.index, frame.t_s, frame.t_arrival_s)
     found = {} if output is None else output.poses
-    obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
+    obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_reading_age_s=1.0)
     state = PlannerState.initial_on_ground(obs, Profile())
     turn = TickRecord(
         number=number, role="flown", began_s=t_s, t_s=t_s,
         inputs=TickInputs(samples, frame=seen),
-        poses={name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
+        unfiltered_pose_by_marker={
+            name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()
+        },
         observation=obs, command=command, phase=state.phase, row_name="seek",
         reason="the target is looked for",
     )  # fmt: skip

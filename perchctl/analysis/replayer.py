@@ -303,7 +303,9 @@ def _differing(
     tick = -sum(turn.role == "waiting" for turn in turns)
     for each in found:
         was, seen = each.turn.observation, each.observation
-        fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
+        fields: list[tuple[str, Any, Any]] = [
+            ("poses", each.turn.unfiltered_pose_by_marker, each.poses)
+        ]
         if was is not None and seen is not None:
             logged = log_names(Observation)
             fields += [

@@ -63,7 +63,7 @@ class _Given:
     def turn(self, turn: TickRecord) -> None:
         taken, obs = turn.inputs, turn.observation
         self._taken, self._samples = taken, [taken.samples, taken.late_samples]
-        if self._name is None and obs is not None and taken.has_source_ended:
+        if self._name is None and obs is not None and taken.has_camera_source_ended:
             self._name = _ended_name(taken, obs)
 
     # As a link.
@@ -75,18 +75,18 @@ class _Given:
 
     @property
     def live(self) -> bool:
-        return self._taken.is_source_live
+        return self._taken.is_camera_source_live
 
     @property
     def finished(self) -> bool:
-        return self._taken.has_source_ended
+        return self._taken.has_camera_source_ended
 
     def poll(self, now_s: float) -> Frame | None:
         seen = self._taken.frame
         if seen is None:
             return None
         image = self._picture_of(seen)
-        t_s = seen.t_s + self._later_s if self._taken.is_source_live else seen.t_s
+        t_s = seen.t_s + self._later_s if self._taken.is_camera_source_live else seen.t_s
         return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.picture_kind, seen.repeated)
 
     def problem(self, now_s: float) -> str | None:

@@ -393,7 +393,7 @@ RESCUE_CLAIMS: dict[RestState, Claims] = {
     RestState.HANGS: {"hangs"},
     RestState.HELD: {"held off the target"},
     RestState.UNKNOWN: {"hangs or stands"},
-    RestState.UNSEEN: {"not seen down"},
+    RestState.END_UNCONFIRMED: {"not seen down"},
 }
 """The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS: Claims = {"stands"}
@@ -408,7 +408,7 @@ def last_transition(report: FlightReport) -> str:
 def report_claims(report: FlightReport) -> Claims:
     """All claims that a report makes about the vehicle."""
     claims = ROW_CLAIMS.get(last_transition(report), set()) | PHASE_CLAIMS.get(report.phase, set())
-    locked = {"locked"} if report.is_vehicle_locked else set()
+    locked = {"locked"} if report.is_locked_by_supervisor else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 

@@ -294,9 +294,9 @@ def _mission(
             drops_sightings = True
         events = Event.list_from_tick(before, state, obs, parts.profile)
         notes = watchers.take_notes()
-        if obs.log_problem is not None and not log_noted:
+        if obs.flight_log_problem is not None and not log_noted:
             log_noted = True
-            notes.insert(0, f"the flight log is incomplete: {obs.log_problem}")
+            notes.insert(0, f"the flight log is incomplete: {obs.flight_log_problem}")
         changed_s = inputs.perception.calibration.changed_s
         if changed_s is not None and changed_s != told_change_s:
             told_change_s = changed_s
@@ -349,15 +349,15 @@ def _observe(
     now_s: float,
     late_s: float,
     feed: FeedStatus | None,
-    log_problem: str | None,
+    flight_log_problem: str | None,
 ) -> Observation:
     return replace(
         inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator_request=parts.operator(),
-        log_problem=log_problem,
+        flight_log_problem=flight_log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
-        rejected_sighting_distance_m=0.0 if feed is None else feed.beside_m,
+        rejected_sighting_to_estimate_m=0.0 if feed is None else feed.beside_m,
     )

@@ -195,7 +195,7 @@ class Watchdog:
         return Observation(
             t_s=now_s,
             telemetry=history.newest or last.obs.telemetry,
-            has_estimate_jumped=history.jumped,
+            has_estimated_position_jumped=history.jumped,
             heading_jump_rad=history.turned_rad,
             loop_late_s=now_s - last.obs.t_s,
             position_age_s=age_s,
@@ -229,7 +229,7 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
     """True also while the weight is on the magnet: its monitored release continues."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
-        and (state.release_began_s is not None or state.motor_stop_ordered_s is not None)
+        and (state.release_began_s is not None or state.motor_stop_ordered_at_s is not None)
     )
 
 
@@ -281,7 +281,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is OperatorRequest.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return RestReport(RestState.UNSEEN)
+            return RestReport(RestState.END_UNCONFIRMED)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         problem: str | None = "the link raised an error"
@@ -293,7 +293,7 @@ def rescue(
                 t_s=now_s,
                 telemetry=newest,
                 link_problem=problem,
-                has_estimate_jumped=history.jumped,
+                has_estimated_position_jumped=history.jumped,
                 heading_jump_rad=history.turned_rad,
                 position_age_s=math.inf if by_target else position_age_s(now_s),
                 imu=history.imu,
@@ -306,4 +306,4 @@ def rescue(
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return RestReport(RestState.UNSEEN)
+    return RestReport(RestState.END_UNCONFIRMED)

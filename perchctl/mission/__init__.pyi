@@ -5,11 +5,11 @@ from .descent import step_landing as step_landing
 from .observation import CameraImuMismatch as CameraImuMismatch
 from .observation import Observation as Observation
 from .observation import VisualInertialMotion as VisualInertialMotion
-from .phase import Claim as Claim
 from .phase import OperatorRequest as OperatorRequest
 from .phase import Outcome as Outcome
 from .phase import Phase as Phase
 from .phase import Severity as Severity
+from .phase import VehicleClaim as VehicleClaim
 from .planner import step_mission as step_mission
 from .records import Event as Event
 from .records import EventKind as EventKind

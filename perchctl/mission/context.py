@@ -46,7 +46,7 @@ class Context:
 
     def held_s(self, condition: Condition[Any]) -> float:
         """Seconds for which a condition has been true; -1 while it is false."""
-        began_s = self.belief.since.get(condition)
+        began_s = self.belief.condition_start_times_s.get(condition)
         if began_s is None:
-            began_s = self.state.since.get(condition)
+            began_s = self.state.condition_start_times_s.get(condition)
         return -1.0 if began_s is None else self.t_s - began_s

@@ -28,9 +28,11 @@ class PhaseDefinition:
         maneuver: maneuver flown in this phase, as far as the evidence depends on it.
         enter: function that prepares the phase. It takes the state that has just entered the phase
             and the context of the tick before the transition, and returns the new state.
-            `state.entry.claims` are the claims of the transition.
+            `state.entry.claims` holds what the transition asserts about the vehicle
+            (`VehicleClaim`).
         act: function that returns the new state and the command of each tick.
-        exits: the phase's own rows in their order; rows for many phases come before them.
+        exits: the transitions (rows of the table) out of this phase alone, in the order in which
+            they are tried; rows for many phases come before them.
         conditions: the phase's own conditions, whose dwell times its exits use.
     """
 

@@ -25,7 +25,7 @@ from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import (
     HANGING,
     HANGING_DWELL_S,
-    MOTORS_OFF_DESPITE_ORDER,
+    MOTORS_OFF_DESPITE_THRUST_ORDER,
     MOTORS_OFF_DWELL_S,
     ON_FLOOR,
     has_slipped,
@@ -42,17 +42,17 @@ from perchctl.mission.belief.update import (
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
-    MAGNET_RELEASED_BELOW_M,
-    MIN_THRUST_FRACTION,
+    MIN_BELOW_CONTACT_WHEN_RELEASED_M,
+    MIN_ORDERED_TO_HOVER_THRUST_RATIO,
     descend_level,
     should_wait_for_climb_rate,
 )
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
-from perchctl.mission.phase import Claim, Phase, Severity
+from perchctl.mission.phase import Phase, Severity, VehicleClaim
 from perchctl.mission.release import (
     catch_slip,
-    choose_catch_setpoint_above_m,
+    choose_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
     release_by_thrust,
@@ -80,8 +80,8 @@ falls."""
 PEEL_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
-FALLING_OFF_MAGNET_MPS = -0.35
-"""Vertical speed below which a vehicle is falling off the magnet while it peels off, m/s."""
+MAX_CLIMB_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
+"""Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
 MAX_LANDED_HEIGHT_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
 MAX_RESTING_CLIMB_MPS = 0.1
@@ -144,9 +144,9 @@ def begin_landing(state: PlannerState) -> PlannerState:
         phase=Phase.LANDING,
         entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
         severity=max(state.severity, Severity.LAND),
-        since={},
+        condition_start_times_s={},
         belief=reset_evidence(b),
-        began_pressed=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
+        must_end_press=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
         last_stop_or_land_order_at_s=None,
         stop_or_land_order_count=0,
     )
@@ -168,25 +168,30 @@ def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
             stop_or_land_order_count=MIN_LANDING_ORDERS,
             last_stop_or_land_order_at_s=b.obs.t_s,
         )
-    elif heard and tel.thrust < 1 and before.motor_stop_ordered_s is None:
+    elif heard and tel.thrust < 1 and before.motor_stop_ordered_at_s is None:
         # The motors were stopped or never ran; no order may start them again.
-        state = replace(state, motor_stop_ordered_s=b.obs.t_s)
-    last_contact_body_z_m = old.last_contact_body_z_m
-    pressed_unseen = state.began_pressed and b.is_positioned_by_target
-    if last_contact_body_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
+        state = replace(state, motor_stop_ordered_at_s=b.obs.t_s)
+    vehicle_world_z_at_last_contact_m = old.vehicle_world_z_at_last_contact_m
+    pressed_unseen = state.must_end_press and b.is_positioned_by_target
+    if vehicle_world_z_at_last_contact_m is None and (
+        before.phase is Phase.PERCH or pressed_unseen
+    ):
         # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
         # ceiling. It counts as free only after a sighting from below.
-        last_contact_body_z_m = tel.position_m[2]
+        vehicle_world_z_at_last_contact_m = tel.position_m[2]
     # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
     state = move_setpoint_to_vehicle(Context(state))
-    within = last_contact_body_z_m is not None or b.reckoning.distance_below_m < MAGNET_REACH_M
-    lost = b.has_no_position_for_descent
+    within = (
+        vehicle_world_z_at_last_contact_m is not None
+        or b.reckoning.gear_below_target_m < MAGNET_REACH_M
+    )
+    lost = b.has_only_imu_for_descent
     b = replace(
         b,
         in_magnet_reach_since_s=before.t_s
         if within and old.in_magnet_reach_since_s is None
         else old.in_magnet_reach_since_s,
-        last_contact_body_z_m=last_contact_body_z_m,
+        vehicle_world_z_at_last_contact_m=vehicle_world_z_at_last_contact_m,
         hover_thrust_estimate=hover.estimate_hover_thrust(old),
     )
     return replace(state, belief=start_dead_reckoning(b) if lost else b)
@@ -197,12 +202,12 @@ def act(c: Context) -> Action:
     state = c.state
     if _is_falling_free(c):
         return _restart_landing_with_catch(c)
-    if state.motor_stop_ordered_s is None and state.catch_setpoint_above_vehicle_m is not None:
+    if state.motor_stop_ordered_at_s is None and state.catch_setpoint_above_vehicle_m is not None:
         if (caught := _catch_fall(c)) is not None:
             return caught
         c = Context(replace(state, catch_setpoint_above_vehicle_m=None))
-    is_off = c.held_s(MOTORS_OFF_DESPITE_ORDER) >= MOTORS_OFF_DWELL_S
-    if c.state.motor_stop_ordered_s is not None or is_off or _is_standing(c):
+    is_off = c.held_s(MOTORS_OFF_DESPITE_THRUST_ORDER) >= MOTORS_OFF_DWELL_S
+    if c.state.motor_stop_ordered_at_s is not None or is_off or _is_standing(c):
         return stop_motors(c)
     if c.state.release_began_s is not None:
         return _complete_transfer_to_magnet(c)
@@ -254,9 +259,13 @@ def is_landing_over(c: Context) -> bool:
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
-        if low and Claim.LANDING_UNCONFIRMED in c.state.entry.claims:
+        if low and VehicleClaim.LANDING_UNCONFIRMED in c.state.entry.claims:
             return True
-    return 0.0 < c.state.descent.thrust <= MIN_THRUST_FRACTION * c.belief.hover_thrust + 1.0
+    return (
+        0.0
+        < c.state.descent.thrust
+        <= MIN_ORDERED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust + 1.0
+    )
 
 
 # --- Falls, and proof of standing ---
@@ -271,7 +280,11 @@ def _is_falling_free(c: Context) -> bool:
     if state.stop_or_land_order_count:
         return False
     caught = state.catch_setpoint_above_vehicle_m is None
-    return b.last_contact_body_z_m is not None and caught and b.is_sinking(-FALLING_OFF_MAGNET_MPS)
+    return (
+        b.vehicle_world_z_at_last_contact_m is not None
+        and caught
+        and b.is_sinking(-MAX_CLIMB_WHEN_FALLING_OFF_MAGNET_MPS)
+    )
 
 
 def _is_standing(c: Context) -> bool:
@@ -291,17 +304,19 @@ def _restart_landing_with_catch(c: Context) -> Action:
     tel, b = c.telemetry, c.belief
     belief = replace(
         b,
-        last_contact_body_z_m=None,
+        vehicle_world_z_at_last_contact_m=None,
         in_magnet_reach_since_s=None,
-        reckoning=replace(b.reckoning, distance_below_m=math.inf),
+        reckoning=replace(b.reckoning, gear_below_target_m=math.inf),
     )
     state = replace(
         c.state,
         belief=belief,
         release_began_s=None,
-        motor_stop_ordered_s=None,
-        began_pressed=False,
-        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_m(b.hover_thrust, tel.thrust),
+        motor_stop_ordered_at_s=None,
+        must_end_press=False,
+        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(
+            b.hover_thrust, tel.thrust
+        ),
         setpoint=None,
         last_stop_or_land_order_at_s=None,
         stop_or_land_order_count=0,
@@ -335,7 +350,7 @@ def _descend_by_setpoints(c: Context) -> Action:
         setpoint = replace(
             setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_SETPOINT_BELOW_VEHICLE_M)
         )
-    state = forget_contact_when_below(state, MAGNET_RELEASED_BELOW_M)
+    state = forget_contact_when_below(state, MIN_BELOW_CONTACT_WHEN_RELEASED_M)
     state = replace(state, setpoint=setpoint, catch_setpoint_above_vehicle_m=None)
     dx, dy = state.lateral_integral_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
@@ -426,6 +441,6 @@ def _complete_transfer_to_magnet(c: Context) -> Action:
     climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
-    part = MIN_THRUST_FRACTION * c.belief.hover_thrust
+    part = MIN_ORDERED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust
     thrust = int(max(KEEPALIVE_THRUST, min(MIN_POSITION_MODE_THRUST, part)))
     return replace(c.state, release_began_s=c.t_s), RawThrust(thrust)

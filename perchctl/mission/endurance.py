@@ -50,8 +50,8 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     counted_s = predict_hover_time_s(
         energy, c.profile, thrust_fraction, identify_power_train(c.telemetry)
     )
-    seconds = None if energy.no_reading_s > MAX_READING_GAP_S else counted_s
-    if c.belief.target.world_m is None:
+    seconds = None if energy.time_since_battery_reading_s > MAX_READING_GAP_S else counted_s
+    if c.belief.target.world_position_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
     enough_s, predicted = seconds, predict_durations(c)
     if enough_s is None:
@@ -85,13 +85,13 @@ def predict_hover_time_s(
     lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else MAX_PRESS_VOLTAGE_DIP_V)
     press_load = max(thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, discharge_rate_factor = fit_sag_model(state)
+    sag_v, true_to_counted_discharge_ratio = fit_sag_model(state)
     end_v = hover_v + sag_v * thrust_fraction
     if profile.planner.hover is None:
         end_v = max(end_v, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (
-        discharge_rate_factor
+        true_to_counted_discharge_ratio
         * thrust_fraction
         * full_thrust_discharge_per_s(profile.vehicle.battery_mah, power_train)
     )
@@ -110,7 +110,9 @@ def predict_durations(c: Context) -> MissionDurations:
     """Predict how long this attempt, each retry and the landing take, from the height of the known
     target."""
     planner, hover = c.planner, c.planner.hover
-    top_z_m = c.belief.target.body_z_touching_target_m - (0.0 if hover is None else hover.below_m)
+    top_z_m = c.belief.target.vehicle_world_z_when_touching_m - (
+        0.0 if hover is None else hover.below_m
+    )
     climb_m = max(0.0, top_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s
     if hover is None:
@@ -134,9 +136,9 @@ def predict_durations(c: Context) -> MissionDurations:
     )
 
 
-def is_charge_too_low(c: Context) -> bool:
+def is_charge_too_low_to_continue(c: Context) -> bool:
     """True if the charge is too low for an attempt at a known target."""
-    gated = c.safety.energy_gate and c.belief.target.world_m is not None
+    gated = c.safety.energy_gate and c.belief.target.world_position_m is not None
     return gated and not c.state.battery.affordable_attempts
 
 
@@ -156,7 +158,9 @@ def battery_shortfall_text(c: Context) -> str:
 
 def _no_reading_grace_s(c: Context) -> float:
     """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
-    return c.safety.battery_stale_s - max(c.belief.battery_fit.no_reading_s, c.obs.battery_age_s)
+    return c.safety.battery_stale_s - max(
+        c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
+    )
 
 
 def _climb_duration_s(profile: Profile, climb_m: float) -> float:

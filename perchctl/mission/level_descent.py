@@ -47,8 +47,8 @@ THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
 SINK_SETPOINT_BY_CAMERA_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
-MIN_CAMERA_SINK_MPS = 0.2
-"""Sink rate from pictures below which the vehicle does not sink, m/s; the error of single
+MIN_SINK_MEASURED_BY_CAMERA_MPS = 0.2
+"""Sink rate measured by pictures below which the vehicle does not sink, m/s; the error of single
 detections is half of it."""
 CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
 """Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
@@ -64,7 +64,7 @@ THRUST_RAMP_BY_CAMERA_PER_S = 0.1
 the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
 MIN_DETECTED_SINK_MPS = 0.05
 """Sink rate below which the vehicle does not sink, m/s."""
-MIN_THRUST_FRACTION = 0.4
+MIN_ORDERED_TO_HOVER_THRUST_RATIO = 0.4
 """Smallest ordered thrust, as a share of the hover thrust."""
 MIN_TILT_COSINE = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
@@ -90,11 +90,12 @@ MAX_VISUAL_BIAS_AGE_S = 6.0
 """Time after which the attitude error that pictures have shown no longer applies, s."""
 MIN_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
-MAX_SUPPORTED_THRUST_FRACTION = 0.88
-"""Largest thrust that counts as low, as a share of the hover thrust."""
+MAX_SUPPORTED_TO_HOVER_THRUST_RATIO = 0.88
+"""Largest thrust at which a vehicle that reads 1 g must be resting on something, as a share of the
+hover thrust."""
 MAX_G_STILL_AIRBORNE = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
-TOUCHDOWN_THRUST_FRACTION = 0.5
+TOUCHDOWN_TO_HOVER_THRUST_RATIO = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
 TOUCHDOWN_DURATION_S = 0.25
 """Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
@@ -109,13 +110,15 @@ MAX_SETPOINT_DESCENT_S = 1.5
 its own estimate, s."""
 MIN_MEAN_SINK_MPS = 0.35
 """Least mean speed of the descent, m/s."""
-MAGNET_RELEASED_BELOW_M = 0.1
-"""Distance below the contact at which the magnet has let go, m. Larger: a vehicle that has come off
-still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
-MAGNET_RELEASED_BELOW_BY_CAMERA_M = 0.2
-"""The same distance from pictures with an old attitude, m. Larger: the vehicle drifts for longer
-before it brakes. Smaller: a target seen at an angle seems to be above."""
-STANDING_THRUST_FRACTION_BY_CAMERA = 0.75
+MIN_BELOW_CONTACT_WHEN_RELEASED_M = 0.1
+"""Distance of the vehicle below its contact from which the magnet has let go, m. Larger: a vehicle
+that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to
+have come off."""
+MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M = 0.2
+"""Distance of the gear below the target, from pictures with an old attitude, at which the magnet
+has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
+angle seems to be above."""
+MAX_STANDING_TO_HOVER_THRUST_BY_CAMERA = 0.75
 """Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
 in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
 Smaller: the motors run on the floor for longer."""
@@ -177,43 +180,48 @@ def descend_level(c: Context) -> Action:
         _climb_measured_at_s(c),
     )
     measured_mps = _measured_climb_mps(c)
-    climb_mps = measured_mps + descent.unmeasured_climb_mps
+    climb_mps = measured_mps + descent.climb_change_not_yet_measured_mps
     is_sinking, ramp_per_s = climb_mps <= -MIN_DETECTED_SINK_MPS, THRUST_RAMP_PER_S
     if _fresh_visual_motion(c) is not None:  # on the floor, recent orders cause no climb
-        is_sinking, ramp_per_s = measured_mps <= -MIN_CAMERA_SINK_MPS, THRUST_RAMP_BY_CAMERA_PER_S
+        is_sinking, ramp_per_s = (
+            measured_mps <= -MIN_SINK_MEASURED_BY_CAMERA_MPS,
+            THRUST_RAMP_BY_CAMERA_PER_S,
+        )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoning_since_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_S:
         thrust *= THRUST_FACTOR_WITHOUT_CLIMB_RATE
-    floor_detected_s = _find_floor_detection_s(c, hover_thrust, height_m, is_sinking=is_sinking)
-    touched_s = math.inf if floor_detected_s is None else c.t_s - floor_detected_s
+    floor_detected_at_s = _find_floor_detection_s(c, hover_thrust, height_m, is_sinking=is_sinking)
+    touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
     if touched_s >= TOUCHDOWN_DURATION_S and falls:
-        floor_detected_s = None  # the vehicle falls at low thrust, so it did not touch the floor
+        floor_detected_at_s = None  # the vehicle falls at low thrust, so it did not touch the floor
     carried = (
         b.is_imu_fresh
         and tel.acc_z_g > MIN_SUPPORTED_G
-        and tel.thrust < MAX_SUPPORTED_THRUST_FRACTION * hover_thrust
+        and tel.thrust < MAX_SUPPORTED_TO_HOVER_THRUST_RATIO * hover_thrust
     )
     overdue = _is_touchdown_overdue(c) and not (
         b.is_imu_fresh and tel.acc_z_g < MAX_G_STILL_AIRBORNE
     )
     before = descent.thrust or hover_thrust
     if touched_s < TOUCHDOWN_DURATION_S:
-        thrust = TOUCHDOWN_THRUST_FRACTION * hover_thrust
+        thrust = TOUCHDOWN_TO_HOVER_THRUST_RATIO * hover_thrust
     elif _is_target_redetected(c):
         thrust = before
-    elif floor_detected_s is not None or carried or not is_sinking or overdue:
+    elif floor_detected_at_s is not None or carried or not is_sinking or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
-    thrust = max(MIN_THRUST_FRACTION * hover_thrust, min(MAX_RAW_THRUST, thrust))
+    thrust = max(MIN_ORDERED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
-    shown_s = 0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_s)
+    shown_s = (
+        0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_at_s)
+    )
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
-    unmeasured_climb_mps = (
-        descent.unmeasured_climb_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
+    climb_change_not_yet_measured_mps = (
+        descent.climb_change_not_yet_measured_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     )
     state = _forget_contact_after_fall(c)
     state = replace(
@@ -221,16 +229,16 @@ def descend_level(c: Context) -> Action:
         descent=replace(
             descent,
             thrust=thrust,
-            floor_detected_s=floor_detected_s,
-            unmeasured_climb_mps=unmeasured_climb_mps,
-            climb_measured_s=measured_s,
+            floor_detected_at_s=floor_detected_at_s,
+            climb_change_not_yet_measured_mps=climb_change_not_yet_measured_mps,
+            climb_measured_at_s=measured_s,
         ),
         setpoint=None,
         stop_or_land_order_count=0,
         catch_setpoint_above_vehicle_m=None,
     )
     roll_rad, pitch_rad = (
-        (0.0, 0.0) if floor_detected_s is not None else _compute_braking_attitude(c)
+        (0.0, 0.0) if floor_detected_at_s is not None else _compute_braking_attitude(c)
     )
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
@@ -255,16 +263,16 @@ def _find_floor_detection_s(
     descent.
     """
     descent, b, seen = c.state.descent, c.belief, _fresh_visual_motion(c)
-    if descent.floor_detected_s is not None:
-        return descent.floor_detected_s
+    if descent.floor_detected_at_s is not None:
+        return descent.floor_detected_at_s
     struck = (
         c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_DURATION_S
         and b.reckoning.climb_before_impact_mps < 0.0
     )
-    weak = 0.0 < descent.thrust < STANDING_THRUST_FRACTION_BY_CAMERA * hover_thrust
+    weak = 0.0 < descent.thrust < MAX_STANDING_TO_HOVER_THRUST_BY_CAMERA * hover_thrust
     stands = (
         seen is not None
-        and seen.target_from_gear_m[2] > MAGNET_RELEASED_BELOW_BY_CAMERA_M
+        and seen.target_from_gear_m[2] > MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M
         and weak
         and not is_sinking
     )
@@ -291,18 +299,20 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
     clearly below it, or the accelerometer a fall; otherwise unchanged."""
     state, b, seen = c.state, c.belief, _fresh_visual_motion(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
-        return forget_contact_when_below(state, MAGNET_RELEASED_BELOW_M)
+        return forget_contact_when_below(state, MIN_BELOW_CONTACT_WHEN_RELEASED_M)
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
         in_magnet_reach_since_s, state.entry.t_s
     )
-    seen_below = seen is not None and seen.target_from_gear_m[2] > MAGNET_RELEASED_BELOW_BY_CAMERA_M
+    seen_below = (
+        seen is not None and seen.target_from_gear_m[2] > MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M
+    )
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
-            last_contact_body_z_m=None,
+            vehicle_world_z_at_last_contact_m=None,
             in_magnet_reach_since_s=None,
-            reckoning=replace(b.reckoning, distance_below_m=math.inf),
+            reckoning=replace(b.reckoning, gear_below_target_m=math.inf),
             dead_reckoning_since_s=None if b.dead_reckoning_since_s is None else c.t_s,
         )
         return replace(state, belief=belief)
@@ -358,13 +368,13 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     part *= min(1.0, MAX_SPEED_AGE_FOR_FULL_BRAKE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _world_to_heading_xy(part * x_mps, part * y_mps, yaw_rad)
     seen, gain = _fresh_visual_motion(c), BRAKE_GAIN_RAD_PER_MPS
-    if seen is not None and b.is_camera_motion_consistent:
+    if seen is not None and b.does_camera_motion_match_vehicle:
         ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
         if c.t_s - seen.t_s <= MAX_CAMERA_SPEED_AGE_S:
             ahead_mps, left_mps, _ = seen.vehicle_velocity_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         reckoning.bias_mps2,
-        reckoning.mean_lateral_mps2,
+        reckoning.mean_specific_force_world_xy_mps2,
     )
     known = (
         0.0
@@ -395,5 +405,7 @@ def _wind_tilt_rad(acceleration_against_wind_mps2: float) -> float:
     )
 
 
-def _brake_tilt_rad(mps: float, rad_per_mps: float) -> float:
-    return max(-MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -rad_per_mps * mps))
+def _brake_tilt_rad(lateral_speed_mps: float, brake_gain_rad_per_mps: float) -> float:
+    return max(
+        -MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -brake_gain_rad_per_mps * lateral_speed_mps)
+    )

@@ -41,15 +41,16 @@ class Observation:
     last_good_frame_age_s: float = 0.0  #: time since the last good frame arrived
     camera_problem: str | None = None  #: None, or one sentence
     link_problem: str | None = None  #: None, or one sentence
-    battery_age_s: float = 0.0
-    has_estimate_jumped: bool = False  #: the state estimate moved further than any flight could
+    battery_reading_age_s: float = 0.0  #: age of the newest battery voltage
+    #: the state estimate moved further than any flight could
+    has_estimated_position_jumped: bool = False
     heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
     loop_late_s: float = 0.0  #: delay of the start of this tick
     successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
     operator_request: OperatorRequest = OperatorRequest.NONE
-    log_problem: str | None = None  #: the flight log cannot be written
+    flight_log_problem: str | None = None  #: the flight log cannot be written
     #: latency beyond the profile's, subtracted from the frames' times (`measured`)
-    extra_camera_latency_s: float = 0.0
+    camera_latency_above_profile_s: float = 0.0
     #: standard deviation of the latency (`measured`); 0 if it is configured
     camera_latency_sigma_s: float = 0.0
     #: why the last target in view belongs to another vehicle
@@ -57,7 +58,7 @@ class Observation:
     position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
     position_problem: str | None = None  #: why no external position is sent; None while they are
     #: distance from the estimate to the newest sighting; 0 if it was accepted
-    rejected_sighting_distance_m: float = 0.0
+    rejected_sighting_to_estimate_m: float = 0.0
     imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`
     #: newest motion on which pictures and accelerometer agreed
     visual_inertial_motion: VisualInertialMotion | None = None

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.update import has_gap, update_belief
+from perchctl.mission.belief.update import has_tick_gap, update_belief
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M
+from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -18,14 +18,19 @@ def observe(
     """Return the state with its belief updated in `maneuver`. After a gap without ticks, the catch
     of a falling vehicle is cancelled. After a jump of the estimate, the remembered positions move
     with it."""
-    if has_gap(state.belief, obs, profile):
+    if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above; keeping it would make the vehicle press.
         setpoint = state.setpoint if state.catch_setpoint_above_vehicle_m is None else None
-        state = replace(state, since={}, catch_setpoint_above_vehicle_m=None, setpoint=setpoint)
+        state = replace(
+            state,
+            condition_start_times_s={},
+            catch_setpoint_above_vehicle_m=None,
+            setpoint=setpoint,
+        )
     known = state.belief.last_telemetry is not None
     belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
     state = replace(state, belief=belief)
-    return _apply_frame_shift(state) if obs.has_estimate_jumped and known else state
+    return _apply_frame_shift(state) if obs.has_estimated_position_jumped and known else state
 
 
 def _apply_frame_shift(state: PlannerState) -> PlannerState:
@@ -38,7 +43,7 @@ def _apply_frame_shift(state: PlannerState) -> PlannerState:
             entry=replace(state.entry, t_s=b.obs.t_s),
             stop_or_land_order_count=0,
             last_stop_or_land_order_at_s=None,
-            catch_setpoint_above_vehicle_m=CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M,
+            catch_setpoint_above_vehicle_m=CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M,
         )
     return replace(
         state,

@@ -20,11 +20,11 @@ class Phase(Enum):
 
     APPROACH = "APPROACH"
     SEARCH = "SEARCH"
-    ESTIMATE = "ESTIMATE"
+    ESTIMATE = "ESTIMATE"  # observe until the estimate of the target's pose is steady
     ALIGN = "ALIGN"
     ASCEND = "ASCEND"
     PERCH = "PERCH"
-    COMPLETE = "COMPLETE"
+    COMPLETE = "COMPLETE"  # transfer the weight to the magnet and stop the motors
     RECOVER = "RECOVER"
     HOVER = "HOVER"
     LANDING = "LANDING"
@@ -66,7 +66,7 @@ FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
 """Phases in which nothing but air should touch the vehicle: their maneuver is `in_free_air`."""
 MAGNET_ATTACH_PHASES = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
-PAPER_METHOD_PHASES = (
+PUBLISHED_METHOD_PHASES = (
     Phase.APPROACH,
     Phase.SEARCH,
     Phase.ESTIMATE,
@@ -122,7 +122,7 @@ _EXIT_CODES: dict[Outcome, int] = {
 }
 
 
-class Claim(Flag):
+class VehicleClaim(Flag):
     """What a row claims about the vehicle, in addition to its reason. The next phase starts from
     the claims. Code that needs such a fact tests the claim, never the name of a row."""
 
@@ -137,7 +137,7 @@ class Claim(Flag):
     """The vehicle hangs where it last touched the target."""
     HELD_BY_OTHER = auto()
     """Something other than the target holds the vehicle."""
-    POSITIONS_WRONG = auto()
+    EXTERNAL_POSITIONS_WRONG = auto()
     """External positions lead position control away from its setpoint."""
     MOUNTING_WRONG = auto()
     """The camera's mounting differs from the profile, or the axes of the positions are wrong."""

@@ -73,12 +73,14 @@ def _update_before_decision(
         if measured and is_hovering(state):
             state = _add_hover_error(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
-    since = update_start_times(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
+    condition_start_times_s = update_start_times(
+        state.condition_start_times_s, PHASE_CONDITIONS, Context(state), obs.t_s
+    )
     state = replace(
         state,
         consecutive_target_frames=consecutive_target_frames,
         hold_reason=hold,
-        since={} if hold else since,
+        condition_start_times_s={} if hold else condition_start_times_s,
     )
     return replace(state, battery=compute_battery_outlook(Context(state)))
 
@@ -115,13 +117,13 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         ),
         severity=state.severity.escalate(row.severity),
         outcome=row.outcome_after(state.outcome),
-        since={},
+        condition_start_times_s={},
         failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
         waiting_reason="",
         waited_in_phase_s=0.0,
         search_step_began_s=c.t_s,
         consecutive_target_frames=0,
-        began_pressed=ends and state.catch_setpoint_above_vehicle_m is None and presses,
+        must_end_press=ends and state.catch_setpoint_above_vehicle_m is None and presses,
         last_stop_or_land_order_at_s=None,
         stop_or_land_order_count=0,
     )
@@ -134,7 +136,7 @@ def act(c: Context) -> Action:
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.
     leaves = state.phase is Phase.RECOVER and (
-        state.began_pressed or state.catch_setpoint_above_vehicle_m is not None
+        state.must_end_press or state.catch_setpoint_above_vehicle_m is not None
     )
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 from perchctl.geometry import Array
 from perchctl.mission.belief.quality import position_loss_text
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Claim, Outcome, Phase, Severity
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
 from perchctl.mission.rest import RestState
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
@@ -42,7 +42,7 @@ class Event:
     severity: Severity = Severity.CONTINUE
     simulated_fault: str = ""  # fault of the simulated scenario that caused it
     rest: RestState | None = None  # rest state found by a rescue; None in all other events
-    claims: Claim = Claim.NONE  # claims of the transition
+    claims: VehicleClaim = VehicleClaim.NONE  # claims of the transition
 
     @classmethod
     def note_from_rescue(
@@ -131,8 +131,8 @@ class TickInputs:
     frame: FrameRecord | None = None
     # the next three are reported by the camera source
     camera_problem: str | None = None
-    has_source_ended: bool = False
-    is_source_live: bool = True
+    has_camera_source_ended: bool = False
+    is_camera_source_live: bool = True
     is_detection_requested: bool = True  # the frame was meant to be searched for markers
     sends_sightings_as_position: bool = True  # sightings are the vehicle's external position
     has_discarded_sightings: bool = False  # earlier ones, because positions had diverged
@@ -140,11 +140,12 @@ class TickInputs:
 
 @dataclass(frozen=True, eq=False)
 class UnfilteredPose:
-    """An unfiltered pose of the target; the fields are those of `perchctl.vision.MarkerPose`."""
+    """An unfiltered pose of the target: `t_s` and `e_m` of a `perchctl.vision.MarkerPose`, and its
+    `e_yaw_rad`."""
 
     t_s: float
     e_m: Array
-    e_yaw_rad: float
+    vehicle_to_target_yaw_rad: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -168,7 +169,8 @@ class TickRecord:
     began_s: float
     t_s: float  # time of the decision; later than `began_s` if the loop was blocked
     inputs: TickInputs
-    poses: dict[str, UnfilteredPose] = field(default_factory=dict)
+    # by the name of the marker, or ``joint`` for a pose from both
+    unfiltered_pose_by_marker: dict[str, UnfilteredPose] = field(default_factory=dict)
     observation: Observation | None = None  # None while waiting
     command: Command | None = None  # None while waiting, and for a failed tick
     phase: Phase | None = None
@@ -232,9 +234,9 @@ class Tick:
         return self.t_s - self.telemetry.t_s + self.telemetry.behind_s
 
     @property
-    def extra_camera_latency_s(self) -> float:
+    def camera_latency_above_profile_s(self) -> float:
         """Latency that is subtracted from the frames' times, beyond the profile's, s."""
-        return self.observation.extra_camera_latency_s
+        return self.observation.camera_latency_above_profile_s
 
     @property
     def external_positions(self) -> ExternalPositions | None:

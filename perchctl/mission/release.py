@@ -22,22 +22,23 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
-PRESS_ENDED_BELOW_CONTACT_M = 0.08
-"""Distance below the contact at which the vehicle has left it, m."""
-FALLING_OFF_PRESS_MPS = -0.3
-"""Vertical speed below which the vehicle is falling off, m/s; the setpoint then stays at the
-vehicle."""
-INTEGRATOR_UNWIND_BELOW_IN_PRESS_M = 1.0
+MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M = 0.08
+"""Distance of the vehicle below the contact from which it has left it, m."""
+MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
+"""Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
+the vehicle."""
+UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
 """Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
-INTEGRATOR_UNWIND_BELOW_IN_AIR_M = 0.25
+UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M = 0.25
 """The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
 PRESS_END_TIMEOUT_S = 4.0
 """Time after which `end_press` ends, whether or not the vehicle has come off, s."""
 
 # --- release ---
-MIN_HOLDING_THRUST_FRACTION = 0.9
-"""Share of the holding thrust down to which the raw thrust of a press is lowered."""
+MIN_RELEASE_TO_HOLDING_THRUST_RATIO = 0.9
+"""Share of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down to
+which the raw thrust of a press is lowered."""
 EXTRA_HANG_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the ordered one, s."""
 
@@ -50,9 +51,9 @@ LATE_STOP_ORDER_PERIOD_S = 0.5
 """Time after which one more stop order is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
-CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M = 1.0
+CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors stand still, m."""
-CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M = 0.2
+CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
 MOTORS_ON_THRUST_FRACTION = 0.5
@@ -74,26 +75,26 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     onboard integrators have unwound; None after that, or if the vehicle was not pressed."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry.position_m
-    if not state.began_pressed:
+    if not state.must_end_press:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
-        away_m > PRESS_ENDED_BELOW_CONTACT_M
+        away_m > MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M
         and not is_above_hover_thrust(c.belief)
-        and tel.velocity_mps[2] > FALLING_OFF_PRESS_MPS
+        and tel.velocity_mps[2] > MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS
     )
     if calm or c.in_phase_s > PRESS_END_TIMEOUT_S:
-        return replace(state, began_pressed=False), None
-    distance_below_m = (
-        INTEGRATOR_UNWIND_BELOW_IN_PRESS_M
-        if away_m < PRESS_ENDED_BELOW_CONTACT_M
-        else INTEGRATOR_UNWIND_BELOW_IN_AIR_M
+        return replace(state, must_end_press=False), None
+    setpoint_below_vehicle_m = (
+        UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M
+        if away_m < MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M
+        else UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M
     )
-    if tel.velocity_mps[2] < FALLING_OFF_PRESS_MPS:
-        distance_below_m = 0.0
+    if tel.velocity_mps[2] < MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS:
+        setpoint_below_vehicle_m = 0.0
     dx, dy = state.lateral_integral_m
     setpoint = PositionSetpoint(
-        x + dx, y + dy, tel.position_m[2] - distance_below_m, state.entry.yaw_rad
+        x + dx, y + dy, tel.position_m[2] - setpoint_below_vehicle_m, state.entry.yaw_rad
     )
     return state, limit_setpoint(c, setpoint)
 
@@ -106,13 +107,17 @@ def lower_thrust(c: Context) -> Action:
     if perch.mode == "raw":
         if not b.is_imu_fresh:
             return hold_contact_by_position(c)
-        lowest = MIN_HOLDING_THRUST_FRACTION * complete.hold_ratio * b.hover_thrust
+        lowest = MIN_RELEASE_TO_HOLDING_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
-    assert b.last_contact_body_z_m is not None
-    slid_m = 0.0 if b.is_position_valid else c.telemetry.position_m[2] - b.last_contact_body_z_m
+    assert b.vehicle_world_z_at_last_contact_m is not None
+    slid_m = (
+        0.0
+        if b.is_position_valid
+        else c.telemetry.position_m[2] - b.vehicle_world_z_at_last_contact_m
+    )
     top = state.entry.position_m[2] + perch.press_m + slid_m
-    low = b.last_contact_body_z_m - complete.release_drop_m + slid_m
+    low = b.vehicle_world_z_at_last_contact_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
     sent = limit_setpoint(c, correct_setpoint(c, setpoint, corrects_height=False))
     return replace(state, setpoint=setpoint), sent
@@ -133,13 +138,13 @@ def release_by_thrust(c: Context, *, accepted_telemetry_age_s: float = 0.0) -> A
         release_began_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(
             b,
-            last_contact_body_z_m=z_m
-            if b.last_contact_body_z_m is None
-            else b.last_contact_body_z_m,
+            vehicle_world_z_at_last_contact_m=z_m
+            if b.vehicle_world_z_at_last_contact_m is None
+            else b.vehicle_world_z_at_last_contact_m,
         )
         state = replace(state, release_began_s=release_began_s, belief=b)
     hung_s = c.held_s(FULL_WEIGHT_HANGS)
-    unconfirmed = b.last_thrust_mismatch_s >= c.t_s - hung_s
+    unconfirmed = b.thrust_last_differed_from_order_at_s >= c.t_s - hung_s
     extra_s = EXTRA_HANG_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
@@ -154,9 +159,9 @@ def hold_contact_by_position(c: Context) -> Action:
     fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
-    if b.last_contact_body_z_m is not None and b.is_position_valid:
-        z_m = b.last_contact_body_z_m
-    setpoint = PositionSetpoint(x, y, z_m + CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M, tel.yaw_rad)
+    if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
+        z_m = b.vehicle_world_z_at_last_contact_m
+    setpoint = PositionSetpoint(x, y, z_m + CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, release_began_s=None), limit_setpoint(c, setpoint)
 
 
@@ -170,17 +175,17 @@ def stop_motors(c: Context) -> Action:
     """Send stop and notify `STOP_ORDER_COUNT` times because one lost notify would lock a hanging
     vehicle; send more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
-    if state.motor_stop_ordered_s is None:
+    if state.motor_stop_ordered_at_s is None:
         return replace(
             state,
-            motor_stop_ordered_s=now_s,
+            motor_stop_ordered_at_s=now_s,
             last_stop_or_land_order_at_s=now_s,
             stop_or_land_order_count=1,
         ), StopMotors()
     waited_s = now_s - (
         state.last_stop_or_land_order_at_s
         if state.last_stop_or_land_order_at_s is not None
-        else state.motor_stop_ordered_s
+        else state.motor_stop_ordered_at_s
     )
     still_to_send = (
         state.stop_or_land_order_count < STOP_ORDER_COUNT and waited_s >= STOP_ORDER_PERIOD_S
@@ -194,10 +199,14 @@ def stop_motors(c: Context) -> Action:
     return state, Idle()
 
 
-def choose_catch_setpoint_above_m(hover_thrust: float, thrust: float) -> float:
+def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, thrust: float) -> float:
     """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
     turning = thrust > MOTORS_ON_THRUST_FRACTION * hover_thrust
-    return CATCH_SETPOINT_ABOVE_IF_MOTORS_ON_M if turning else CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M
+    return (
+        CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M
+        if turning
+        else CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M
+    )
 
 
 def catch_slip(c: Context) -> Action | None:
@@ -228,13 +237,15 @@ def _braking_setpoint_m(c: Context) -> tuple[float, float]:
     return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S
 
 
-def forget_contact_when_below(state: PlannerState, distance_below_m: float) -> PlannerState:
-    """Return the state without its recorded contact if the vehicle is more than `distance_below_m`
-    below it; otherwise unchanged."""
+def forget_contact_when_below(state: PlannerState, below_contact_m: float) -> PlannerState:
+    """Return the state without its recorded contact if the vehicle is more than `below_contact_m`
+    below that contact; otherwise unchanged."""
     b = state.belief
     if (
-        b.last_contact_body_z_m is None
-        or b.telemetry.position_m[2] >= b.last_contact_body_z_m - distance_below_m
+        b.vehicle_world_z_at_last_contact_m is None
+        or b.telemetry.position_m[2] >= b.vehicle_world_z_at_last_contact_m - below_contact_m
     ):
         return state
-    return replace(state, belief=replace(b, last_contact_body_z_m=None, last_contact_offset=None))
+    return replace(
+        state, belief=replace(b, vehicle_world_z_at_last_contact_m=None, last_contact_offset=None)
+    )

@@ -10,7 +10,7 @@ from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import MOTORS_STOPPED, current_gear_offset
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.phase import Outcome, Phase, VehicleClaim
 from perchctl.mission.records import Event
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
@@ -36,10 +36,10 @@ MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
 ascent allows."""
 
 
-def find_row_claims(row_name: str) -> Claim:
+def find_row_claims(row_name: str) -> VehicleClaim:
     """Return the claims of the built-in row with this name, as a log stores it; none for any other
     name, for example that of your own row."""
-    return next((row.claims for row in TABLE if row.name == row_name), Claim.NONE)
+    return next((row.claims for row in TABLE if row.name == row_name), VehicleClaim.NONE)
 
 
 @dataclass(frozen=True)
@@ -76,19 +76,19 @@ class CameraFindings:
 
     @classmethod
     def from_camera_errors(
-        cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False
+        cls, camera_errors: CameraErrors, camera: CameraConfig, *, simulated: bool = False
     ) -> CameraFindings:
         """Return the findings from a flight's estimates, with advice on each error that is beyond
         its limit and significant at 95 %; no advice if the flight was `simulated`."""
-        latency_s = camera.start_latency_s + seen.delay_s
-        x, y, z = (math.degrees(turn) for turn in seen.mount_rotation_xyz_rad)
-        sx, sy, sz = (math.degrees(sigma) for sigma in seen.mount_rotation_sigma_xyz_rad)
-        found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
+        latency_s = camera.start_latency_s + camera_errors.delay_s
+        x, y, z = (math.degrees(turn) for turn in camera_errors.mount_rotation_xyz_rad)
+        sx, sy, sz = (math.degrees(sigma) for sigma in camera_errors.mount_rotation_sigma_xyz_rad)
+        found, advice = cls(latency_s, camera_errors.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
         if simulated:
             return found
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
         if set_here and _is_significant(
-            seen.delay_s, MIN_REPORTED_LATENCY_ERROR_S, seen.delay_sigma_s
+            camera_errors.delay_s, MIN_REPORTED_LATENCY_ERROR_S, camera_errors.delay_sigma_s
         ):
             advice.append(
                 f"the latency is {found.latency_text}, not {camera.start_latency_s * 1e3:.0f} ms "
@@ -134,7 +134,7 @@ class HoverReport:
 
     duration_s: float
     below_target_m: float
-    rms_m: tuple[float, float, float]
+    gear_to_hover_position_rms_xyz_m: tuple[float, float, float]
     rms_yaw_rad: float
 
     @classmethod
@@ -150,7 +150,7 @@ class HoverReport:
     def text(self) -> str:
         """The report in words, for example ``20.0 s; RMS error x 4.1, y 3.0, z 6.2 mm, heading 0.8
         deg``."""
-        x, y, z = (f"{1e3 * each:.1f}" for each in self.rms_m)
+        x, y, z = (f"{1e3 * each:.1f}" for each in self.gear_to_hover_position_rms_xyz_m)
         yaw = f"{math.degrees(self.rms_yaw_rad):.1f}"
         return f"{self.duration_s:.1f} s; RMS error x {x}, y {y}, z {z} mm, heading {yaw} deg"
 
@@ -164,7 +164,7 @@ class FlightReport:
     reason: str
     attempts: int
     duration_s: float
-    is_vehicle_locked: bool
+    is_locked_by_supervisor: bool
     history: tuple[Event, ...] = ()  # events of the phases, from the start of the flight
     findings: CameraFindings | None = None  # latency and mounting, if the flight was long enough
     last_contact_offset: ContactOffset | None = None  # offset of a vehicle that hangs
@@ -176,7 +176,7 @@ class FlightReport:
     @property
     def is_profile_suspect(self) -> bool:
         """True if a row that claims a wrong profile fired during the flight."""
-        return any(Claim.PROFILE_MAY_BE_WRONG in event.claims for event in self.history)
+        return any(VehicleClaim.PROFILE_MAY_BE_WRONG in event.claims for event in self.history)
 
     @classmethod
     def from_state(
@@ -207,7 +207,8 @@ class FlightReport:
             duration_s=obs.t_s - state.started_s,
             # The available telemetry is older than an emergency stop, which always locks the
             # vehicle.
-            is_vehicle_locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
+            is_locked_by_supervisor=obs.telemetry.has_bit(LOCKED)
+            or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None
             if camera_errors is None
@@ -274,6 +275,6 @@ def find_touchdown(c: Context) -> Touchdown | None:
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     told = why and (
-        state.phase is not Phase.ABORTED or Claim.LANDING_UNCONFIRMED in state.entry.claims
+        state.phase is not Phase.ABORTED or VehicleClaim.LANDING_UNCONFIRMED in state.entry.claims
     )
     return f"{why}; {state.reason}" if told else state.reason

@@ -9,7 +9,7 @@ from enum import Enum
 from perchctl.mission.belief.contact import contact_height_tolerance_m
 from perchctl.mission.belief.target import MIN_FAR_ABOVE_M
 from perchctl.mission.context import Context
-from perchctl.mission.phase import Claim, Phase
+from perchctl.mission.phase import Phase, VehicleClaim
 
 MAX_HANGING_DRIFT_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
@@ -31,7 +31,7 @@ class RestState(Enum):
     HELD = "something holds the vehicle away from the target; the motors are off"
     STANDS = "the vehicle stands on the floor with its motors off"
     UNKNOWN = "the motors are off; it is unknown whether the vehicle hangs or stands"
-    UNSEEN = "how the flight ended could not be confirmed: keep away from the vehicle"
+    END_UNCONFIRMED = "how the flight ended could not be confirmed: keep away from the vehicle"
 
 
 def find_rest_state(c: Context) -> RestState:
@@ -47,7 +47,7 @@ def find_rest_state(c: Context) -> RestState:
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HANGING_HEIGHT_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
     stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_STILL_HANGING_M
-    at_contact = b.last_contact_body_z_m is not None and not b.target.is_far_above
+    at_contact = b.vehicle_world_z_at_last_contact_m is not None and not b.target.is_far_above
     if stayed or (b.height_m > MAX_FLOOR_REST_HEIGHT_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
@@ -62,10 +62,10 @@ def _is_held_elsewhere(c: Context) -> bool:
         and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_DESCENT_STILL_HANGING_M
     ):
         return False
-    if Claim.HELD_BY_OTHER in state.entry.claims:
+    if VehicleClaim.HELD_BY_OTHER in state.entry.claims:
         return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
-        contact_height_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M
+        contact_height_tolerance_m(b) < b.target.gear_to_target_z_m <= MIN_FAR_ABOVE_M
         and b.last_contact_offset is None
     )
     by_position = (
@@ -82,16 +82,18 @@ def _find_rest_state_from_falls(c: Context) -> RestState:
     came within the magnet's reach. It is UNKNOWN after a silence that was long enough to hide a
     fall or a catch."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_magnet_reach_since_s
-    floor_s = c.state.descent.floor_detected_s
+    floor_s = c.state.descent.floor_detected_at_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt
-    unsure = reckoning.last_possible_catch_gap_end_s > max(down_s, reckoning.last_sighting_at_s)
+    unsure = reckoning.last_gap_magnet_may_attach_ended_at_s > max(
+        down_s, reckoning.last_sighting_at_s
+    )
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
-    came_unheard = unsure and reckoning.last_possible_catch_gap_end_s <= since_s
+    came_unheard = unsure and reckoning.last_gap_magnet_may_attach_ended_at_s <= since_s
     return (
         RestState.UNKNOWN
-        if came_unheard or b.imu.last_fall_hiding_gap_end_s > since_s
+        if came_unheard or b.imu.last_gap_that_may_hide_fall_ended_at_s > since_s
         else RestState.HANGS
     )
 
@@ -102,20 +104,26 @@ def is_still_hanging(c: Context) -> bool:
     if (
         not b.is_positioned_by_target
         and b.is_position_valid
-        and b.last_contact_body_z_m is not None
+        and b.vehicle_world_z_at_last_contact_m is not None
     ):
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
-        if not falls and b.last_contact_body_z_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M:
+        if (
+            not falls
+            and b.vehicle_world_z_at_last_contact_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M
+        ):
             return True
     return _find_rest_state_from_falls(c) is RestState.HANGS
 
 
 def is_hanging_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped while the vehicle hung, and it still hangs."""
-    motor_stop_ordered_s, landing = c.state.motor_stop_ordered_s, c.state.phase is Phase.LANDING
-    if motor_stop_ordered_s is None or (
+    motor_stop_ordered_at_s, landing = (
+        c.state.motor_stop_ordered_at_s,
+        c.state.phase is Phase.LANDING,
+    )
+    if motor_stop_ordered_at_s is None or (
         landing
-        and motor_stop_ordered_s >= c.state.entry.t_s
+        and motor_stop_ordered_at_s >= c.state.entry.t_s
         and c.state.stop_or_land_order_count == 0
     ):
         return False

@@ -24,9 +24,9 @@ from perchctl.mission.belief.motion import MAX_PUSH_TO_ESTIMATE_DELAY_S
 from perchctl.mission.belief.quality import (
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
+    ESTIMATE_VARIANCE_TOO_LARGE,
     TARGET_BELOW,
     TILTED,
-    VARIANCE_TOO_LARGE,
     no_picture_reason,
     position_loss_text,
     variance_text,
@@ -38,10 +38,10 @@ from perchctl.mission.phase import (
     MAGNET_ATTACH_PHASES,
     PRE_CONTACT_PHASES,
     PRE_LANDING_PHASES,
-    Claim,
     OperatorRequest,
     Outcome,
     Phase,
+    VehicleClaim,
 )
 from perchctl.mission.phases.ascend import NEAR_STANDOFF
 from perchctl.mission.rest import is_hanging_with_motors_off
@@ -56,24 +56,25 @@ from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 LIFTOFF_HEIGHT_M = 0.05
-"""Height below which the lateral limit of a take-off is `MAX_GROUND_DISPLACEMENT_M`, m."""
-MAX_GROUND_DISPLACEMENT_M = 0.12
-"""Largest lateral motion before the vehicle has lifted off, m. Larger: a wrong mounting tips it
-over."""
+"""Height below which the lateral limit of a take-off is `MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M`,
+m."""
+MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
+"""Largest lateral motion of the vehicle before it has lifted off, m. Larger: a wrong mounting tips
+it over."""
 LOW_HEIGHT_FOR_DIVERGENCE_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
-MAX_DEVIATION_AT_LOW_HEIGHT_M = 0.22
+MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
 `LOW_HEIGHT_FOR_DIVERGENCE_M` and in a vertical climb."""
-MAX_LANDING_DEVIATION_M = 0.4
+MAX_SETPOINT_DEVIATION_IN_LANDING_M = 0.4
 """The same distance during a landing, m."""
 MAX_SETPOINT_DEVIATION_M = 0.8
 """The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
 reaches the walls."""
-EXTRA_DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
-"""Increase of the lateral limit with the target as the position source, in m per second of the
-latency's standard deviation: pictures that are 0.1 s later than assumed cause up to 0.2 m. Larger:
-a rotated camera leads the vehicle further away."""
+SETPOINT_DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
+"""Increase of the limit on the lateral distance from the setpoint with the target as the position
+source, in m per second of the camera latency's standard deviation: pictures that are 0.1 s later
+than assumed cause up to 0.2 m. Larger: a rotated camera leads the vehicle further away."""
 MAX_LATERAL_OFFSET_IN_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
@@ -104,7 +105,7 @@ the flight."""
 # --- Reliability of position, pictures and mounting ---
 
 
-def has_diverged(c: Context) -> bool:
+def is_led_away_from_setpoint(c: Context) -> bool:
     """True if position control leads the vehicle away from its setpoint, as with external positions
     in wrong axes: it is further away than any draught could move it, it oscillates, or its
     estimated velocity contradicts the accelerometer."""
@@ -116,15 +117,18 @@ def has_diverged(c: Context) -> bool:
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
-        touched = b.last_contact_body_z_m is not None or c.state.motor_stop_ordered_s is not None
-        return not touched and _setpoint_deviation_m(c) > MAX_LANDING_DEVIATION_M
+        touched = (
+            b.vehicle_world_z_at_last_contact_m is not None
+            or c.state.motor_stop_ordered_at_s is not None
+        )
+        return not touched and _setpoint_deviation_m(c) > MAX_SETPOINT_DEVIATION_IN_LANDING_M
     spare_m = (
-        EXTRA_DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        SETPOINT_DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
         if b.is_positioned_by_target
         else 0.0
     )
     if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
-        return _setpoint_deviation_m(c) > MAX_GROUND_DISPLACEMENT_M + spare_m
+        return _setpoint_deviation_m(c) > MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M + spare_m
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
@@ -134,7 +138,7 @@ def has_diverged(c: Context) -> bool:
     is_pushed = b.imu.t_s - b.imu.last_push_at_s <= MAX_PUSH_TO_ESTIMATE_DELAY_S  # by moving air
     stays = b.height_m < LOW_HEIGHT_FOR_DIVERGENCE_M or (only_climbs and not is_pushed)
     return _setpoint_deviation_m(c) > (
-        MAX_DEVIATION_AT_LOW_HEIGHT_M + spare_m if stays else MAX_SETPOINT_DEVIATION_M
+        MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M + spare_m if stays else MAX_SETPOINT_DEVIATION_M
     )
 
 
@@ -182,10 +186,10 @@ def is_position_lost(c: Context) -> bool:
         return True
     if (
         b.position_age_s > MIN_CONTRADICTED_POSITION_AGE_S
-        and c.obs.rejected_sighting_distance_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
+        and c.obs.rejected_sighting_to_estimate_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
     ):
         return True
-    unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VELOCITY_VARIANCE_M2PS2
+    unsure = b.worst_axis_velocity_variance_m2ps2 > MAX_BLIND_VELOCITY_VARIANCE_M2PS2
     return b.is_positioned_by_target and b.is_position_stale and unsure
 
 
@@ -199,7 +203,7 @@ def is_outside_fence(c: Context) -> bool:
     return math.hypot(dx, dy) > c.safety.fence_radius_m
 
 
-def is_outside_corridor(c: Context) -> bool:
+def is_outside_fleet_corridor(c: Context) -> bool:
     """True if a vehicle of a fleet is where another one may fly, or if nothing says where it is.
     A vehicle without a corridor is never outside."""
     corridor, (x_m, y_m, _) = c.safety.corridor, c.telemetry.position_m
@@ -209,7 +213,7 @@ def is_outside_corridor(c: Context) -> bool:
 def wrong_latency_reason(c: Context) -> str:
     """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
-    assumed_s = camera.start_latency_s + c.obs.extra_camera_latency_s
+    assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s
     found = f"the pictures are {1e3 * (assumed_s + error_s):.0f} ms old"
     if not b.is_telemetry_fresh:  # with late telemetry, pictures in time seem late
@@ -232,15 +236,19 @@ def is_mounting_wrong(c: Context) -> bool:
     """True if the target moves along with the vehicle, or appears below it."""
     b = c.belief
     below = c.held_s(TARGET_BELOW) >= TARGET_BELOW_DWELL_S
-    return b.mounting.is_wrong or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0 or below
+    return (
+        b.mounting.is_camera_mounting_wrong
+        or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0
+        or below
+    )
 
 
 def wrong_mounting_reason(c: Context) -> str:
     """Return how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
-    if turn_rad or b.mounting.is_wrong:
-        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.rotation_rad) / 10.0)
+    if turn_rad or b.mounting.is_camera_mounting_wrong:
+        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.camera_yaw_error_rad) / 10.0)
         turn_deg = 180 if turn_deg == -180 else turn_deg
         text = (
             f"the camera seems to be rotated by about {turn_deg} deg relative to the profile: the "
@@ -250,8 +258,8 @@ def wrong_mounting_reason(c: Context) -> str:
         capture = not turn_rad and c.profile.positioning.source.is_mocap
         return f"{text}; or the motion capture may have swapped axes" if capture else text
     return (
-        f"the target appears {-b.target.error_z_m:.1f} m below the vehicle: camera.mount does not "
-        f"point the camera up"
+        f"the target appears {-b.target.gear_to_target_z_m:.1f} m below the vehicle: "
+        f"camera.mount does not point the camera up"
     )
 
 
@@ -279,14 +287,14 @@ def is_blocked_off_target(c: Context) -> bool:
     """True if the vehicle is blocked at a position where a press would not prove the contact."""
     pressing = c.state.phase is Phase.PERCH
     return is_blocked(c) and not (
-        pressing and abs(c.belief.target.error_z_m) <= contact_height_tolerance_m(c.belief)
+        pressing and abs(c.belief.target.gear_to_target_z_m) <= contact_height_tolerance_m(c.belief)
     )
 
 
 def is_press_thrust_insufficient(c: Context) -> bool:
     """True if no thrust remains for a press: measured at full thrust, or predicted before the
     press. A mission that hovers does not press, so nothing is predicted for it."""
-    if c.state.began_pressed:
+    if c.state.must_end_press:
         return False
     if c.held_s(SATURATED_THRUST) >= SATURATED_THRUST_DWELL_S:
         return True
@@ -303,7 +311,7 @@ def _outcome_after_supervisor_lock(before: Outcome | None) -> Outcome:
     return Outcome.SAFETY if before is Outcome.HOVERED else before or Outcome.PERCHED
 
 
-def is_time_over(c: Context) -> bool:
+def is_time_for_all_attempts_over(c: Context) -> bool:
     """True if the time for all attempts has run out; a hover has its own duration in addition."""
     hover = c.planner.hover
     allowed_s = c.planner.perching_time_s + (0.0 if hover is None else hover.duration_s)
@@ -335,7 +343,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     motor_cut_row(
         "tilted",
         lambda c: (
-            c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.motor_stop_ordered_s is None
+            c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.motor_stop_ordered_at_s is None
         ),
         "tilted beyond the limit: motors cut",
     ),
@@ -367,9 +375,9 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "position-astray",
         FREE_AIR_PHASES | {Phase.LANDING},
-        has_diverged,
+        is_led_away_from_setpoint,
         divergence_reason,
-        claims=Claim.POSITIONS_WRONG | Claim.PROFILE_MAY_BE_WRONG,
+        claims=VehicleClaim.EXTERNAL_POSITIONS_WRONG | VehicleClaim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "position-lost",
@@ -389,7 +397,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "estimate-unsure",
         FREE_AIR_PHASES,
-        lambda c: c.held_s(VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
+        lambda c: c.held_s(ESTIMATE_VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
         lambda c: f"{variance_text(c.belief)}: the positioning system may have failed",
     ),
     land_row(
@@ -401,7 +409,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "battery-unknown",
         PRE_CONTACT_PHASES,
-        lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
+        lambda c: c.obs.battery_reading_age_s > c.safety.battery_stale_s,
         "the battery reading is no longer updated",
     ),
     land_row(
@@ -409,14 +417,14 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         FREE_AIR_PHASES,
         lambda c: c.belief.camera_imu_mismatch.camera_latency_error_s != 0.0,
         wrong_latency_reason,
-        claims=Claim.PROFILE_MAY_BE_WRONG,
+        claims=VehicleClaim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "mounting",
         FREE_AIR_PHASES,
         is_mounting_wrong,
         wrong_mounting_reason,
-        claims=Claim.MOUNTING_WRONG | Claim.PROFILE_MAY_BE_WRONG,
+        claims=VehicleClaim.MOUNTING_WRONG | VehicleClaim.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "height-limit",
@@ -425,7 +433,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: f"height {c.belief.height_m:.2f} m is above the limit",
     ),
     land_row("fence", PRE_CONTACT_PHASES, is_outside_fence, "outside the fence"),
-    land_row("corridor", PRE_CONTACT_PHASES, is_outside_corridor, "outside its corridor"),
+    land_row("corridor", PRE_CONTACT_PHASES, is_outside_fleet_corridor, "outside its corridor"),
     land_row(
         "camera-gone",
         CAMERA_GUIDED_PHASES,
@@ -447,13 +455,13 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "log-lost",
         PRE_CONTACT_PHASES,
-        lambda c: c.safety.land_on_log_error and c.obs.log_problem is not None,
-        lambda c: f"flight log: {c.obs.log_problem}",
+        lambda c: c.safety.land_on_log_error and c.obs.flight_log_problem is not None,
+        lambda c: f"flight log: {c.obs.flight_log_problem}",
     ),
     land_row(
         "time-over",
         PRE_CONTACT_PHASES,
-        is_time_over,
+        is_time_for_all_attempts_over,
         lambda c: (
             "the perching time has run out"
             if c.planner.hover is None
@@ -474,7 +482,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_ATTACH_PHASES,
         is_held_elsewhere,
         "something holds the vehicle away from the target",
-        claims=Claim.HELD_BY_OTHER,
+        claims=VehicleClaim.HELD_BY_OTHER,
     ),
     land_row(
         "hangs-at-contact",
@@ -484,7 +492,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
             f"the vehicle hangs at the target's height, "
             f"{gear_offset_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
         ),
-        claims=Claim.HANGS,
+        claims=VehicleClaim.HANGS,
     ),
     # --- obstacles ---
     land_row(
@@ -504,7 +512,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
             f"pressing against an obstacle at {c.belief.height_m:.2f} m"
             + ("" if c.belief.hover_thrust else ", or the thrust is too low")
         ),
-        claims=Claim.BLOCKED,
+        claims=VehicleClaim.BLOCKED,
     ),
     land_row(
         "too-weak",

@@ -52,7 +52,7 @@ MAX_FULL_FEEDBACK_AGE_S = 0.06
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
 MAX_FEEDBACK_AGE_S = 0.16
 """Age of the telemetry from which the onboard controllers are left alone, s."""
-LATERAL_FEEDBACK_START_BELOW_M = 0.8
+LATERAL_FEEDBACK_START_BELOW_TARGET_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_FADE_IN_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
@@ -60,8 +60,8 @@ MAX_LATERAL_CORRECTION_M = 0.1
 """Largest correction of a setpoint by the lateral feedback, m."""
 GROUND_CLEARANCE_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
-MAX_INTEGRATED_ERROR_M = 0.06
-"""Position error below which the integral also accumulates in motion, m."""
+MAX_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
+"""Largest lateral position error that the integral still accumulates while the vehicle moves, m."""
 MAX_LATERAL_INTEGRAL_M = 0.4
 """Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
 further. Smaller: a wind keeps the vehicle off its target permanently."""
@@ -71,8 +71,8 @@ the goal. Smaller: a gusty wind is never balanced."""
 UNCONFIRMED_MOUNTING_SPEED_MPS = 0.25
 """Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
 vehicle further off."""
-OUT_OF_VIEW_SINK_MPS = 0.2
-"""Sink rate during a hold while the target is out of view, m/s."""
+ORDERED_SINK_WITH_TARGET_UNSEEN_MPS = 0.2
+"""Sink rate ordered during a hold while the camera does not see the target, m/s."""
 MIN_HOLD_HEIGHT_M = 0.3
 """Height above the ground at which that sink ends, m."""
 
@@ -85,7 +85,7 @@ def hold_here(c: Context) -> PositionSetpoint:
 
 def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Return the body's world x and y (m) with the gear below the target at heading `yaw_rad`."""
-    target = c.belief.target.world_m
+    target = c.belief.target.world_position_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
     return float(target[0] - gear[0]), float(target[1] - gear[1])
@@ -162,7 +162,7 @@ def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> 
     tx, ty = c.state.lateral_integral_m
     stands = c.belief.speed_mps < MAX_IN_PLACE_SPEED_MPS
     most_m = MAX_LATERAL_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
-    if stands or math.hypot(ex, ey) < MAX_INTEGRATED_ERROR_M:
+    if stands or math.hypot(ex, ey) < MAX_ERROR_TO_INTEGRATE_IN_MOTION_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
     return limit_vector(tx, ty, most_m)
@@ -221,7 +221,9 @@ def correct_setpoint(
 def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Return the lateral feedback on top of the onboard controllers; zero far from the target or
     with old telemetry."""
-    near = (LATERAL_FEEDBACK_START_BELOW_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_FADE_IN_M
+    near = (
+        LATERAL_FEEDBACK_START_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
+    ) / LATERAL_FEEDBACK_FADE_IN_M
     prompt = (MAX_FEEDBACK_AGE_S - c.belief.attitude_age_s) / (
         MAX_FEEDBACK_AGE_S - MAX_FULL_FEEDBACK_AGE_S
     )
@@ -229,7 +231,7 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
     if gain == 0.0:
         return 0.0, 0.0
     (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error(c, reference)
-    ax_mps2, ay_mps2 = c.belief.acceleration_from_lean_mps2
+    ax_mps2, ay_mps2 = c.belief.lean_acceleration_world_xy_mps2
     dx = (
         LATERAL_ERROR_GAIN * error_x_m
         - LATERAL_DAMPING_S * vx_mps
@@ -255,7 +257,7 @@ def _lateral_error(
     follow the target."""
     offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.sent.maneuver
     follows_target = maneuver.is_camera_guided or maneuver.presses
-    if offset is None or not follows_target or c.belief.target.world_m is None:
+    if offset is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
     # The reference may still be on its way to the target.
@@ -273,7 +275,7 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
     if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HOLD_HEIGHT_M)
-    z_m = setpoint.z_m - OUT_OF_VIEW_SINK_MPS * max(0.0, c.t_s - c.state.t_s)
+    z_m = setpoint.z_m - ORDERED_SINK_WITH_TARGET_UNSEEN_MPS * max(0.0, c.t_s - c.state.t_s)
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 

@@ -10,7 +10,7 @@ from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Claim, Outcome, Phase, Severity
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
 from perchctl.profile import Profile
 from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
@@ -31,9 +31,10 @@ class LevelDescent:
     """Memory of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
     thrust: float = 0.0  # last ordered thrust
-    climb_measured_s: float = -math.inf  # time of the newest sample at the last tick
-    unmeasured_climb_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
-    floor_detected_s: float | None = None  # time at which the floor was detected
+    climb_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
+    # climb rate that recent orders cause and no sample shows yet
+    climb_change_not_yet_measured_mps: float = 0.0
+    floor_detected_at_s: float | None = None  # time at which the floor was detected
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,10 @@ class HoverErrors:
     """Sums of the squares of x, y, z and yaw."""
 
     def with_error(
-        self, t_s: float, e_m: tuple[float, float, float], e_yaw_rad: float
+        self, t_s: float, e_m: tuple[float, float, float], vehicle_to_target_yaw_rad: float
     ) -> HoverErrors:
         """Return the errors with those of one more frame at `t_s`."""
-        errors = (*e_m, e_yaw_rad)
+        errors = (*e_m, vehicle_to_target_yaw_rad)
         x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squared_error_sums, errors, strict=True))
         return HoverErrors(self.began_s, t_s, self.frames + 1, (x2, y2, z2, yaw2))
 
@@ -83,7 +84,7 @@ class PhaseEntry:
     yaw_rad: float = 0.0
     row_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
-    claims: Claim = Claim.NONE  # claims of the transition
+    claims: VehicleClaim = VehicleClaim.NONE  # claims of the transition
     stop: EmergencyStop | StopMotors | None = None  # command that the transition sends at once
 
 
@@ -98,7 +99,7 @@ class PlannerState:
     t_s: float = 0.0  #: time of the last decision
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
-    since: dict[Condition[Any], float] = field(default_factory=dict)
+    condition_start_times_s: dict[Condition[Any], float] = field(default_factory=dict)
     """Start time of each true condition of the phases."""
     failed_attempts: int = 0  #: number of failed attempts
     #: number of successive frames in this phase that measured the target
@@ -107,12 +108,13 @@ class PlannerState:
     search_step_began_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     lateral_integral_m: tuple[float, float] = (0.0, 0.0)
-    began_pressed: bool = False  #: the phase began with the vehicle pressed at high thrust
+    #: the phase began with the vehicle pressed at high thrust, and the press has not been ended
+    must_end_press: bool = False
     catch_setpoint_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
     blocked_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
     release_began_s: float | None = None  #: start of the release by raw thrust
-    motor_stop_ordered_s: float | None = None  #: first order to stop the motors
+    motor_stop_ordered_at_s: float | None = None  #: first order to stop the motors
     last_stop_or_land_order_at_s: float | None = None  #: last order to land or to stop the motors
     stop_or_land_order_count: int = 0
     raw_thrust_order: int | None = None  #: last ordered raw thrust; None in position mode
@@ -142,7 +144,7 @@ class PlannerState:
     @property
     def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.release_began_s is None and self.motor_stop_ordered_s is None
+        return self.release_began_s is None and self.motor_stop_ordered_at_s is None
 
     def sent(self, maneuver: Maneuver) -> SentOrders:
         """Return the orders so far, in the form that the belief uses."""
@@ -152,8 +154,8 @@ class PlannerState:
             setpoint=self.setpoint,
             raw_thrust=self.raw_thrust_order,
             release_began_s=self.release_began_s,
-            motor_stop_ordered_s=self.motor_stop_ordered_s,
-            floor_detected_s=self.descent.floor_detected_s,
+            motor_stop_ordered_at_s=self.motor_stop_ordered_at_s,
+            floor_detected_at_s=self.descent.floor_detected_at_s,
         )
 
     @classmethod

@@ -6,7 +6,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from perchctl.mission.context import Context
-from perchctl.mission.phase import AIRBORNE_PHASES, Claim, Outcome, Phase, Severity
+from perchctl.mission.phase import AIRBORNE_PHASES, Outcome, Phase, Severity, VehicleClaim
 from perchctl.vehicle import EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
@@ -32,7 +32,7 @@ class Transition:
     severity: Severity = Severity.CONTINUE
     outcome: NewOutcome | None = None
     stop: EmergencyStop | StopMotors | None = None
-    claims: Claim = Claim.NONE
+    claims: VehicleClaim = VehicleClaim.NONE
 
     def keeps_mission_in(self, phase: Phase) -> bool:
         """True if the row keeps the mission in this phase instead of leaving it."""
@@ -86,7 +86,7 @@ def land_row(
     when: Predicate,
     reason: Reason,
     outcome: Outcome = Outcome.SAFETY,
-    claims: Claim = Claim.NONE,
+    claims: VehicleClaim = VehicleClaim.NONE,
 ) -> Transition:
     """Return a row that ends the mission and starts the landing."""
     return Transition(
@@ -99,14 +99,14 @@ def back_off_row(
     phases: Set[Phase],
     when: Predicate,
     reason: Reason,
-    claims: Claim = Claim.NONE,
+    claims: VehicleClaim = VehicleClaim.NONE,
 ) -> Transition:
     """Return a row that ends the attempt: descend a little and try again."""
     return Transition(name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, claims=claims)
 
 
-def abort_landing_row(
-    name: str, when: Predicate, reason: Reason, claims: Claim = Claim.NONE
+def abort_during_landing_row(
+    name: str, when: Predicate, reason: Reason, claims: VehicleClaim = VehicleClaim.NONE
 ) -> Transition:
     """Return a row that ends a landing which could not be completed normally."""
     return Transition(

@@ -157,7 +157,7 @@ def tick_record(
         "cam_age_s": tick.last_good_frame_age_s,
         "late_s": tick.loop_late_s,
         "delay_s": None if tick.camera_errors is None else tick.camera_errors.delay_s,
-        "delay_used_s": tick.extra_camera_latency_s or None,
+        "delay_used_s": tick.camera_latency_above_profile_s or None,
         "true_miss_m": true_miss_m,
         **_xyz("true_", true_position_m),
         **_external_values(tick.external_positions),

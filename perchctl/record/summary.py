@@ -13,11 +13,11 @@ import numpy as np
 from perchctl.errors import LogIncomplete
 from perchctl.mission import (
     CameraFindings,
-    Claim,
     ContactOffset,
     HoverReport,
     Outcome,
     Touchdown,
+    VehicleClaim,
     find_row_claims,
 )
 from perchctl.record.read import FlightLog
@@ -121,7 +121,7 @@ class FlightSummary:
             log_problem=end.get("problem"),
             simulated=simulated,
             is_profile_suspect=any(
-                Claim.PROFILE_MAY_BE_WRONG in find_row_claims(str(event.get("row")))
+                VehicleClaim.PROFILE_MAY_BE_WRONG in find_row_claims(str(event.get("row")))
                 for event in log.events
             ),
         )
@@ -220,7 +220,7 @@ _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {
     "hover_s": "duration_s",
     "hover_below_m": "below_target_m",
-    "hover_rms_m": "rms_m",
+    "hover_rms_m": "gear_to_hover_position_rms_xyz_m",
     "hover_yaw_rms_rad": "rms_yaw_rad",
 }
 _FINDINGS = {

@@ -234,7 +234,7 @@ class LogWatcher:
             attempts=report.attempts,
             miss_m=miss_m,
             battery_min_v=self._battery_min_v,
-            locked=report.is_vehicle_locked,
+            locked=report.is_locked_by_supervisor,
             fell=fell,
             findings=report.findings,
             contact=report.last_contact_offset,

@@ -37,7 +37,7 @@ def test_the_faults_know_the_same_phases_as_the_mission() -> None:
     assert truth.FREE_AIR == phase.FREE_AIR_PHASES
     assert set(catalogue.AIR) | hover == phase.AIRBORNE_PHASES == set(catalogue.USUAL_S)
     assert truth.STEERED_BY_TARGET | {phase.Phase.SEARCH, phase.Phase.APPROACH} == {
-        *phase.PAPER_METHOD_PHASES,
+        *phase.PUBLISHED_METHOD_PHASES,
         *hover,
     }
 

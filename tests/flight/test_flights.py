@@ -19,7 +19,7 @@ from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, planner
 from perchctl.mission.context import Context
-from perchctl.mission.phase import PAPER_METHOD_PHASES
+from perchctl.mission.phase import PUBLISHED_METHOD_PHASES
 from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.record.fields import tick_record
@@ -27,7 +27,7 @@ from perchctl.sim import Neighbour, SimulatedVehicle, draw_scenario
 from tests.helpers.flights import DATA_SHEET, SEED, SHORT, Flown, fly_short, short_profile
 from tests.helpers.loop_rig import Watcher
 
-SEVEN_NAMES = [phase.value for phase in PAPER_METHOD_PHASES]
+SEVEN_NAMES = [phase.value for phase in PUBLISHED_METHOD_PHASES]
 MISS_LIMIT_M = 0.020
 ON_THE_FLOOR_M = 0.05
 SLIPPERY_N = 0.1  # a quarter of the weight
@@ -39,7 +39,7 @@ def assert_perched(flown: Flown, attempts: int = 1) -> None:
     assert flight.hanging
     assert flight.miss_m < MISS_LIMIT_M
     assert report.attempts == attempts
-    assert not any((flight.locked, report.is_vehicle_locked, flight.fell))
+    assert not any((flight.locked, report.is_locked_by_supervisor, flight.fell))
 
 
 def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "") -> None:
@@ -48,7 +48,7 @@ def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "
     assert outcome.exit_code == exit_code
     assert words in report.reason
     assert flown.z_m < ON_THE_FLOOR_M
-    assert not any((flight.hanging, flight.locked, report.is_vehicle_locked, flight.fell))
+    assert not any((flight.hanging, flight.locked, report.is_locked_by_supervisor, flight.fell))
 
 
 # --- A flight under good conditions ---------------------------------------------------
@@ -180,7 +180,7 @@ SOFT_MPS = 0.35
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("phase", PAPER_METHOD_PHASES, ids=lambda p: p.value)
+@pytest.mark.parametrize("phase", PUBLISHED_METHOD_PHASES, ids=lambda p: p.value)
 def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     """On the floor; or, where the magnet has it already, peeled off in vain and left hanging,
     and reported so."""
@@ -210,7 +210,7 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     assert (report.phase, report.outcome) == (Phase.ABORTED, Outcome.EMERGENCY)
     assert report.outcome.exit_code == 53
     assert flown.flight.locked  # docs/firmware.md, "Emergency stop"
-    assert report.is_vehicle_locked  # which is said, though no telemetry has told it yet
+    assert report.is_locked_by_supervisor  # which is said, though no telemetry has told it yet
 
 
 # --- Receivers that repeat ------------------------------------------------------------------------
@@ -255,9 +255,12 @@ def test_the_log_holds_the_planner_s_error_and_an_unlogged_flight_is_the_same(
         record, target = tick_record(tick), context.obs.target
         assert target is not None
         assert [record[f"e{axis}_m"] for axis in "xyz"] == target.e_m.tolist()
-        assert record["eyaw_rad"] == context.belief.target.error_yaw_rad
-        assert math.hypot(record["ex_m"], record["ey_m"]) == context.belief.target.error_xy_m
-        assert record["ez_m"] == context.belief.target.error_z_m
+        assert record["eyaw_rad"] == context.belief.target.vehicle_to_target_yaw_rad
+        assert (
+            math.hypot(record["ex_m"], record["ey_m"])
+            == context.belief.target.gear_to_target_distance_xy_m
+        )
+        assert record["ez_m"] == context.belief.target.gear_to_target_z_m
         assert target.t_s == tick.t_s  # at the present, not at the frame's time
 
 

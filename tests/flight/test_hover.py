@@ -77,7 +77,7 @@ def test_what_a_hover_claims_is_true_of_the_vehicle(log_path: Path) -> None:
     place_m = scenario.ceiling_z_m - gear_m - BELOW_M
     assert np.abs(np.array(truth.height_m) - place_m).max() < 0.06
     assert report.hover is not None
-    x_m, y_m, z_m = report.hover.rms_m
+    x_m, y_m, z_m = report.hover.gear_to_hover_position_rms_xyz_m
     assert max(x_m, y_m) < 0.02
     assert z_m < 0.03
 

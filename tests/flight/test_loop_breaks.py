@@ -135,7 +135,7 @@ def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> 
     assert link.own == []  # no setpoint that would take the landing back
     said = rig.watcher.events[-1]
     assert said.kind is EventKind.NOTE
-    assert (said.rest is RestState.UNSEEN) is not heard
+    assert (said.rest is RestState.END_UNCONFIRMED) is not heard
     assert "Broken in flight" in said.reason
     assert ("motors off" in said.reason) is heard
     assert ("could not be confirmed" in said.reason) is not heard

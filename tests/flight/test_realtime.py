@@ -27,7 +27,7 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.mission.phase import PAPER_METHOD_PHASES
+from perchctl.mission.phase import PUBLISHED_METHOD_PHASES
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.sim import SimProcess, draw_scenario
@@ -89,7 +89,7 @@ def test_fly_perches_in_real_time_through_cflib(tmp_path: Path) -> None:
     assert float(miss[1]) < 20.0
 
     assert "\x1b" not in err + out
-    assert {p.value for p in PAPER_METHOD_PHASES} <= {span.phase for span in log.phases}
+    assert {p.value for p in PUBLISHED_METHOD_PHASES} <= {span.phase for span in log.phases}
 
     said = json.loads(out)
     assert (said["outcome"], said["exit_code"], said["locked"]) == ("perched", 0, False)

@@ -13,7 +13,7 @@ from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Wat
 from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.update import KEEPALIVE_THRUST
 from perchctl.mission.descent import LANDING_ORDER_PERIOD_S, MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
-from perchctl.mission.release import CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M, STOP_ORDER_COUNT
+from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, STOP_ORDER_COUNT
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -44,7 +44,7 @@ AT_CEILING = state_with(
     phase=Phase.COMPLETE,
     t_s=T_S,
     takeoff_position_m=(0.0, 0.0, 0.0),
-    last_contact_body_z_m=CEILING_M,
+    vehicle_world_z_at_last_contact_m=CEILING_M,
     release_began_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
@@ -127,7 +127,7 @@ HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
 PRESSING = remembering(
-    AT_CEILING, phase=Phase.PERCH, last_contact_body_z_m=None, release_began_s=None
+    AT_CEILING, phase=Phase.PERCH, vehicle_world_z_at_last_contact_m=None, release_began_s=None
 )
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
@@ -174,7 +174,7 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig.after(0.33, **FALLS)
     caught = rig.after(0.35, **FALLS)
     assert caught == PositionSetpoint(
-        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_ABOVE_IF_MOTORS_OFF_M, 3.0), 0.0
+        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, 3.0), 0.0
     )
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
@@ -251,7 +251,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
 
 
 def test_only_stops_after_the_motors_were_stopped_for_good() -> None:
-    rig = Rig(StopMotors(), remembering(AT_CEILING, motor_stop_ordered_s=T_S), CEILING_M)
+    rig = Rig(StopMotors(), remembering(AT_CEILING, motor_stop_ordered_at_s=T_S), CEILING_M)
     sent = [rig.after(s, thrust=0.0) for s in (0.5, 1.1, 9.0)]
     assert all(command in (None, StopMotors()) for command in sent)
 

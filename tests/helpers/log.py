@@ -134,7 +134,7 @@ def tick(
     outside: ExternalPositions | None = None,
 ) -> Tick:
     obs = Observation(
-        t_s, sample, target, last_good_frame_age_s=0.03, extra_camera_latency_s=delay_used_s
+        t_s, sample, target, last_good_frame_age_s=0.03, camera_latency_above_profile_s=delay_used_s
     )
     turn = flown_turn(obs, command, external_positions=outside)
     return Tick(record=turn, state=state, output=output, camera_errors=consistency)

@@ -187,17 +187,25 @@ _ENTRY = {
 def remembering(state: PlannerState, **changes: Any) -> PlannerState:
     """The state with changes of its own fields, of its belief's and of its descent's, each by the
     field's name. Conditions, as `since`, go where they are counted."""
-    since = changes.pop("since", None)
-    if since is not None:
-        changes["since"] = {each: s for each, s in since.items() if each in PHASE_CONDITIONS}
-        held = {each: s for each, s in since.items() if each not in PHASE_CONDITIONS}
-        state = replace(state, belief=replace(state.belief, since=held))
+    condition_start_times_s = changes.pop("condition_start_times_s", None)
+    if condition_start_times_s is not None:
+        changes["condition_start_times_s"] = {
+            each: s for each, s in condition_start_times_s.items() if each in PHASE_CONDITIONS
+        }
+        held = {
+            each: s for each, s in condition_start_times_s.items() if each not in PHASE_CONDITIONS
+        }
+        state = replace(state, belief=replace(state.belief, condition_start_times_s=held))
     if "hover_thrust" in changes:
         thrust = changes.pop("hover_thrust")
         changes["hover_thrust_estimate"] = (
             HoverThrust(thrust, LEARNED_SIGMA) if thrust else HoverThrust()
         )
-    belief = {name: value for name, value in changes.items() if name in _BELIEF - {"since"}}
+    belief = {
+        name: value
+        for name, value in changes.items()
+        if name in _BELIEF - {"condition_start_times_s"}
+    }
     descent = {name: value for name, value in changes.items() if name in _DESCENT}
     entry = {_ENTRY[name]: value for name, value in changes.items() if name in _ENTRY}
     rest = {
@@ -246,6 +254,6 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         last_target_world_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         battery_fit=FINE_BATTERY,
-        last_contact_body_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
+        vehicle_world_z_at_last_contact_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
         hover_errors=HoverErrors(t_s, t_s),
     )

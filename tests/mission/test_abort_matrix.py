@@ -82,10 +82,10 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
     ),
     "heading-lost": (
-        _obs(has_estimate_jumped=True, heading_jump_rad=1.5), 0.1, PRE_CONTACT_PHASES, LAND,
-        Outcome.SAFETY,
+        _obs(has_estimated_position_jumped=True, heading_jump_rad=1.5), 0.1,
+        PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
-    "estimator-jump": (_obs(has_estimate_jumped=True), 0.8, PRE_CONTACT_PHASES, LAND,
+    "estimator-jump": (_obs(has_estimated_position_jumped=True), 0.8, PRE_CONTACT_PHASES, LAND,
         Outcome.SAFETY),
     "estimate-unsure": (
         _tel(velocity_variance_m2ps2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
@@ -93,7 +93,9 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
     ),
     "battery-low": (_tel(battery_v=2.8), 1.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
     "battery-low-power": (_tel(battery_state=3), 1.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
-    "battery-unknown": (_obs(battery_age_s=99.0), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "battery-unknown": (
+        _obs(battery_reading_age_s=99.0), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY
+    ),
     "height-limit": (
         _tel(position_m=(0.0, 0.0, 3.4)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
@@ -269,7 +271,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
-    held = {"last_contact_body_z_m": HANG_Z_M, "release_began_s": 10.0, **changes}
+    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 10.0, **changes}
     return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 
@@ -353,7 +355,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
 
 @pytest.mark.parametrize(
     "stopped",
-    [{}, {"motor_stop_ordered_s": 9.5, "stop_or_land_order_count": 5}],
+    [{}, {"motor_stop_ordered_at_s": 9.5, "stop_or_land_order_count": 5}],
     ids=["turns", "stopped"],
 )
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str, Any]) -> None:
@@ -367,7 +369,7 @@ def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str
         held = at(HANG_Z_M - 0.2)(10.2 + TICK_S * i)
         state, command = planner.step_mission(state, held, PROFILE)
         assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.2 + 1e-9)
-    assert state.motor_stop_ordered_s is None
+    assert state.motor_stop_ordered_at_s is None
 
 
 def _heard_last(z_m: float, **tel: Any) -> Look:

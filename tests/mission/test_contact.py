@@ -10,7 +10,7 @@ from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
     CONTACT,
-    PRESS_THRUST_RATIO,
+    MIN_PRESS_TO_HOVER_THRUST_RATIO,
     SUPPORT_SHOWN_BY_IMU,
     is_pressing,
 )
@@ -51,7 +51,7 @@ def touching(
 
 def is_contact(obs: Observation, profile: Profile = PROFILE, **remembered: Any) -> bool:
     pressing = remembering(state_in(Phase.PERCH, z_m=HANG_Z_M), **remembered)
-    return CONTACT in observing(pressing, obs, profile).belief.since
+    return CONTACT in observing(pressing, obs, profile).belief.condition_start_times_s
 
 
 @pytest.mark.parametrize("profile", [PROFILE, MOCAP, BY_TARGET], ids=["deck", "mocap", "target"])
@@ -108,7 +108,7 @@ def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     assert not is_contact(touching(), hover_thrust=0.0)
     unanswered = {
         "raw_thrust_order": 20000,
-        "thrust_mismatch_since_s": BEGIN_S - 1.0,
+        "thrust_differs_from_order_since_s": BEGIN_S - 1.0,
         "setpoint": None,
     }
     assert not is_contact(touching(), **unanswered)
@@ -122,12 +122,12 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     above = PositionSetpoint(0.0, 0.0, HANG_Z_M + 0.2, 0.0)
     b = observing(replace(pressing, setpoint=above), obs).belief
     found = [
-        CONTACT in b.since,
-        CLIMB_BLOCKED in b.since,
-        SUPPORT_SHOWN_BY_IMU in b.since,
+        CONTACT in b.condition_start_times_s,
+        CLIMB_BLOCKED in b.condition_start_times_s,
+        SUPPORT_SHOWN_BY_IMU in b.condition_start_times_s,
         is_pressing(b),
     ]
-    assert found == [thrust >= PRESS_THRUST_RATIO] * 4
+    assert found == [thrust >= MIN_PRESS_TO_HOVER_THRUST_RATIO] * 4
 
 
 @pytest.mark.parametrize(("raw_thrust_order", "presses"), [(60_000, True), (None, False)])

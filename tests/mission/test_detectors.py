@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    FALL_SINK_MPS,
-    FREE_FALL_S,
     LATERAL_VELOCITY_TIME_CONSTANT_S,
+    MAX_CLIMB_GAINED_IN_FALL_MPS,
     MAX_RISE_BEFORE_FALL_MPS,
     MAX_STEADY_CLIMB_DEVIATION_MPS,
     MAX_STEADY_LATERAL_DEVIATION_MPS,
+    MIN_FREE_FALL_DURATION_S,
     MIN_PUSH_G,
-    VERTICAL_OFFSET_TIME_CONSTANT_S,
+    UP_ACCELERATION_OFFSET_TIME_CONSTANT_S,
     FallDetector,
     FreezeDetector,
     Impact,
@@ -52,7 +52,7 @@ def watched(
     return fall
 
 
-LEARNED_S = 4.0 * VERTICAL_OFFSET_TIME_CONSTANT_S
+LEARNED_S = 4.0 * UP_ACCELERATION_OFFSET_TIME_CONSTANT_S
 
 
 @given(RATES_HZ, BIAS_MPS2)
@@ -85,7 +85,7 @@ def test_a_fall_is_noticed_after_the_same_time_at_each_rate(part: float) -> None
                 break
     assert len(found) == 3
     assert max(found) - min(found) <= 0.02 + 1e-9  # one sample at the lowest rate
-    assert max(found) <= FREE_FALL_S + 0.04
+    assert max(found) <= MIN_FREE_FALL_DURATION_S + 0.04
 
 
 @given(RATES_HZ, st.floats(1.0, 6.0))
@@ -112,7 +112,7 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
 ) -> None:
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
-    late_s = (MAX_RISE_BEFORE_FALL_MPS - FALL_SINK_MPS) / (0.8 * falls_mps2)
+    late_s = (MAX_RISE_BEFORE_FALL_MPS - MAX_CLIMB_GAINED_IN_FALL_MPS) / (0.8 * falls_mps2)
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
     assert watched(flight, rate_hz).last_fall_at_s > 1.0
 
@@ -128,7 +128,7 @@ def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_
         fall = fall.update_fall(t_s, up_mps2, reads_g, dt_s)
         if fall.last_fall_at_s > 0.0:
             break
-    assert FREE_FALL_S <= t_s - 1.0 <= FREE_FALL_S + 2.1 * dt_s
+    assert MIN_FREE_FALL_DURATION_S <= t_s - 1.0 <= MIN_FREE_FALL_DURATION_S + 2.1 * dt_s
 
 
 # --- Impacts -------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> 
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED) is None
-    assert energy.no_reading_s == pytest.approx(10.0)
+    assert energy.time_since_battery_reading_s == pytest.approx(10.0)
 
 
 @settings(max_examples=60)
@@ -194,10 +194,10 @@ GRACE_S = PROFILE.safety.battery_stale_s
         (Phase.ALIGN, NEAR_ITS_END, 3.24, OPEN, False),
         # Fault 7: a vehicle that tells nothing of its battery is landed after
         # `safety.battery_stale_s`, and not in the middle of an ascent.
-        (Phase.ALIGN, BatteryFit(no_reading_s=8.0), 0.0, PROFILE, False),
-        (Phase.ALIGN, BatteryFit(no_reading_s=GRACE_S - 10.0), 0.0, PROFILE, True),
+        (Phase.ALIGN, BatteryFit(time_since_battery_reading_s=8.0), 0.0, PROFILE, False),
+        (Phase.ALIGN, BatteryFit(time_since_battery_reading_s=GRACE_S - 10.0), 0.0, PROFILE, True),
         # What was little is no more without a reading.
-        (Phase.ALIGN, replace(NEAR_ITS_END, no_reading_s=8.0), 0.0, PROFILE, True),
+        (Phase.ALIGN, replace(NEAR_ITS_END, time_since_battery_reading_s=8.0), 0.0, PROFILE, True),
     ],
     ids=["ascends", "presses", "open", "grace", "grace is over", "little before"],
 )
@@ -216,7 +216,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
 def test_a_reading_that_stands_still_is_none() -> None:
     state = state_in(Phase.ALIGN)
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
-        later = observation(state.t_s + 4.0, battery_age_s=age_s)
+        later = observation(state.t_s + 4.0, battery_reading_age_s=age_s)
         state = replace(observing(state, later), t_s=later.t_s)
         assert (compute_battery_outlook(Context(state)).hover_time_left_s is not None) is known
 

@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.mission import CameraFindings, FlightReport, ImuMotion, Observation, Phase
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.phase import Claim
+from perchctl.mission.phase import VehicleClaim
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraErrors
@@ -69,7 +69,7 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
         if callable(row.reason)
         and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
     }
-    assert blames == {row.name for row in TABLE if Claim.PROFILE_MAY_BE_WRONG in row.claims}
+    assert blames == {row.name for row in TABLE if VehicleClaim.PROFILE_MAY_BE_WRONG in row.claims}
 
 
 @pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED])
@@ -94,13 +94,13 @@ def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     reckoning = DeadReckoning(
         lateral_offset_m=(0.02, 0.0),
         lateral_sigma_m=0.01,
-        distance_below_m=0.0,
+        gear_below_target_m=0.0,
         last_sighting_at_s=BEGIN_S - 0.5,
     )
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
-        reckoning=reckoning, last_contact_body_z_m=1.9, in_magnet_reach_since_s=BEGIN_S,
-        motor_stop_ordered_s=BEGIN_S,
+        reckoning=reckoning, vehicle_world_z_at_last_contact_m=1.9, in_magnet_reach_since_s=BEGIN_S,
+        motor_stop_ordered_at_s=BEGIN_S,
         dead_reckoning_since_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
-    DESCENT_HOVER_DRIFT_PER_SQRT_S,
+    HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S,
     MAX_DESCENT_CORRECTION_SIGMAS,
     MIN_HOVER_THRUST_SIGMA_IN_DESCENT,
     estimate_hover_thrust,
@@ -22,8 +22,8 @@ from perchctl.mission.belief.hover import (
 from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.belief.thrust import (
     ACCELEROMETER_HOVER_THRUST_SIGMA,
-    QUIET_HOVER_DRIFT_PER_SQRT_S,
-    THRUST_SIGMA,
+    HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S,
+    THRUST_MEASUREMENT_SIGMA_FRACTION,
     HoverThrust,
 )
 from perchctl.mission.phase import Phase
@@ -38,7 +38,9 @@ from tests.helpers.mission import (
 )
 
 thrusts = st.floats(30_000.0, 62_000.0)
-drifts = st.sampled_from([QUIET_HOVER_DRIFT_PER_SQRT_S, DESCENT_HOVER_DRIFT_PER_SQRT_S])
+drifts = st.sampled_from(
+    [HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S, HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S]
+)
 DESCENDS = SentOrders(maneuver=Maneuver(descends=True), raw_thrust=48_000)
 
 
@@ -57,7 +59,9 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
-    settled_s = 12.0 * THRUST_SIGMA / drift  # the filter's own time, twelve times
+    settled_s = (
+        12.0 * THRUST_MEASUREMENT_SIGMA_FRACTION / drift
+    )  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
     found = measured(
         HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA), [true] * steps, 0.02, drift
@@ -69,7 +73,9 @@ def test_it_converges_to_what_is_measured(first: float, true: float, drift: floa
 def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: float) -> None:
     """P = r d for a scalar Kalman filter, within the step of a tick."""
     found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
-    assert found.sigma == pytest.approx(math.sqrt(THRUST_SIGMA * drift), rel=0.05)
+    assert found.sigma == pytest.approx(
+        math.sqrt(THRUST_MEASUREMENT_SIGMA_FRACTION * drift), rel=0.05
+    )
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
@@ -114,8 +120,8 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 @pytest.mark.parametrize(
     "hides",
     [
-        {"sent": replace(DESCENDS, floor_detected_s=9.9)},
-        {"last_contact_body_z_m": 1.0},  # a magnet may hold it
+        {"sent": replace(DESCENDS, floor_detected_at_s=9.9)},
+        {"vehicle_world_z_at_last_contact_m": 1.0},  # a magnet may hold it
         {"in_magnet_reach_since_s": 9.0},
     ],
     ids=["floor", "contact", "reach"],

@@ -93,8 +93,8 @@ def test_a_hover_that_ends_on_the_magnet_is_no_hover(seen: str) -> None:
     """Its exit code says that the vehicle has landed."""
     off = {"thrust": 0.0, "supervisor": READY | (LOCKED if seen == "locked" else 0)}
     state = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), motor_stop_ordered_s=BEGIN_S - 1.0,
-        last_contact_body_z_m=HANG_Z_M, outcome=Outcome.HOVERED,
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), motor_stop_ordered_at_s=BEGIN_S - 1.0,
+        vehicle_world_z_at_last_contact_m=HANG_Z_M, outcome=Outcome.HOVERED,
     )  # fmt: skip
     end = fly(state, at(HANG_Z_M, **off), 0.3, HOVERING).state
     assert (end.phase, end.outcome) == (Phase.PERCHED, Outcome.SAFETY)
@@ -151,7 +151,7 @@ def test_each_frame_counts_once_and_the_errors_are_those_of_the_place() -> None:
     assert state.hover_errors.frames == 2
     report = HoverReport.from_state(state, HOVERING)
     assert report is not None
-    assert report.rms_m == pytest.approx((0.03, 0.0, 0.04))
+    assert report.gear_to_hover_position_rms_xyz_m == pytest.approx((0.03, 0.0, 0.04))
     assert report.rms_yaw_rad == pytest.approx(0.1)
     assert report.duration_s == pytest.approx(4 * TICK_S)
     assert "RMS error x 30.0, y 0.0, z 40.0 mm, heading 5.7 deg" in report.text

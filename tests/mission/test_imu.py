@@ -19,7 +19,7 @@ from perchctl.mission.belief.motion import (
 )
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
-    MAX_CLIMB_DURING_SILENCE_MPS,
+    MAX_CLIMB_IN_TELEMETRY_GAP_MPS,
     DeadReckoning,
     add_sighting,
     advance_reckoning,
@@ -40,7 +40,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     frozen = [telemetry(0.01 * i, acc_x_g=0.0, acc_z_g=0.9) for i in range(300)]
     motion = flown(frozen)
     assert motion.acceleration_frozen_for_s == pytest.approx(2.99)
-    assert motion.last_silence_end_s == pytest.approx(2.99)
+    assert motion.last_telemetry_gap_ended_at_s == pytest.approx(2.99)
     assert motion.last_fall_at_s < 0.0
     assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
@@ -65,7 +65,10 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
     floor took that, has gone down."""
     t_s = 0.99 + silent_s
     hangs = since_heard(telemetry(t_s, 1.9 + 0.05, velocity_mps=(0.0, 0.0, drift_mps)))
-    assert (hangs.last_silence_end_s, hangs.last_fall_hiding_gap_end_s) == (t_s, -math.inf)
+    assert (hangs.last_telemetry_gap_ended_at_s, hangs.last_gap_that_may_hide_fall_ended_at_s) == (
+        t_s,
+        -math.inf,
+    )
     for z_m, climb_mps, changes in (
         (1.9, drift_mps - 1.0, {}),  # the floor's blow was more than the accelerometer reads
         (0.0, drift_mps, {}),
@@ -73,9 +76,9 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
         (1.9, drift_mps, {"start": 1}),  # and this estimate is another one
     ):
         after = telemetry(t_s, z_m, velocity_mps=(0.0, 0.0, climb_mps), **changes)
-        assert since_heard(after).last_fall_hiding_gap_end_s == t_s
+        assert since_heard(after).last_gap_that_may_hide_fall_ended_at_s == t_s
     still = telemetry(0.99, 1.9)
-    assert since_heard(replace(still, t_s=t_s), still).last_fall_hiding_gap_end_s == t_s
+    assert since_heard(replace(still, t_s=t_s), still).last_gap_that_may_hide_fall_ended_at_s == t_s
 
 
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
@@ -130,19 +133,39 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
     assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
 
 
-@given(distance_below_m=st.floats(0.05, 2.0), silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 3.0))
+@given(
+    gear_below_target_m=st.floats(0.05, 2.0), silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 3.0)
+)
 def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
-    distance_below_m: float, silent_s: float
+    gear_below_target_m: float, silent_s: float
 ) -> None:
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = distance_below_m - MAX_CLIMB_DURING_SILENCE_MPS * silent_s < MAGNET_REACH_M
+    near = gear_below_target_m - MAX_CLIMB_IN_TELEMETRY_GAP_MPS * silent_s < MAGNET_REACH_M
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
-        (distance_below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),
-        (distance_below_m, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), False, False),
-        (distance_below_m, telemetry(1.0), telemetry(1.0 + silent_s, start=1, **off), False, False),
+        (
+            gear_below_target_m,
+            telemetry(1.0, **sinks),
+            telemetry(1.0 + silent_s, **sinks),
+            near,
+            True,
+        ),
+        (
+            gear_below_target_m,
+            telemetry(1.0, **off),
+            telemetry(1.0 + silent_s, **off),
+            False,
+            False,
+        ),
+        (
+            gear_below_target_m,
+            telemetry(1.0),
+            telemetry(1.0 + silent_s, start=1, **off),
+            False,
+            False,
+        ),
         (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
     ):
         imu = flown([before])
@@ -150,10 +173,11 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         new = advance_reckoning(
             old, imu.with_sample(before, after), after, is_estimate_believed=False
         )
-        assert (new.last_possible_catch_gap_end_s == after.t_s) is unsure
-        assert new.distance_below_m == (z_m if kept else math.inf)
+        assert (new.last_gap_magnet_may_attach_ended_at_s == after.t_s) is unsure
+        assert new.gear_below_target_m == (z_m if kept else math.inf)
         assert (
-            add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_distance_below_m == z_m
+            add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_gear_below_target_m
+            == z_m
         )
 
 
@@ -164,11 +188,11 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
-        assert new is not late or 0.02 < reckoning.min_distance_below_m < 0.1
+        assert new is not late or 0.02 < reckoning.min_gear_below_target_m < 0.1
         motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=False)
     assert motion.last_fall_at_s > 1.0
-    assert reckoning.last_possible_catch_gap_end_s == late.t_s
+    assert reckoning.last_gap_magnet_may_attach_ended_at_s == late.t_s
 
 
 def estimate_only_mps(
@@ -192,7 +216,7 @@ def estimate_only_mps(
         motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=True)
         last = new
-    return abs(reckoning.lateral_gain_of_estimate_only_mps[0])
+    return abs(reckoning.lateral_velocity_unseen_by_imu_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:

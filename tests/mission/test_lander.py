@@ -31,7 +31,7 @@ from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
 from perchctl.mission.descent import PEEL_TIMEOUT_S
-from perchctl.mission.phase import PRE_LANDING_PHASES, Claim
+from perchctl.mission.phase import PRE_LANDING_PHASES, VehicleClaim
 from perchctl.mission.table import PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -88,7 +88,7 @@ BEGUN: dict[str, tuple[dict[str, Any], type[Any]]] = {
     "released": ({"release_began_s": NOW_S - 0.5}, RawThrust),
     "stopped": (
         {
-            "motor_stop_ordered_s": NOW_S - 0.2,
+            "motor_stop_ordered_at_s": NOW_S - 0.2,
             "stop_or_land_order_count": 1,
             "last_stop_or_land_order_at_s": NOW_S - 0.2,
         },
@@ -117,7 +117,7 @@ def context(
     state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
         t_s=NOW_S - TICK_S, last_telemetry=sample, reckoned_height_m=z_m,
-        last_contact_body_z_m=z_m if held else None,
+        vehicle_world_z_at_last_contact_m=z_m if held else None,
         in_magnet_reach_since_s=NOW_S - 2.0 if held else None,
         reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
@@ -199,25 +199,29 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
             PositionSetpoint,
             RawThrust,
         ),
-        ({"has_estimate_jumped": True}, Land, RawThrust),
+        ({"has_estimated_position_jumped": True}, Land, RawThrust),
         ({"loop_late_s": 0.5}, Land, RawThrust),
         ({"link_problem": "gone"}, Land, RawThrust),
         ({"behind_s": 0.5}, Land, RawThrust),
         ({"age_s": 0.6}, Land, RawThrust),
-        ({"has_estimate_jumped": True, "heading_jump_rad": 1.5}, RawThrust, RawThrust),
+        ({"has_estimated_position_jumped": True, "heading_jump_rad": 1.5}, RawThrust, RawThrust),
         (
-            {"has_estimate_jumped": True, "heading_jump_rad": 1.5, "behind_s": 0.5},
+            {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5, "behind_s": 0.5},
             RawThrust,
             RawThrust,
         ),
         # A level descent does not change its mode for a moment; without a vertical speed raw thrust
         # would be blind, and the vehicle's own landing is left.
         (
-            {"has_estimate_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.2},
+            {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.2},
             RawThrust,
             RawThrust,
         ),
-        ({"has_estimate_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.6}, Land, RawThrust),
+        (
+            {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5, "age_s": 0.6},
+            Land,
+            RawThrust,
+        ),
     ],
 )
 def test_each_part_of_what_is_known_has_its_own_age(
@@ -290,7 +294,11 @@ def test_a_way_down_that_is_spent_ends_without_a_lock(
     known: str, changes: dict[str, Any], spent: bool
 ) -> None:
     c = context(
-        known, known == "onboard", phase=Phase.ABORTED, claims=Claim.LANDING_UNCONFIRMED, **changes
+        known,
+        known == "onboard",
+        phase=Phase.ABORTED,
+        claims=VehicleClaim.LANDING_UNCONFIRMED,
+        **changes,
     )
     _, command = PHASES[Phase.ABORTED].act(c)
     assert isinstance(command, StopMotors if spent else Idle)
@@ -305,10 +313,10 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
-        floor_detected_s=NOW_S - 0.5, thrust=half, reckoning=aside,
+        floor_detected_at_s=NOW_S - 0.5, thrust=half, reckoning=aside,
     )  # fmt: skip
     state, command = descent.act(c)
-    assert (state.descent.floor_detected_s is not None) is stands
+    assert (state.descent.floor_detected_at_s is not None) is stands
     assert isinstance(command, RawThrust)
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
 
@@ -323,7 +331,7 @@ def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, flo
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
     )
     state, _ = descent.act(c)
-    assert (state.descent.floor_detected_s is not None) is floor
+    assert (state.descent.floor_detected_at_s is not None) is floor
 
 
 @pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True), (0.2, False)])
@@ -357,7 +365,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     reckoning = DeadReckoning(
         imu=imu,
         bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
-        mean_lateral_mps2=(reads_mps2 * cos, reads_mps2 * sin),
+        mean_specific_force_world_xy_mps2=(reads_mps2 * cos, reads_mps2 * sin),
         time_under_position_control_s=held_s,
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
@@ -392,10 +400,12 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     phase: Phase, since_s: float, is_there: bool
 ) -> None:
     """Late pictures show it lower. On its way down the floor carries it, too."""
-    c = context("sight", phase=phase, since={SUPPORT_SHOWN_BY_IMU: NOW_S - since_s})
-    reckoning = replace(c.state.belief.reckoning, distance_below_m=0.1)
+    c = context(
+        "sight", phase=phase, condition_start_times_s={SUPPORT_SHOWN_BY_IMU: NOW_S - since_s}
+    )
+    reckoning = replace(c.state.belief.reckoning, gear_below_target_m=0.1)
     state = observing(remembering(c.state, reckoning=reckoning), c.obs, c.profile)
-    assert (state.belief.reckoning.distance_below_m == 0.0) is is_there
+    assert (state.belief.reckoning.gear_below_target_m == 0.0) is is_there
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
@@ -442,14 +452,14 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_HANGING_HEIGHT_M),
         last_telemetry=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_setpoint_above_vehicle_m=1.0,
-        since={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
+        condition_start_times_s={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
     obs = observation(later_s, telemetry=telemetry(later_s, MIN_HANGING_HEIGHT_M, **off))
     after = observing(state, obs, profile)
-    assert after.belief.since[MOTORS_STOPPED] == (later_s if stale else 0.0)
-    assert after.belief.since[BATTERY_LOW] == 1.0
+    assert after.belief.condition_start_times_s[MOTORS_STOPPED] == (later_s if stale else 0.0)
+    assert after.belief.condition_start_times_s[BATTERY_LOW] == 1.0
     assert (after.catch_setpoint_above_vehicle_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
@@ -468,14 +478,14 @@ def ended(
     in_magnet_reach_since_s: float | None = None,
     imu: ImuMotion = UNMOVED,
     reckoning: DeadReckoning = UNRECKONED,
-    floor_detected_s: float | None = None,
+    floor_detected_at_s: float | None = None,
     **observed: Any,
 ) -> RestState:
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_ordered_s=NOW_S - 1.0,
-        in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_s=floor_detected_s,
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_ordered_at_s=NOW_S - 1.0,
+        in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_at_s=floor_detected_at_s,
         reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, BY_TARGET))
@@ -498,7 +508,9 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
     assert (
         ended(
             in_magnet_reach_since_s,
-            ImuMotion(t_s=NOW_S, last_fall_at_s=fell_s, last_fall_hiding_gap_end_s=gap_s),
+            ImuMotion(
+                t_s=NOW_S, last_fall_at_s=fell_s, last_gap_that_may_hide_fall_ended_at_s=gap_s
+            ),
         )
         is found
     )
@@ -519,7 +531,7 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
     begun = remembering(
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_order_count=6,
         last_stop_or_land_order_at_s=BEGIN_S,
-        in_magnet_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
+        in_magnet_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(gear_below_target_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
     assert (state.belief.in_magnet_reach_since_s is not None) is (part < 1.0)
@@ -531,10 +543,10 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(last_possible_catch_gap_end_s=NOW_S - 3.0)
+    silence = DeadReckoning(last_gap_magnet_may_attach_ended_at_s=NOW_S - 3.0)
     assert ended(in_magnet_reach_since_s, reckoning=silence) is RestState.UNKNOWN
     assert (
-        ended(in_magnet_reach_since_s, reckoning=silence, floor_detected_s=NOW_S - 1.5)
+        ended(in_magnet_reach_since_s, reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
         is RestState.STANDS
     )
     seen = replace(silence, last_sighting_at_s=NOW_S - 2.5)
@@ -543,28 +555,28 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 
 
 @pytest.mark.parametrize(
-    ("phase", "distance_below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)]
+    ("phase", "gear_below_target_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)]
 )
 def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
-    phase: Phase, distance_below_m: float
+    phase: Phase, gear_below_target_m: float
 ) -> None:
     """The loop comes back after 11 s, and the motors stand still already."""
     seen = {"target": None, "position_age_s": 11.0, "imu": UNMOVED}
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = remembering(
-        before, reckoning=DeadReckoning(UNMOVED, distance_below_m=distance_below_m)
+        before, reckoning=DeadReckoning(UNMOVED, gear_below_target_m=gear_below_target_m)
     )
     entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = descent.enter_descent(
         context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
     )
-    assert new.motor_stop_ordered_s == NOW_S
+    assert new.motor_stop_ordered_at_s == NOW_S
     assert rest.find_rest_state(context_at(new, obs, BY_TARGET)) is RestState.HANGS
 
 
 def test_a_target_seen_far_above_tells_that_it_stands() -> None:
-    silent = ImuMotion(t_s=NOW_S, last_fall_hiding_gap_end_s=6.0)
+    silent = ImuMotion(t_s=NOW_S, last_gap_that_may_hide_fall_ended_at_s=6.0)
     for z_m, found in ((CEILING_M - 1.0, RestState.STANDS), (HANG_Z_M, RestState.UNKNOWN)):
         target = target_at(NOW_S, body_m=(0.0, 0.0, z_m))
         assert ended(4.0, silent, target=target) is found
@@ -588,8 +600,8 @@ BIT = st.fixed_dictionaries(
             [
                 {},
                 {},
-                {"has_estimate_jumped": True},
-                {"has_estimate_jumped": True, "heading_jump_rad": 1.5},
+                {"has_estimated_position_jumped": True},
+                {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5},
                 {"loop_late_s": 1.2},
                 {"link_problem": "gone"},
                 {"operator_request": OperatorRequest.LAND},
@@ -601,17 +613,21 @@ BITS = st.lists(BIT, min_size=1, max_size=5)
 REMEMBERED = st.sampled_from(
     [
         {},
-        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0},
-        {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0, "release_began_s": 9.9},
+        {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0},
         {
-            "last_contact_body_z_m": HANG_Z_M,
+            "vehicle_world_z_at_last_contact_m": HANG_Z_M,
+            "in_magnet_reach_since_s": 9.0,
+            "release_began_s": 9.9,
+        },
+        {
+            "vehicle_world_z_at_last_contact_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
             "release_began_s": 9.0,
-            "motor_stop_ordered_s": 9.8,
+            "motor_stop_ordered_at_s": 9.8,
             "stop_or_land_order_count": 2,
         },
         {"catch_setpoint_above_vehicle_m": 1.0},
-        {"began_pressed": True},
+        {"must_end_press": True},
         {"hover_thrust": 0.0},
         {"dead_reckoning_since_s": 9.0, "reckoned_height_m": 1.0},
     ]

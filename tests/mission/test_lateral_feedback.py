@@ -229,7 +229,9 @@ def test_pictures_and_lean_hold_the_vehicle_where_its_estimate_wanders() -> None
     spreads_m = []
     for pictures in (True, False):
         vehicle = Hovering(0.0, 0.02, wander_m=0.002, pictures=pictures)
-        confirmed = remembering(ascending(), mounting=MountingMonitor(is_confirmed=True))
+        confirmed = remembering(
+            ascending(), mounting=MountingMonitor(is_camera_mounting_confirmed=True)
+        )
         flight = fly(confirmed, vehicle, 20.0, one_phase=True)
         assert flight.ticks[-1].t_s > BEGIN_S + 15.0
         spreads_m.append(vehicle.spread_m(2.0, len(vehicle.path_m) * TICK_S))

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission.belief.lateral_offset import (
-    MAX_GAP_S,
-    MAX_VELOCITY_SIGMA_MPS,
+    MAX_PICTURE_GAP_S,
+    MAX_SIGMA_OF_USED_VELOCITY_MPS,
     LateralOffset,
     LateralOffsetFilter,
     LateralVector,
@@ -144,7 +144,7 @@ def test_the_spread_grows_until_the_estimate_is_unknown() -> None:
     spreads = [known(filtered, 1.5 + t_s).sigma_m for t_s in np.linspace(0.0, 0.48, 10)]
     assert spreads == sorted(spreads)
     assert spreads[-1] > 2.0 * spreads[0]
-    assert filtered.predict(1.5 + MAX_GAP_S + PICTURE_S) is None
+    assert filtered.predict(1.5 + MAX_PICTURE_GAP_S + PICTURE_S) is None
     assert filtered.predict(0.5) is None
 
 
@@ -153,7 +153,7 @@ def test_nothing_is_known_before_the_pictures_show_a_velocity() -> None:
     one = LateralOffsetFilter().with_picture(1.0, (0.0, 0.0), 0.001)
     assert one.predict(1.0) is None
     with_more = watch(swaying(0.005, 1.7, 0.0), 0.5)
-    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_MPS
+    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_SIGMA_OF_USED_VELOCITY_MPS
 
 
 def test_a_step_of_the_pose_is_no_velocity() -> None:

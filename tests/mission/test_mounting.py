@@ -41,7 +41,7 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
     """Half a second still, then straight on; the watch, and how far it flew until it spoke."""
     rng = np.random.default_rng(0)
     watch, t_s, moved_m = MountingMonitor(), 0.0, 0.0
-    while moved_m < way_m and not watch.is_wrong:
+    while moved_m < way_m and not watch.is_camera_mounting_wrong:
         t_s += FRAME_S
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
@@ -53,14 +53,14 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
 @given(st.one_of(st.floats(75, 180), st.floats(-180, -75)))
 def test_a_turned_mounting_is_seen_and_measured(deg: float) -> None:
     watch, moved_m = flown(turned(deg))
-    assert watch.is_wrong
+    assert watch.is_camera_mounting_wrong
     assert moved_m < 0.17
-    assert abs(math.remainder(math.degrees(watch.rotation_rad) - deg, 360.0)) < 15.0
+    assert abs(math.remainder(math.degrees(watch.camera_yaw_error_rad) - deg, 360.0)) < 15.0
 
 
 @given(st.floats(-30, 30))
 def test_a_mounting_that_leads_to_the_target_is_left_alone(deg: float) -> None:
-    assert not flown(turned(deg))[0].is_wrong
+    assert not flown(turned(deg))[0].is_camera_mounting_wrong
 
 
 def _tilting(deg: float) -> MountingMonitor:
@@ -78,8 +78,8 @@ def test_a_turned_mounting_shows_in_the_vehicles_own_tilts(deg: int) -> None:
     """Before it has gone anywhere. Taken for a target that jumps, it would be looked at afresh
     with each tilt, while the vehicle flies on."""
     watch = _tilting(deg)
-    assert watch.is_wrong
-    assert abs(math.remainder(math.degrees(watch.rotation_rad) - deg, 360.0)) < 5.0
+    assert watch.is_camera_mounting_wrong
+    assert abs(math.remainder(math.degrees(watch.camera_yaw_error_rad) - deg, 360.0)) < 5.0
 
 
 def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
@@ -96,7 +96,7 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(contradictions=9, rotation_rad=math.pi / 2)
+    watch = MountingMonitor(contradictions=9, camera_yaw_error_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
     assert flight.state.row_name == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
@@ -114,7 +114,7 @@ def test_a_target_that_is_moved_is_no_turned_mounting(
         over_s = max(frames * FRAME_S, 1e-6)
         return TARGET + step * min(1.0, max(0.0, (t_s - at_s) / over_s))
 
-    assert not flown(moved)[0].is_wrong
+    assert not flown(moved)[0].is_camera_mounting_wrong
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
     for i in range(900):
         shift = frame_shift_m(i)
         watch = update_monitor(watch, MountingSample(i * FRAME_S, complex(shift), TARGET + shift))
-        assert not watch.is_wrong
+        assert not watch.is_camera_mounting_wrong
 
 
 class Follows(Motors):
@@ -169,7 +169,7 @@ def test_a_right_mounting_flies_on() -> None:
     it = Follows(0.0)
     state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
-    assert state.belief.mounting.is_confirmed
+    assert state.belief.mounting.is_camera_mounting_confirmed
     assert max(it.far_m) > 0.3
     assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 

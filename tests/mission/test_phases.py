@@ -10,9 +10,9 @@ from perchctl.mission.phase import (
     CAMERA_GUIDED_PHASES,
     FINAL_PHASES,
     FREE_AIR_PHASES,
-    PAPER_METHOD_PHASES,
     PRE_CONTACT_PHASES,
     PRE_LANDING_PHASES,
+    PUBLISHED_METHOD_PHASES,
 )
 from perchctl.mission.table import PHASES, TABLE
 
@@ -45,9 +45,9 @@ def test_what_the_camera_steers_and_what_flies_in_the_open_is_declared_once() ->
 
 def test_the_sets_are_those_of_the_paper_s_phases() -> None:
     """By name: a phase that is put between others must not push one out."""
-    names = " ".join(phase.value for phase in PAPER_METHOD_PHASES)
+    names = " ".join(phase.value for phase in PUBLISHED_METHOD_PHASES)
     assert names == "APPROACH SEARCH ESTIMATE ALIGN ASCEND PERCH COMPLETE"
-    assert {*PAPER_METHOD_PHASES, Phase.RECOVER} <= PRE_LANDING_PHASES
+    assert {*PUBLISHED_METHOD_PHASES, Phase.RECOVER} <= PRE_LANDING_PHASES
     assert {Phase.COMPLETE} == PRE_LANDING_PHASES - PRE_CONTACT_PHASES
     assert not FINAL_PHASES & AIRBORNE_PHASES
 

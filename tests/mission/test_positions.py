@@ -182,7 +182,7 @@ class Hangs(Motors):
 
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
-    held = {"last_contact_body_z_m": HANG_Z_M, "in_magnet_reach_since_s": BEGIN_S - 5.0}
+    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "in_magnet_reach_since_s": BEGIN_S - 5.0}
     return remembering(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
@@ -211,7 +211,7 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
 
 
 STOPPED: dict[str, Any] = {
-    "motor_stop_ordered_s": BEGIN_S - 1.0,
+    "motor_stop_ordered_at_s": BEGIN_S - 1.0,
     "release_began_s": BEGIN_S - 3.0,
     "stop_or_land_order_count": 5,
 }
@@ -252,9 +252,9 @@ def test_what_nobody_saw_hang_has_not_perched(
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, last_contact_body_z_m=0.6,
+        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, vehicle_world_z_at_last_contact_m=0.6,
         release_began_s=9.0,
-        motor_stop_ordered_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
+        motor_stop_ordered_at_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -271,7 +271,10 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     ("contact", "ends"),
     [
         ({}, Phase.PERCHED),
-        ({"last_contact_body_z_m": None, "in_magnet_reach_since_s": None}, Phase.LANDED),
+        (
+            {"vehicle_world_z_at_last_contact_m": None, "in_magnet_reach_since_s": None},
+            Phase.LANDED,
+        ),
     ],
     ids=["contact", "none"],
 )
@@ -403,7 +406,7 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
     (Phase.LANDING, (0.3, 0.0, 1.0), {}, MOCAP, False),
     (Phase.LANDING, (0.5, 0.0, 1.0), {}, MOCAP, True),
     # The magnet may hold what has touched the ceiling aside of its setpoint.
-    (Phase.LANDING, (0.5, 0.0, 1.0), {"last_contact_body_z_m": 1.0}, MOCAP, False),
+    (Phase.LANDING, (0.5, 0.0, 1.0), {"vehicle_world_z_at_last_contact_m": 1.0}, MOCAP, False),
 ])  # fmt: skip
 def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     phase: Phase,
@@ -458,7 +461,7 @@ def gains_beside(
     for t_s in times(lasts_s):
         if not state.belief.is_position_diverged:
             beside = replace(
-                state.belief.reckoning, lateral_gain_of_estimate_only_mps=(0.0, estimate_only_mps)
+                state.belief.reckoning, lateral_velocity_unseen_by_imu_mps=(0.0, estimate_only_mps)
             )
             state = remembering(state, reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}

@@ -135,7 +135,7 @@ def blind(look: Look) -> Look:
 def unknown(t_s: float) -> Observation:
     """Motors off, neither the target nor a position of late, and a silence not long ago."""
     obs = replace(at(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
-    return replace(obs, imu=ImuMotion(t_s=t_s, last_fall_hiding_gap_end_s=BEGIN_S))
+    return replace(obs, imu=ImuMotion(t_s=t_s, last_gap_that_may_hide_fall_ended_at_s=BEGIN_S))
 
 
 LAND_ON_LOG = changed({"safety.land_on_log_error": True})
@@ -152,7 +152,10 @@ CASES: dict[str, Case] = {
     ),
     "hung-but-locked": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
-        O.PERCHED, state={"motor_stop_ordered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M},
+        O.PERCHED, state={
+            "motor_stop_ordered_at_s": BEGIN_S,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
+        },
         z_m=CONTACT_Z_M,
     ),
     "locked": Case(P.ALIGN, P.ABORTED, at(supervisor=AIRBORNE | LOCKED), 0.1, O.SAFETY,
@@ -167,8 +170,8 @@ CASES: dict[str, Case] = {
     "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), BEGIN_S), 1.5, O.SAFETY),
     "heading-lost": Case(
-        P.ALIGN, P.LANDING, seen(has_estimate_jumped=True, heading_jump_rad=1.5), 0.1, O.SAFETY,
-        RawThrust
+        P.ALIGN, P.LANDING, seen(has_estimated_position_jumped=True, heading_jump_rad=1.5), 0.1,
+        O.SAFETY, RawThrust
     ),
     "position-astray": Case(
         P.APPROACH, P.LANDING, aside(0.2, 0.01), 0.1, O.SAFETY, RawThrust, z_m=0.3, profile=MOCAP
@@ -176,12 +179,14 @@ CASES: dict[str, Case] = {
     "position-lost": Case(
         P.ALIGN, P.LANDING, seen(position_age_s=0.8, position_problem="occluded"), 0.1, O.SAFETY
     ),
-    "estimator-jump": Case(P.ALIGN, P.LANDING, seen(has_estimate_jumped=True), 0.8, O.SAFETY),
+    "estimator-jump": Case(
+        P.ALIGN, P.LANDING, seen(has_estimated_position_jumped=True), 0.8, O.SAFETY
+    ),
     "estimate-unsure": Case(
         P.ALIGN, P.LANDING, at(velocity_variance_m2ps2=0.08), 1.2, O.SAFETY
     ),
     "battery-low": Case(P.ASCEND, P.LANDING, at(battery_v=2.8), 1.8, O.SAFETY),
-    "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
+    "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_reading_age_s=99.0), 0.1, O.SAFETY),
     "latency": Case(
         P.ALIGN, P.LANDING,
         seen(camera_imu_mismatch=CameraImuMismatch(camera_latency_error_s=0.15)), 0.1, O.SAFETY,
@@ -200,7 +205,7 @@ CASES: dict[str, Case] = {
     "markers-disagree": Case(P.ALIGN, P.LANDING, seen(successive_marker_conflicts=40), 0.1,
         O.SAFETY),
     "log-lost": Case(
-        P.ALIGN, P.LANDING, seen(log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
+        P.ALIGN, P.LANDING, seen(flight_log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
     ),
     "time-over": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"started_s": -1000.0}
@@ -210,14 +215,14 @@ CASES: dict[str, Case] = {
     ),
     "held": Case(
         P.ASCEND, P.LANDING, at(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
-        state={"entered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M - 0.2},
+        state={"entered_s": BEGIN_S, "vehicle_world_z_at_last_contact_m": CONTACT_Z_M - 0.2},
         z_m=CONTACT_Z_M - 0.2,
         row="held",
     ),
     "hangs-at-contact": Case(
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
-            "entered_s": BEGIN_S, "last_contact_body_z_m": CONTACT_Z_M,
+            "entered_s": BEGIN_S, "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
             "last_contact_offset": ContactOffset(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
@@ -283,18 +288,24 @@ CASES: dict[str, Case] = {
     ),
     "perched": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
-        state={"motor_stop_ordered_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M},
+        state={
+            "motor_stop_ordered_at_s": BEGIN_S - 3.0,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
+        },
         z_m=CONTACT_Z_M,
     ),
     "fell-unseen": Case(
         P.COMPLETE, P.LANDING, at(0.02, **OFF), 0.3, O.SAFETY,
-        state={"motor_stop_ordered_s": BEGIN_S - 3.0, "last_contact_body_z_m": CONTACT_Z_M},
+        state={
+            "motor_stop_ordered_at_s": BEGIN_S - 3.0,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
+        },
         z_m=CONTACT_Z_M,
     ),
     "not-stopped": Case(
         P.COMPLETE, P.LANDING, at(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
-        state={"motor_stop_ordered_s": BEGIN_S - 12.0, "stop_or_land_order_count": 5,
-            "last_contact_body_z_m": CONTACT_Z_M},
+        state={"motor_stop_ordered_at_s": BEGIN_S - 12.0, "stop_or_land_order_count": 5,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "attempts-used": Case(
@@ -312,8 +323,8 @@ CASES: dict[str, Case] = {
     "sunk": Case(P.HOVER, P.ASCEND, seen(0.9), 0.5, profile=HOVERING),
     "hung": Case(
         P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.ENDED_BY_OPERATOR,
-        state={"outcome": O.ENDED_BY_OPERATOR, "motor_stop_ordered_s": BEGIN_S,
-            "last_contact_body_z_m": CONTACT_Z_M},
+        state={"outcome": O.ENDED_BY_OPERATOR, "motor_stop_ordered_at_s": BEGIN_S,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "landed": Case(
@@ -322,15 +333,15 @@ CASES: dict[str, Case] = {
     ),
     "held-elsewhere": Case(
         P.LANDING, P.ABORTED, at(CONTACT_Z_M - 0.2, **OFF), 0.3, O.SAFETY,
-        state={"outcome": O.SAFETY, "motor_stop_ordered_s": BEGIN_S, "row": "held",
+        state={"outcome": O.SAFETY, "motor_stop_ordered_at_s": BEGIN_S, "row": "held",
             "entered_s": BEGIN_S},
         z_m=CONTACT_Z_M - 0.2,
     ),
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
-            "outcome": O.SAFETY, "motor_stop_ordered_s": BEGIN_S,
-            "last_contact_body_z_m": CONTACT_Z_M,
+            "outcome": O.SAFETY, "motor_stop_ordered_at_s": BEGIN_S,
+            "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
             "in_magnet_reach_since_s": BEGIN_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
@@ -363,8 +374,8 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     """It hangs, but nobody has seen whether it hangs on the target: its outcome is that of what led
     to the landing."""
     state = remembering(
-        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), motor_stop_ordered_s=BEGIN_S - 1.0,
-        last_contact_body_z_m=CONTACT_Z_M, outcome=O.ENDED_BY_OPERATOR,
+        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), motor_stop_ordered_at_s=BEGIN_S - 1.0,
+        vehicle_world_z_at_last_contact_m=CONTACT_Z_M, outcome=O.ENDED_BY_OPERATOR,
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
     state, _ = planner.step_mission(state, locked, PROFILE)
@@ -387,7 +398,7 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
     assert row is not None
     text = row.reason_text(context)
     assert text.startswith("not steady 6 s after the attempt: moving at 0.30 m/s, 0.31 m")
-    hangs = context_at(remembering(state, last_contact_body_z_m=z_m), sample, PROFILE)
+    hangs = context_at(remembering(state, vehicle_world_z_at_last_contact_m=z_m), sample, PROFILE)
     assert row.reason_text(hangs).endswith("still at its contact")
 
 
@@ -468,7 +479,7 @@ WAIT = Transition("wait", {P.ALIGN}, lambda c: c.t_s < 50.0, P.ALIGN, "mine", Se
 def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     """It stays aligned and does not go on, the wait does not count, and other rows still act."""
     table = add_rows([WAIT])
-    state = waiting = remembering(state_in(P.ALIGN), since={ALIGNED: 10.0})
+    state = waiting = remembering(state_in(P.ALIGN), condition_start_times_s={ALIGNED: 10.0})
     for t_s in range(11, 50):
         waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
     assert (waiting.phase, waiting.pause_reason, waiting.hold_reason) == (P.ALIGN, "mine", "")

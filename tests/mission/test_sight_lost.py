@@ -14,7 +14,10 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.belief import GUST_SPEED_THRESHOLD_MPS, MAX_FUSED_POSITION_EXTRA_AGE_S
+from perchctl.mission.belief.belief import (
+    MAX_POSITION_AGE_BEYOND_LATENCY_S,
+    MIN_SPEED_GAINED_IN_GUST_MPS,
+)
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import (
     BRAKE_GAIN_RAD_PER_MPS,
@@ -105,7 +108,7 @@ def test_what_sightings_contradict_is_not_flown_by(
     beside_m: float, age_s: float, lands: bool
 ) -> None:
     """It comes down level as soon as they have done so for longer than one of them may be wrong."""
-    seen = at(1.0, obs={"rejected_sighting_distance_m": beside_m, "position_age_s": age_s})
+    seen = at(1.0, obs={"rejected_sighting_to_estimate_m": beside_m, "position_age_s": age_s})
     state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
     assert (state.phase is Phase.LANDING) is lands
     assert ("from its estimate" in state.reason) is lands
@@ -160,7 +163,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
 ) -> None:
     """For 0.1 s without a sight: sideways the estimate feels none of it."""
     gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
-    assume(abs(gained_mps - GUST_SPEED_THRESHOLD_MPS) >= 0.05)
+    assume(abs(gained_mps - MIN_SPEED_GAINED_IN_GUST_MPS) >= 0.05)
 
     def look(t_s: float) -> Observation:
         passed_s = t_s - BEGIN_S
@@ -169,10 +172,10 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         return unseen(1.0, for_s=max(0.01, passed_s - 0.1), yaw_rad=yaw_rad, **felt)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
-    assert (flight.state.phase is Phase.LANDING) is (gained_mps > GUST_SPEED_THRESHOLD_MPS)
+    assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_SPEED_GAINED_IN_GUST_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.row_name == "position-lost"
-        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_FUSED_POSITION_EXTRA_AGE_S
+        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_POSITION_AGE_BEYOND_LATENCY_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3
@@ -187,7 +190,9 @@ def test_pictures_that_come_late_are_no_blow(later_s: float, lost: int) -> None:
 
     def look(t_s: float) -> Observation:
         age_s = 0.07 + later_s + (t_s - BEGIN_S) % period_s
-        return at(obs={"position_age_s": age_s, "extra_camera_latency_s": later_s}, **slow)(t_s)
+        return at(obs={"position_age_s": age_s, "camera_latency_above_profile_s": later_s}, **slow)(
+            t_s
+        )
 
     flight = fly(state_in(Phase.ALIGN), look, 3.0, PROFILE, feels=True, one_phase=True)
     assert flight.state.phase is not Phase.LANDING
@@ -208,13 +213,15 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
     estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
     unknown_mps = math.hypot(x_mps, y_mps)
-    assume(abs(unknown_mps - GUST_SPEED_THRESHOLD_MPS) > 0.01)
+    assume(abs(unknown_mps - MIN_SPEED_GAINED_IN_GUST_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
-        state_in(Phase.LANDING, z_m=1.9), last_contact_body_z_m=1.9, release_began_s=BEGIN_S - 1.0,
+        state_in(Phase.LANDING, z_m=1.9), vehicle_world_z_at_last_contact_m=1.9,
+        release_began_s=BEGIN_S - 1.0,
         in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
         reckoning=DeadReckoning(
-            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), lateral_gain_of_imu_only_mps=(x_mps, y_mps)
+            imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
+            lateral_velocity_unseen_by_estimate_mps=(x_mps, y_mps),
         ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
@@ -222,7 +229,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     _, command = step_mission(state, obs, PROFILE)
     assert is_setpoint(command, above_m=1.85)
     assert isinstance(command, PositionSetpoint)
-    if unknown_mps > GUST_SPEED_THRESHOLD_MPS:
+    if unknown_mps > MIN_SPEED_GAINED_IN_GUST_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
             braked_mps = max(
                 -MAX_SPEED_USED_FOR_BRAKING_MPS, min(MAX_SPEED_USED_FOR_BRAKING_MPS, mps)

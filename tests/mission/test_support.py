@@ -98,7 +98,7 @@ def test_a_vehicle_with_late_telemetry_is_supported_by_nothing_known() -> None:
 def test_it_presses_against_the_target_with_more_thrust_than_it_hovers_by() -> None:
     obs = hanging(0.0)
     presses = replace(obs, telemetry=replace(obs.telemetry, thrust=1.3 * HOVER_THRUST))
-    assert supported(presses, Phase.PERCH) is Support.PRESSED
+    assert supported(presses, Phase.PERCH) is Support.PRESSED_SURFACE
 
 
 def test_a_vehicle_that_has_come_down_and_cannot_fly_stands_on_the_floor() -> None:

@@ -67,7 +67,7 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
     hover: float, thrust: float, holds: bool
 ) -> None:
     hangs = remembering(
-        state_in(Phase.COMPLETE), hover_thrust=hover, last_contact_body_z_m=CONTACT_Z_M
+        state_in(Phase.COMPLETE), hover_thrust=hover, vehicle_world_z_at_last_contact_m=CONTACT_Z_M
     )
     c = context_at(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
     assert MAGNET_HOLDS.holds(c.belief) is holds
@@ -176,7 +176,9 @@ def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     t_s = 10.1 + PROFILE.planner.perch.timeout_s
     saturated = {SATURATED_THRUST: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
-    state = remembering(above, since=saturated, catch_setpoint_above_vehicle_m=None)
+    state = remembering(
+        above, condition_start_times_s=saturated, catch_setpoint_above_vehicle_m=None
+    )
     for _ in range(2):
         state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)
         assert state.phase is Phase.RECOVER  # and full thrust is no sign of a heavy vehicle

@@ -241,7 +241,7 @@ def test_what_pictures_show_standing_on_little_thrust_stands_on_the_floor() -> N
     vehicle = Falling(0.8, 0.0, 1.0)
     come_down(vehicle, 9.0)
     assert vehicle.state is not None
-    assert vehicle.state.descent.floor_detected_s is not None
+    assert vehicle.state.descent.floor_detected_at_s is not None
 
 
 def test_what_hangs_right_below_the_target_does_not() -> None:
@@ -249,14 +249,19 @@ def test_what_hangs_right_below_the_target_does_not() -> None:
     vehicle = Falling(HANG_Z_M - 0.05, 0.0, 1.0, held=True)
     come_down(vehicle, 9.0)
     assert vehicle.state is not None
-    assert vehicle.state.descent.floor_detected_s is None
+    assert vehicle.state.descent.floor_detected_at_s is None
 
 
 def test_pictures_that_show_it_below_its_contact_clear_that() -> None:
     """Once, and not the time since which it has been without a position."""
     vehicle = Falling(HANG_Z_M, 0.0, 1.0)
-    come_down(vehicle, 5.0, last_contact_body_z_m=HANG_Z_M, in_magnet_reach_since_s=BEGIN_S - 1.5)
+    come_down(
+        vehicle,
+        5.0,
+        vehicle_world_z_at_last_contact_m=HANG_Z_M,
+        in_magnet_reach_since_s=BEGIN_S - 1.5,
+    )
     assert vehicle.state is not None
-    assert vehicle.state.belief.last_contact_body_z_m is None
+    assert vehicle.state.belief.vehicle_world_z_at_last_contact_m is None
     assert vehicle.state.belief.dead_reckoning_since_s is not None
     assert vehicle.state.belief.dead_reckoning_since_s < BEGIN_S + 4.0

@@ -62,7 +62,7 @@ def landing(z_m: float = HANG_Z_M, phase: Phase = Phase.LANDING, **changes: Any)
 
 def hanging(phase: Phase = Phase.LANDING, **changes: Any) -> PlannerState:
     """The same, where the magnet may hold it."""
-    return landing(HANG_Z_M, phase, **{"last_contact_body_z_m": HANG_Z_M, **changes})
+    return landing(HANG_Z_M, phase, **{"vehicle_world_z_at_last_contact_m": HANG_Z_M, **changes})
 
 
 # --- What presses, and what is on the floor ------------------------------------------------------
@@ -78,11 +78,11 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
 @pytest.mark.parametrize("phase", [Phase.LANDING, Phase.RECOVER])
 def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
     """The integrators that a second of full thrust has wound up hold it there for seconds."""
-    pressing = fly(landing(1.0, phase, began_pressed=True), at(1.0, thrust=65535.0))
+    pressing = fly(landing(1.0, phase, must_end_press=True), at(1.0, thrust=65535.0))
     assert is_setpoint(pressing.command, distance_below_m=0.2)
     away = at(0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
     state, command = step_mission(pressing.state, away(10.5), PROFILE)
-    assert not state.began_pressed
+    assert not state.must_end_press
     assert is_setpoint(command, above_m=0.4)
 
 
@@ -101,8 +101,8 @@ BITS = st.tuples(
 )
 STATES: tuple[dict[str, Any], ...] = (
     {},
-    {"last_contact_body_z_m": HANG_Z_M},
-    {"last_contact_body_z_m": HANG_Z_M, "release_began_s": 9.9},
+    {"vehicle_world_z_at_last_contact_m": HANG_Z_M},
+    {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 9.9},
     {"stop_or_land_order_count": 2, "last_stop_or_land_order_at_s": 9.9},
     {"hover_thrust": 0.0},
 )
@@ -154,7 +154,12 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     bits=st.lists(BITS, min_size=1, max_size=6),
     begin=st.sampled_from(STATES),
     doubt=st.sampled_from(
-        [{}, {"has_estimate_jumped": True}, {"link_problem": "gone"}, {"loop_late_s": 0.5}]
+        [
+            {},
+            {"has_estimated_position_jumped": True},
+            {"link_problem": "gone"},
+            {"loop_late_s": 0.5},
+        ]
     ),
     flying=st.booleans(),
 )
@@ -298,7 +303,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
 ) -> None:
     """Not even where it was pressed before, and a contact seemed to be there; nor once the target
     that tells it is out of sight."""
-    begin = landing(HANG_Z_M - 0.2, phase, last_contact_body_z_m=HANG_Z_M - 0.2)
+    begin = landing(HANG_Z_M - 0.2, phase, vehicle_world_z_at_last_contact_m=HANG_Z_M - 0.2)
     hand = InAHand(0.2, seen_until_s=seen_until_s)
     flight = fly(begin, hand, 20.0, PROFILES[positioning], feels=True)
     state = flight.state
@@ -326,7 +331,7 @@ def test_only_what_hangs_at_the_target_is_caught(
     begin = landing(
         HANG_Z_M - distance_below_m,
         Phase.RECOVER,
-        last_contact_body_z_m=HANG_Z_M - distance_below_m,
+        vehicle_world_z_at_last_contact_m=HANG_Z_M - distance_below_m,
     )
     assert (
         fly(
@@ -401,7 +406,7 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     share: float, steady_s: float, since_s: float, touched: bool
 ) -> None:
     tel = telemetry(10.02, HANG_Z_M, thrust=share * HOVER_THRUST)
-    pressing = landing(phase=Phase.PERCH, since={CONTACT: since_s})
+    pressing = landing(phase=Phase.PERCH, condition_start_times_s={CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
     obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_steady_since_s=steady_s))
@@ -414,7 +419,10 @@ def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_reco
     """Steady because it sticks there, the next attempt would begin pressed."""
     touched = hanging(Phase.RECOVER, last_contact_offset=ContactOffset(0.01, 0.02))
     state = fly(touched, at(HANG_Z_M - 0.1)).state
-    assert (state.belief.last_contact_body_z_m, state.belief.last_contact_offset) == (None, None)
+    assert (state.belief.vehicle_world_z_at_last_contact_m, state.belief.last_contact_offset) == (
+        None,
+        None,
+    )
     assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
@@ -464,7 +472,7 @@ def test_a_completion_whose_telemetry_stands_still_ends(
         Phase.COMPLETE,
         in_magnet_reach_since_s=9.0,
         release_began_s=9.0,
-        motor_stop_ordered_s=10.0,
+        motor_stop_ordered_at_s=10.0,
         last_stop_or_land_order_at_s=10.0,
         stop_or_land_order_count=1,
     )
@@ -487,7 +495,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     """Locked by a lost notify while it slips: it is not reported as perched."""
     locked = {**OFF, "supervisor": READY | LOCKED, "velocity_mps": (0.0, 0.0, -0.9)}
     flight = fly(
-        hanging(Phase.COMPLETE, motor_stop_ordered_s=9.0, stop_or_land_order_count=5),
+        hanging(Phase.COMPLETE, motor_stop_ordered_at_s=9.0, stop_or_land_order_count=5),
         at(HANG_Z_M - 0.05, **locked),
     )
     assert flight.state.phase is not Phase.PERCHED
@@ -512,7 +520,9 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     """It was at rest before the silence and is at rest after it: on the floor. Else what is
     remembered moves with the estimate."""
     state = landing(1.0, last_telemetry=telemetry(10.0, 1.0))
-    new, _ = step_mission(state, at(0.02, obs={"has_estimate_jumped": True})(10.0 + gap_s), PROFILE)
+    new, _ = step_mission(
+        state, at(0.02, obs={"has_estimated_position_jumped": True})(10.0 + gap_s), PROFILE
+    )
     assert state.belief.takeoff_position_m is not None
     assert new.belief.takeoff_position_m is not None
     assert new.belief.takeoff_position_m[2] - state.belief.takeoff_position_m[2] == pytest.approx(
@@ -532,7 +542,12 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
         last_stop_or_land_order_at_s=9.0,
         last_telemetry=telemetry(9.98, 0.4, supervisor=lands),
     )
-    up = at(0.9, obs={"has_estimate_jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
+    up = at(
+        0.9,
+        obs={"has_estimated_position_jumped": True},
+        velocity_mps=(0.0, 0.0, -0.3),
+        supervisor=lands,
+    )
     state, command = step_mission(state, up(10.0), PROFILE)
     assert is_setpoint(command, above_m=1.2)
     slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)

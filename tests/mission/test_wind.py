@@ -53,7 +53,7 @@ def test_a_velocity_that_no_position_shows_is_no_motion(
     wind, while the vehicle stands still."""
     flight = fly(state_in(Phase.RECOVER), blown(0.0, reads_mps, towards_rad), LEARNED_S, MOCAP)
     assert Phase.ESTIMATE in {tick.state.phase for tick in flight.ticks}  # steady, it goes on
-    bias_mps = flight.state.belief.reckoning.velocity_bias_mps
+    bias_mps = flight.state.belief.reckoning.estimated_velocity_bias_world_xy_mps
     assert bias_mps == pytest.approx(
         (reads_mps * math.cos(towards_rad), reads_mps * math.sin(towards_rad)), abs=0.02
     )
@@ -65,8 +65,8 @@ def test_a_motion_that_positions_show_stays_one(flown_mps: float, towards_rad: f
     look = blown(0.6, 0.0, towards_rad, flown_mps)
     flight = fly(state_in(Phase.RECOVER), look, 3.0, MOCAP, one_phase=True)
     assert flight.state.phase is Phase.RECOVER
-    assert math.hypot(*flight.state.belief.reckoning.velocity_bias_mps) < 0.02
-    assert STEADY not in flight.state.since
+    assert math.hypot(*flight.state.belief.reckoning.estimated_velocity_bias_world_xy_mps) < 0.02
+    assert STEADY not in flight.state.condition_start_times_s
 
 
 @BRIEFLY
@@ -139,9 +139,13 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
         imu = imu.with_sample(last, sample)
         last = sample
         reckoning = advance_reckoning(
-            reckoning, imu, sample, is_estimate_believed=True, is_position_correcting_velocity=True
+            reckoning,
+            imu,
+            sample,
+            is_estimate_believed=True,
+            is_estimated_velocity_being_corrected=True,
         )
-    (bx, by, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_lateral_mps2
+    (bx, by, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_specific_force_world_xy_mps2
     assert (bx - x_mps2) / 9.81 == pytest.approx(-wind_g * math.cos(towards_rad), abs=0.01)
     assert (by - y_mps2) / 9.81 == pytest.approx(-wind_g * math.sin(towards_rad), abs=0.01)
 

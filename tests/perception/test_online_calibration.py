@@ -129,4 +129,6 @@ def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:
     target = replace(old.target, measured_s=10.02 - limit_s - 0.03)
     stale = replace(old, target=target)
     assert not context_at(state, stale).belief.target.is_fresh
-    assert context_at(state, replace(stale, extra_camera_latency_s=0.05)).belief.target.is_fresh
+    assert context_at(
+        state, replace(stale, camera_latency_above_profile_s=0.05)
+    ).belief.target.is_fresh

@@ -132,7 +132,7 @@ def whole_turn() -> TickRecord:
         inputs=TickInputs(
             (replace(sample, t_s=0.9), sample), is_detection_requested=False, frame=frame
         ),
-        poses={"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
+        unfiltered_pose_by_marker={"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
         observation=Observation(1.3, sample, synthetic.target(1.0, 1.0)),
         command=Land(0.0, 2.0),
         phase=Phase.LANDING,

@@ -21,7 +21,7 @@ from perchctl.mission import (
     Phase,
     RestState,
 )
-from perchctl.mission.phase import Claim
+from perchctl.mission.phase import VehicleClaim
 from perchctl.mission.state import BatteryOutlook
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_rounded_json
@@ -142,7 +142,7 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     """As it ends, and as its log is read: the simulated camera is the scenario's."""
     landing = Event(
         1.0, EventKind.PHASE, "the camera seems to be rotated", Phase.LANDING, "mounting",
-        claims=Claim.PROFILE_MAY_BE_WRONG,
+        claims=VehicleClaim.PROFILE_MAY_BE_WRONG,
     )  # fmt: skip
     found = CameraFindings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(uri=uri))

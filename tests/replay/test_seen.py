@@ -59,7 +59,7 @@ def test_the_pictures_show_what_they_showed() -> None:
 def test_they_show_all_that_matters() -> None:
     """Before take-off and after; the large marker alone, both, the small one alone."""
     turns = corpus("seen").turns
-    poses = {name for turn in turns for name in turn.poses}
+    poses = {name for turn in turns for name in turn.unfiltered_pose_by_marker}
     assert {"large", "joint", "small"} <= poses
     assert any(turn.role == "waiting" and turn.inputs.frame for turn in turns)
     stages = {t.stage for turn in turns if (t := _target(turn.observation)) is not None}

@@ -3,11 +3,11 @@
 A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
 voltage as a function of its charge (`REST_VOLTAGES_V`) and the current at full thrust
 (`PowerTrain`). It fits two parameters by least squares with exponential forgetting: the voltage sag
-at full thrust, and `discharge_rate_factor`, the factor by which this battery discharges faster than
-the assumed current predicts:
+at full thrust, and `true_to_counted_discharge_ratio`, the discharge rate of this battery divided by
+the rate counted from the assumed current:
 
     reading = rest voltage(charge) - sag * load
-    d charge / dt = -discharge_rate_factor * load * current / capacity
+    d charge / dt = -true_to_counted_discharge_ratio * load * current / capacity
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ FULL_THRUST_SAG_SIGMA_V = 0.3
 late."""
 MIN_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
-TYPICAL_DISCHARGE_RATE_FACTOR = 1.1
-"""Factor by which a typical battery discharges faster than the assumed current predicts."""
-DISCHARGE_RATE_FACTOR_SIGMA = 0.3
-"""Standard deviation of that factor between batteries."""
-MIN_DISCHARGE_RATE_FACTOR = 1.0
-"""Lower bound of the fitted discharge factor."""
-MAX_DISCHARGE_RATE_FACTOR = 3.0
-"""Upper bound of the fitted discharge factor."""
+TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.1
+"""Discharge rate of a typical battery, divided by the rate counted from the assumed current."""
+TRUE_TO_COUNTED_DISCHARGE_RATIO_SIGMA = 0.3
+"""Standard deviation of that ratio between batteries."""
+MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.0
+"""Lower bound of the fitted ratio."""
+MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO = 3.0
+"""Upper bound of the fitted ratio."""
 VOLTAGE_READING_SIGMA_V = 0.02
 """Standard deviation of one second of averaged voltage readings, V."""
 BATTERY_FIT_TIME_CONSTANT_S = 40.0
@@ -53,9 +53,9 @@ VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 MAX_STEADY_THRUST_DEVIATION_FRACTION = 0.06
 """Largest difference between the current load and the filtered load, as a share of full thrust. A
 reading with a larger difference belongs to an earlier thrust and is not used."""
-MIN_CHARGE_FOR_COUNTING_FRACTION = 0.05
-"""Charge below which the count of the consumed charge is not used: the voltage curve is so steep
-there that the readings alone determine the consumed charge."""
+MIN_CHARGE_FRACTION_TO_COUNT_DISCHARGE = 0.05
+"""Share of the full charge below which the discharge counted from the assumed current is not used:
+the voltage curve is so steep there that the readings alone determine the charge."""
 MIN_FIT_THRUST_FRACTION = 0.2
 """Smallest load, as a share of full thrust, at which a reading contributes to the fitted sag."""
 MIN_TIME_UNDER_LOAD_S = 1.0
@@ -68,7 +68,7 @@ class SagModel(NamedTuple):
     """The two parameters that the fit determines."""
 
     full_thrust_sag_v: float
-    discharge_rate_factor: float
+    true_to_counted_discharge_ratio: float
 
 
 class FitSums(NamedTuple):
@@ -78,11 +78,11 @@ class FitSums(NamedTuple):
     the sag's deviation, plus the drop of the resting voltage times the factor's deviation.
     """
 
-    thrust_thrust: float = 0.0
-    thrust_drop: float = 0.0
-    drop_drop: float = 0.0
-    thrust_error: float = 0.0
-    drop_error: float = 0.0
+    thrust_squared: float = 0.0
+    thrust_times_rest_drop: float = 0.0
+    rest_drop_squared: float = 0.0
+    thrust_times_voltage_error: float = 0.0
+    rest_drop_times_voltage_error: float = 0.0
 
 
 NO_READINGS = FitSums()
@@ -92,9 +92,9 @@ NO_READINGS = FitSums()
 class BatteryFit:
     """State of the battery fit after the newest reading.
 
-    The fit has two unknowns: the voltage sag at full thrust, V, and the discharge rate factor, the
-    actual charge consumption divided by the one that the assumed current predicts. Charges are
-    shares of the full charge; thrusts are shares of full thrust.
+    The fit has two unknowns: the voltage sag at full thrust, V, and the true discharge rate divided
+    by the rate counted from the assumed current. Charges are shares of the full charge; thrusts are
+    shares of full thrust.
     """
 
     # resting voltage before take-off, estimated if the first reading was under load
@@ -105,7 +105,7 @@ class BatteryFit:
     mean_thrust_fraction: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
     time_under_load_s: float = 0.0  # total time of readings under load
-    no_reading_s: float = 0.0  # time since the last reading
+    time_since_battery_reading_s: float = 0.0  # time since the last reading
     normal_equation_sums: FitSums = NO_READINGS
 
 
@@ -144,13 +144,19 @@ def identify_power_train(telemetry: Telemetry) -> PowerTrain:
 
 
 def update_from_telemetry(
-    old: BatteryFit, telemetry: Telemetry, reading_age_s: float, dt_s: float, battery_mah: float
+    old: BatteryFit,
+    telemetry: Telemetry,
+    reading_age_s: float,
+    dt_s: float,
+    battery_capacity_mah: float,
 ) -> BatteryFit:
     """Return the fit after a new sample, taken `dt_s` after the previous one. A battery reading
     older than `MAX_BATTERY_READING_AGE_S` counts as missing."""
     reading_v = telemetry.battery_v if reading_age_s <= MAX_BATTERY_READING_AGE_S else math.nan
     power_train = identify_power_train(telemetry)
-    return update_battery_fit(old, dt_s, reading_v, telemetry.thrust, battery_mah, power_train)
+    return update_battery_fit(
+        old, dt_s, reading_v, telemetry.thrust, battery_capacity_mah, power_train
+    )
 
 
 def update_battery_fit(
@@ -158,11 +164,11 @@ def update_battery_fit(
     dt_s: float,
     battery_v: float,
     thrust: float,
-    battery_mah: float,
+    battery_capacity_mah: float,
     power_train: PowerTrain,
 ) -> BatteryFit:
-    """Return the state `dt_s` later, with the commanded thrust (0..65535) and a capacity of
-    `battery_mah`.
+    """Return the state `dt_s` later, with the commanded thrust (0..65535) and the battery's full
+    charge `battery_capacity_mah`.
 
     A `battery_v` that is NaN or that no cell can have counts as missing. The estimate then falls
     with the charge that the thrust consumes.
@@ -171,7 +177,7 @@ def update_battery_fit(
     state = replace(
         state,
         counted_discharge_fraction=state.counted_discharge_fraction
-        + thrust_fraction * full_thrust_discharge_per_s(battery_mah, power_train) * dt_s,
+        + thrust_fraction * full_thrust_discharge_per_s(battery_capacity_mah, power_train) * dt_s,
         filtered_thrust_fraction=_low_pass(
             state.filtered_thrust_fraction, thrust_fraction, dt_s / VOLTAGE_LAG_TIME_CONSTANT_S
         ),
@@ -184,17 +190,19 @@ def update_battery_fit(
         )
     # reduce the last estimate by the charge that the thrust consumes
     if not is_battery_reading(battery_v):
-        state = replace(state, no_reading_s=state.no_reading_s + dt_s)
+        state = replace(
+            state, time_since_battery_reading_s=state.time_since_battery_reading_s + dt_s
+        )
         if state.rest_v is None:
             return state
         spent = (
-            fit_sag_model(state).discharge_rate_factor
+            fit_sag_model(state).true_to_counted_discharge_ratio
             * state.filtered_thrust_fraction
-            * full_thrust_discharge_per_s(battery_mah, power_train)
+            * full_thrust_discharge_per_s(battery_capacity_mah, power_train)
             * dt_s
         )
         return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
-    state = replace(state, no_reading_s=0.0)
+    state = replace(state, time_since_battery_reading_s=0.0)
     if thrust_fraction == 0.0 and not state.time_under_load_s:
         return replace(state, takeoff_rest_v=battery_v, rest_v=battery_v)
     if abs(thrust_fraction - state.filtered_thrust_fraction) > MAX_STEADY_THRUST_DEVIATION_FRACTION:
@@ -223,13 +231,18 @@ def fit_sag_model(state: BatteryFit) -> SagModel:
     values and bounded."""
     a, b, c, p, q = state.normal_equation_sums
     a += FULL_THRUST_SAG_SIGMA_V**-2
-    c += DISCHARGE_RATE_FACTOR_SIGMA**-2
+    c += TRUE_TO_COUNTED_DISCHARGE_RATIO_SIGMA**-2
     det = a * c - b * b
     sag_v = TYPICAL_FULL_THRUST_SAG_V + (c * p - b * q) / det
-    discharge_rate_factor = TYPICAL_DISCHARGE_RATE_FACTOR + (a * q - b * p) / det
+    true_to_counted_discharge_ratio = (
+        TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO + (a * q - b * p) / det
+    )
     return SagModel(
         max(MIN_FULL_THRUST_SAG_V, sag_v),
-        min(MAX_DISCHARGE_RATE_FACTOR, max(MIN_DISCHARGE_RATE_FACTOR, discharge_rate_factor)),
+        min(
+            MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO,
+            max(MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO, true_to_counted_discharge_ratio),
+        ),
     )
 
 
@@ -254,14 +267,14 @@ def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -
     assert state.takeoff_rest_v is not None
     begun = charge_from_rest_v(state.takeoff_rest_v)
     counted = max(
-        min(begun, MIN_CHARGE_FOR_COUNTING_FRACTION), begun - state.counted_discharge_fraction
+        min(begun, MIN_CHARGE_FRACTION_TO_COUNT_DISCHARGE), begun - state.counted_discharge_fraction
     )
     spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
     off_v = (
         state.takeoff_rest_v
         - battery_v
         - TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction
-        - TYPICAL_DISCHARGE_RATE_FACTOR * spent_v
+        - TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO * spent_v
     )
     weight, keep = dt_s / VOLTAGE_READING_SIGMA_V**2, math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S)
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
@@ -274,9 +287,9 @@ def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -
     )
 
 
-def full_thrust_discharge_per_s(battery_mah: float, power_train: PowerTrain) -> float:
+def full_thrust_discharge_per_s(battery_capacity_mah: float, power_train: PowerTrain) -> float:
     """Return the share of the full charge that one second of full thrust consumes."""
-    return power_train.full_thrust_current_a / (3.6 * battery_mah)
+    return power_train.full_thrust_current_a / (3.6 * battery_capacity_mah)
 
 
 def _low_pass(value: float, new_value: float, weight: float) -> float:

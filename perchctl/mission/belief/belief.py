@@ -30,15 +30,15 @@ from perchctl.vehicle import Telemetry
 POSITION_SETTLING_AFTER_GAP_S = 0.5
 """Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
 trusted before it has converged."""
-MAX_FUSED_POSITION_EXTRA_AGE_S = 0.13
-"""How much older than the camera's latency the newest position may be while it still corrects the
-estimate, s: three pictures at 30 per second. Larger: `has_uncorrected_gust` reacts to a blow
-later."""
-GUST_SPEED_THRESHOLD_MPS = 0.2
-"""Speed gained without a sighting that counts as a blow or gust, m/s; flights without a fault show
-0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
+MAX_POSITION_AGE_BEYOND_LATENCY_S = 0.13
+"""How much older than the camera's latency the newest external position may be while it still
+corrects the estimated velocity, s: three pictures at 30 per second. Larger: `has_uncorrected_gust`
+reacts to a blow later."""
+MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
+"""Lateral speed that the vehicle gains without a sighting in a blow or gust, m/s; flights without a
+fault show 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
 GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
-"""Increase of the `GUST_SPEED_THRESHOLD_MPS` threshold, in m/s per second of the latency's standard
+"""Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
 deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
 uncertain latency, blows go unnoticed."""
 THRUST_REPORT_DELAY_S = 0.2
@@ -104,21 +104,22 @@ class Belief:
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     #: low-passed `lean_sine_world_xy`, with the time constant `LEAN_TIME_CONSTANT_S`
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
-    last_contact_body_z_m: float | None = None  #: height of the body where the magnet may hold it
+    #: height of the body where the magnet may hold it
+    vehicle_world_z_at_last_contact_m: float | None = None
     last_contact_offset: ContactOffset | None = None  #: offset at the last contact
     #: time since which the gear is within the magnet's reach
     in_magnet_reach_since_s: float | None = None
     #: start time of each true condition
-    since: dict[Condition[Any], float] = field(default_factory=dict)
+    condition_start_times_s: dict[Condition[Any], float] = field(default_factory=dict)
 
     # --- thrust and battery ---
     hover_thrust_estimate: HoverThrust = field(default_factory=HoverThrust)
     #: thrust that the rotors produce, 0..65535; None before a sample
     rotor_thrust: float | None = None
     #: time since which the reported thrust differs from the ordered one
-    thrust_mismatch_since_s: float | None = None
+    thrust_differs_from_order_since_s: float | None = None
     #: last tick in which that difference was older than `THRUST_REPORT_DELAY_S`
-    last_thrust_mismatch_s: float = -math.inf
+    thrust_last_differed_from_order_at_s: float = -math.inf
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
     @classmethod
@@ -135,7 +136,7 @@ class Belief:
 
     def held_s(self, condition: Condition[Belief]) -> float:
         """Seconds for which the condition has been true; -1 while it is false."""
-        began_s = self.since.get(condition)
+        began_s = self.condition_start_times_s.get(condition)
         return -1.0 if began_s is None else self.obs.t_s - began_s
 
     # --- Age of the telemetry ---
@@ -181,14 +182,14 @@ class Belief:
         return self.profile.positioning.source.is_target
 
     @cached_property
-    def velocity_variance_m2ps2(self) -> float:
+    def worst_axis_velocity_variance_m2ps2(self) -> float:
         """Variance of the estimated velocity, (m/s)^2. Infinite if it is missing; 0 if
         `link.unreported` says that the vehicle never reports it, so that no variance limit
         applies."""
         return self._variance_or_default(self.obs.telemetry.velocity_variance_m2ps2)
 
     @cached_property
-    def position_variance_m2(self) -> float:
+    def worst_axis_position_variance_m2(self) -> float:
         """Variance of the estimated position, m^2; with decks, of the height alone, because a Flow
         deck measures no other position. Infinite if unknown, 0 if `link.unreported` says that the
         vehicle does not report it."""
@@ -208,8 +209,8 @@ class Belief:
         """True if the variance of velocity or position is too large for position control."""
         safety = self.profile.safety
         return (
-            self.velocity_variance_m2ps2 > safety.flight_velocity_variance_m2ps2
-            or self.position_variance_m2 > safety.flight_variance_m2
+            self.worst_axis_velocity_variance_m2ps2 > safety.flight_velocity_variance_m2ps2
+            or self.worst_axis_position_variance_m2 > safety.flight_variance_m2
         )
 
     @cached_property
@@ -248,13 +249,13 @@ class Belief:
     @cached_property
     def camera_latency_s(self) -> float:
         """Age of a frame on arrival, s: the camera latency in use."""
-        return self.profile.camera.start_latency_s + self.obs.extra_camera_latency_s
+        return self.profile.camera.start_latency_s + self.obs.camera_latency_above_profile_s
 
     @cached_property
-    def is_position_correcting_velocity(self) -> bool:
+    def is_estimated_velocity_being_corrected(self) -> bool:
         """True while the newest position still corrects the estimated velocity: it is at most
-        `MAX_FUSED_POSITION_EXTRA_AGE_S` older than the latency."""
-        return self.position_age_s <= self.camera_latency_s + MAX_FUSED_POSITION_EXTRA_AGE_S
+        `MAX_POSITION_AGE_BEYOND_LATENCY_S` older than the latency."""
+        return self.position_age_s <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_LATENCY_S
 
     @cached_property
     def has_uncorrected_gust(self) -> bool:
@@ -264,14 +265,14 @@ class Belief:
         if not (
             self.is_positioned_by_target
             and is_reckoned
-            and not self.is_position_correcting_velocity
+            and not self.is_estimated_velocity_being_corrected
         ):
             return False
         least_mps = (
-            GUST_SPEED_THRESHOLD_MPS
+            MIN_SPEED_GAINED_IN_GUST_MPS
             + GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
-        return math.hypot(*self.reckoning.lateral_gain_of_imu_only_mps) > least_mps
+        return math.hypot(*self.reckoning.lateral_velocity_unseen_by_estimate_mps) > least_mps
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
@@ -294,7 +295,7 @@ class Belief:
         )
 
     @cached_property
-    def has_no_position_for_descent(self) -> bool:
+    def has_only_imu_for_descent(self) -> bool:
         """True if only accelerometer and attitude remain for a descent."""
         if self.is_positioned_by_target:
             return not self.can_descend_by_target
@@ -341,7 +342,7 @@ class Belief:
         adds to the estimate is subtracted."""
         vx_mps, vy_mps, vz_mps = self.obs.telemetry.velocity_mps
         if self.is_position_valid:
-            bias_x_mps, bias_y_mps = self.reckoning.velocity_bias_mps
+            bias_x_mps, bias_y_mps = self.reckoning.estimated_velocity_bias_world_xy_mps
             vx_mps, vy_mps = vx_mps - bias_x_mps, vy_mps - bias_y_mps
         return vx_mps, vy_mps, vz_mps
 
@@ -356,7 +357,7 @@ class Belief:
         return cos_yaw * level_x - sin_yaw * level_y, sin_yaw * level_x + cos_yaw * level_y
 
     @cached_property
-    def acceleration_from_lean_mps2(self) -> tuple[float, float]:
+    def lean_acceleration_world_xy_mps2(self) -> tuple[float, float]:
         """Lateral acceleration (x, y), m/s^2, world axes, that follows from the difference between
         the present lean and the mean lean. The mean lean itself causes none: it balances the wind,
         an unbalanced vehicle, or an error of the estimated attitude. Wrong after a change of the
@@ -398,8 +399,8 @@ class Belief:
         """True if the reported thrust can be used: it agrees with the ordered raw thrust if there
         is one, or has differed from it for at most `THRUST_REPORT_DELAY_S`."""
         return (
-            self.thrust_mismatch_since_s is None
-            or self.obs.t_s - self.thrust_mismatch_since_s <= THRUST_REPORT_DELAY_S
+            self.thrust_differs_from_order_since_s is None
+            or self.obs.t_s - self.thrust_differs_from_order_since_s <= THRUST_REPORT_DELAY_S
         )
 
     # --- The target ---
@@ -416,7 +417,7 @@ class Belief:
         """Lateral offset from the gear to the target and velocity, from pictures and lean. None if
         the last pictures are too old or too few, or once they contradict the vehicle's motion: with
         a rotated camera, this velocity would damp nothing."""
-        if self.mounting.is_wrong or self.obs.camera_imu_mismatch is not None:
+        if self.mounting.is_camera_mounting_wrong or self.obs.camera_imu_mismatch is not None:
             return None
         return self.lateral_offset_filter.predict(self.obs.t_s)
 
@@ -432,17 +433,20 @@ class Belief:
         return max(0.0, self.obs.t_s - self.reckoning.last_sighting_at_s)
 
     @cached_property
-    def is_camera_motion_consistent(self) -> bool:
+    def does_camera_motion_match_vehicle(self) -> bool:
         """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
         the target is the positioning system, otherwise with its state estimate."""
         if self.is_positioned_by_target:
             return (
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None
             )
-        return not (self.mounting.is_awaiting_evidence or self.mounting.is_wrong)
+        return not (self.mounting.is_awaiting_evidence or self.mounting.is_camera_mounting_wrong)
 
     @property
     def is_in_magnet_reach(self) -> bool:
         """True if the magnet may hold the vehicle: after a contact, or once dead reckoning places
         the gear within its reach."""
-        return self.last_contact_body_z_m is not None or self.in_magnet_reach_since_s is not None
+        return (
+            self.vehicle_world_z_at_last_contact_m is not None
+            or self.in_magnet_reach_since_s is not None
+        )

@@ -10,9 +10,9 @@ One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_t
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and against
 an unknown object without a position (`SUPPORT_SHOWN_BY_IMU`). The last one also covers too little
-thrust, by the same threshold below hover thrust as the other is above it: `PRESS_THRUST_RATIO`
-moves all of these, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too
-small to support the vehicle (`is_thrust_too_low_to_fly`).
+thrust, by the same threshold below hover thrust as the other is above it:
+`MIN_PRESS_TO_HOVER_THRUST_RATIO` moves all of these, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS`
+and `ON_FLOOR` require a thrust too small to support the vehicle (`is_thrust_too_low_to_fly`).
 
 `find_support` says in one word what these conditions show: the vehicle flies, presses, hangs on the
 magnet, hangs on something else, stands, or it is unknown. How long the evidence has lasted is the
@@ -31,29 +31,29 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
-PRESS_THRUST_RATIO = 1.08
-"""Multiple of hover thrust above which a vehicle at rest is pressing: more than five standard
-deviations of the hover thrust learned in quiet flight. Larger: a weak press goes undetected.
-Smaller: a gust or a sagging battery looks like a press."""
+MIN_PRESS_TO_HOVER_THRUST_RATIO = 1.08
+"""Reported thrust over hover thrust from which a vehicle at rest is pressing: more than five
+standard deviations of the hover thrust learned in quiet flight. Larger: a weak press goes
+undetected. Smaller: a gust or a sagging battery looks like a press."""
 SATURATED_FRACTION_OF_FULL_THRUST = 0.98
 """Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
 much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-PRESSING_FRACTION_OF_RAW_THRUST = 0.99
-"""Share of a raw press's ordered thrust that always counts as pressing. Larger: a reading just
-below the ordered thrust goes undetected. Smaller: a heavy vehicle seems to press while it
-hovers."""
-MAX_HOVER_FRACTION_TO_PROVE_PRESS = 0.93
-"""Hover thrust, as a share of full thrust, above which more thrust is no evidence of a press.
-Smaller: a press is never detected on a heavy vehicle."""
-MAX_NON_LIFTING_HOVER_FRACTION = 0.8
+MIN_PRESS_TO_ORDERED_THRUST_RATIO = 0.99
+"""Reported thrust over the ordered thrust of a raw press from which the vehicle always counts as
+pressing. Larger: a reading just below the ordered thrust goes undetected. Smaller: a heavy vehicle
+seems to press while it hovers."""
+MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS = 0.93
+"""Hover thrust, as a share of full thrust, above which the thrust left for a press is too small to
+prove one. Smaller: a press is never detected on a heavy vehicle."""
+MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
 """Share of hover thrust up to which thrust cannot hold the vehicle in the air; above it, the ground
 effect of the ceiling may."""
 MAX_MOTORS_STOPPED_THRUST = 5000
 """Largest raw thrust, 0..65535, at which the motors stand still."""
-MIN_FLYING_THRUST = 1000
-"""Raw thrust, 0..65535, below which nothing flies."""
+MIN_POSSIBLE_HOVER_THRUST = 1000
+"""Smallest reported thrust, 0..65535, that may be hover thrust; any vehicle's is far larger."""
 
 # --- motion and position ---
 MAX_MOTIONLESS_CLIMB_MPS = 0.05
@@ -68,7 +68,7 @@ MAX_HOVER_DEVIATION_FROM_1G_G = 0.1
 MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
-MIN_SETPOINT_ABOVE_TO_PRESS_M = 0.08
+MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
 """Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
 climb is detected late."""
 TOUCH_OFFSET_SIGMA_M = 0.001
@@ -83,21 +83,24 @@ MIN_DESCENT_BEFORE_FLOOR_M = 0.1
 """Distance below its start at which a descent counts as under way, m."""
 MAX_DESCENT_WHILE_HELD_M = 0.1
 """Distance from its start within which a vehicle in a descent may still be held there, m."""
-MAX_FLOOR_SUPPORT_HEIGHT_M = 0.3
-"""Height above which the floor cannot be the support, m."""
+MAX_HEIGHT_STANDING_ON_FLOOR_M = 0.3
+"""Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
+hanging, m; allows for the drift of the height in flight. (`MAX_STANDING_HEIGHT_M` applies to a
+vehicle that has not drifted yet.)"""
 MIN_BLOCKED_HEIGHT_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
 MAX_STANDING_HEIGHT_M = 0.1
 """Height below which a vehicle may still stand on the ground instead of pressing, m."""
-MAX_HANGING_ERROR_Z_M = 0.15
-"""Largest height difference to the target at which the vehicle may hang on its magnet, m."""
-MIN_ON_FLOOR_ERROR_Z_M = 0.3
-"""Least height difference to the target of a vehicle that stands on the floor, m."""
-RELEASED_FALL_MPS = -0.05
-"""Vertical speed below which a released vehicle with a low specific force is falling, m/s."""
-FALLING_AT_FULL_THRUST_MPS = -0.15
-"""Vertical speed below which a vehicle at full thrust is falling instead of being too weak to
-climb, m/s."""
+MAX_HANGING_GEAR_TO_TARGET_Z_M = 0.15
+"""Largest height difference between gear and target, m, at which the vehicle may hang on its
+magnet."""
+MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
+"""Least height difference between gear and target, m, of a vehicle that stands on the floor."""
+MAX_CLIMB_IN_FALL_AFTER_RELEASE_MPS = -0.05
+"""Climb rate below which a released vehicle with a low specific force is falling, m/s."""
+MIN_CLIMB_AT_SATURATED_THRUST_MPS = -0.15
+"""Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
+falls."""
 
 # --- time ---
 MOTORS_OFF_AFTER_STOP_ORDER_S = 5.0
@@ -163,7 +166,7 @@ def contact_height_tolerance_m(b: Belief) -> float:
 
 def is_at_contact_height(b: Belief) -> bool:
     """True if the gear is at the target's height, within `contact_height_tolerance_m`."""
-    return abs(b.target.error_z_m) <= contact_height_tolerance_m(b)
+    return abs(b.target.gear_to_target_z_m) <= contact_height_tolerance_m(b)
 
 
 def is_at_target(b: Belief) -> bool:
@@ -188,13 +191,15 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
     vz = tel.velocity_mps[2]
     stuck = (
         setpoint is not None
-        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_ABOVE_TO_PRESS_M
+        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M
         and vz < MAX_MOTIONLESS_CLIMB_MPS
     )
     return (
         b.is_telemetry_fresh
         and b.is_position_valid
-        and MIN_FLYING_THRUST <= tel.thrust < SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
+        and MIN_POSSIBLE_HOVER_THRUST
+        <= tel.thrust
+        < SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
         and b.speed_mps < MAX_HOVER_SPEED_MPS
         and abs(vz) < MAX_HOVER_CLIMB_MPS
         and abs(tel.acc_z_g - 1.0) < MAX_HOVER_DEVIATION_FROM_1G_G
@@ -209,7 +214,7 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
     is larger and still too small to lift the vehicle, since position mode does not order less.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
-    if MAX_NON_LIFTING_HOVER_FRACTION * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
+    if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
         most = max(most, MIN_POSITION_MODE_THRUST)
     return b.is_thrust_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
@@ -220,8 +225,10 @@ def is_above_hover_thrust(b: Belief) -> bool:
     full thrust."""
     most = SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
-        most = PRESSING_FRACTION_OF_RAW_THRUST * max_press_thrust(b.profile)
-    least = min(PRESS_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
+        most = MIN_PRESS_TO_ORDERED_THRUST_RATIO * max_press_thrust(b.profile)
+    least = (
+        min(MIN_PRESS_TO_HOVER_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
+    )
     return b.telemetry.thrust >= least
 
 
@@ -240,9 +247,9 @@ def is_pressing(b: Belief) -> bool:
 def is_slipping(b: Belief) -> bool:
     """True if the vehicle falls away from the proven contact, by position or by acceleration."""
     complete, tel = b.profile.planner.complete, b.telemetry
-    if b.last_contact_body_z_m is None or not b.is_sinking(complete.slip_mps):
+    if b.vehicle_world_z_at_last_contact_m is None or not b.is_sinking(complete.slip_mps):
         return False
-    above_m = tel.position_m[2] - b.last_contact_body_z_m
+    above_m = tel.position_m[2] - b.vehicle_world_z_at_last_contact_m
     return (
         not b.is_position_valid
         or above_m < MAX_UPWARD_DRIFT_DURING_SLIP_M
@@ -250,7 +257,7 @@ def is_slipping(b: Belief) -> bool:
     )
 
 
-def is_still(b: Belief) -> bool:
+def is_motionless(b: Belief) -> bool:
     """True if the vehicle is motionless and supported: the accelerometer reads 1 g."""
     return b.is_reading_one_g and (
         abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_MPS or not b.is_position_valid
@@ -267,7 +274,7 @@ def _is_in_contact(b: Belief) -> bool:
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS and b.is_position_valid
     motionless_s = b.obs.t_s - b.imu.climb_steady_since_s
     return (
-        abs(b.target.error_z_m)
+        abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
         + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_positioned_by_target else 0)
         and (steady or motionless_s >= perch.contact_dwell_s)
@@ -280,7 +287,9 @@ def _is_in_contact(b: Belief) -> bool:
 
 def _is_magnet_holding(b: Belief) -> bool:
     return (
-        is_thrust_too_low_to_fly(b) and not is_slipping(b) and (b.is_position_valid or is_still(b))
+        is_thrust_too_low_to_fly(b)
+        and not is_slipping(b)
+        and (b.is_position_valid or is_motionless(b))
     )
 
 
@@ -289,7 +298,7 @@ def _is_weight_hanging(b: Belief) -> bool:
     return (
         b.sent.release_began_s is not None
         and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
-        and is_still(b)
+        and is_motionless(b)
         and not is_slipping(b)
     )
 
@@ -300,15 +309,22 @@ def _is_hanging(b: Belief) -> bool:
     slow release is safe for both."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.is_position_valid:
-        return is_thrust_too_low_to_fly(b) and is_still(b)
-    held = is_thrust_too_low_to_fly(b) and b.height_m > MAX_FLOOR_SUPPORT_HEIGHT_M and is_still(b)
+        return is_thrust_too_low_to_fly(b) and is_motionless(b)
+    held = (
+        is_thrust_too_low_to_fly(b)
+        and b.height_m > MAX_HEIGHT_STANDING_ON_FLOOR_M
+        and is_motionless(b)
+    )
     if not b.sent.maneuver.descends:
         return held
     at_contact = (
-        b.last_contact_body_z_m is not None
-        and abs(tel.position_m[2] - b.last_contact_body_z_m) <= complete.slip_m
+        b.vehicle_world_z_at_last_contact_m is not None
+        and abs(tel.position_m[2] - b.vehicle_world_z_at_last_contact_m) <= complete.slip_m
     )
-    at_target = b.obs.target is not None and abs(b.target.error_z_m) <= MAX_HANGING_ERROR_Z_M
+    at_target = (
+        b.obs.target is not None
+        and abs(b.target.gear_to_target_z_m) <= MAX_HANGING_GEAR_TO_TARGET_Z_M
+    )
     stayed = (
         b.sent.maneuver_start_m[2] - tel.position_m[2] < MAX_DESCENT_WHILE_HELD_M
         and not b.target.is_far_above
@@ -319,10 +335,10 @@ def _is_hanging(b: Belief) -> bool:
 def _are_motors_off(b: Belief) -> bool:
     """True if the thrust is zero and the supervisor reports that the vehicle does not fly, or has
     had `MOTORS_OFF_AFTER_STOP_ORDER_S` to do so."""
-    motor_stop_ordered_s = b.sent.motor_stop_ordered_s
+    motor_stop_ordered_at_s = b.sent.motor_stop_ordered_at_s
     long_off = (
-        motor_stop_ordered_s is not None
-        and b.obs.t_s - motor_stop_ordered_s > MOTORS_OFF_AFTER_STOP_ORDER_S
+        motor_stop_ordered_at_s is not None
+        and b.obs.t_s - motor_stop_ordered_at_s > MOTORS_OFF_AFTER_STOP_ORDER_S
     )
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
@@ -335,32 +351,35 @@ def _have_motors_stopped(b: Belief) -> bool:
     return _are_motors_off(b) and not _is_raw_thrust_ordered(b)
 
 
-def _are_motors_off_despite_order(b: Belief) -> bool:
+def _are_motors_off_despite_thrust_order(b: Belief) -> bool:
     return _are_motors_off(b) and _is_raw_thrust_ordered(b)
 
 
 def _is_on_floor(b: Belief) -> bool:
     """True if the vehicle is motionless at a thrust too small to support it, and is low or has come
     down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
-    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= MIN_ON_FLOOR_ERROR_Z_M
+    near_target = (
+        b.obs.target is not None
+        and abs(b.target.gear_to_target_z_m) <= MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M
+    )
     came_down_m = b.sent.maneuver_start_m[2] - b.telemetry.position_m[2]
     came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_BEFORE_FLOOR_M
     handover_m = b.profile.planner.landing.handover_m
-    low = b.height_m < handover_m or (came_down and b.last_contact_body_z_m is None)
-    return is_thrust_too_low_to_fly(b) and low and not near_target and is_still(b)
+    low = b.height_m < handover_m or (came_down and b.vehicle_world_z_at_last_contact_m is None)
+    return is_thrust_too_low_to_fly(b) and low and not near_target and is_motionless(b)
 
 
 def _is_blocked(b: Belief) -> bool:
     """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
     hover thrust or is at its limit, and nothing moves."""
     setpoint, tel = b.sent.setpoint, b.telemetry
-    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_ABOVE_TO_PRESS_M:
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M:
         return False
     strong = (
-        b.hover_thrust < MAX_HOVER_FRACTION_TO_PROVE_PRESS * FULL_THRUST
+        b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS * FULL_THRUST
         and is_above_hover_thrust(b)
     )
-    return strong and b.height_m > MIN_BLOCKED_HEIGHT_M and is_still(b)
+    return strong and b.height_m > MIN_BLOCKED_HEIGHT_M and is_motionless(b)
 
 
 def _shows_support_by_imu(b: Belief) -> bool:
@@ -368,9 +387,12 @@ def _shows_support_by_imu(b: Belief) -> bool:
     in the air, thrust this far above or below hover thrust would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
-        0 < hover < MAX_HOVER_FRACTION_TO_PROVE_PRESS * FULL_THRUST
+        0 < hover < MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS * FULL_THRUST
         and b.is_thrust_known
-        and (is_above_hover_thrust(b) or tel.thrust <= (2.0 - PRESS_THRUST_RATIO) * hover)
+        and (
+            is_above_hover_thrust(b)
+            or tel.thrust <= (2.0 - MIN_PRESS_TO_HOVER_THRUST_RATIO) * hover
+        )
         and b.is_reading_one_g
         and b.obs.t_s - b.imu.climb_steady_since_s >= perch.contact_dwell_s
     )
@@ -378,7 +400,7 @@ def _shows_support_by_imu(b: Belief) -> bool:
 
 def _is_thrust_saturated(b: Belief) -> bool:
     full = b.telemetry.thrust >= SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
-    return full and FALLING_AT_FULL_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
+    return full and MIN_CLIMB_AT_SATURATED_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
 
 
 CONTACT = Condition("contact", _is_in_contact, depends_on=RequiredData.POSITION)
@@ -397,8 +419,10 @@ MOTORS_STOPPED = Condition(
     "motors stopped", _have_motors_stopped, depends_on=RequiredData.TELEMETRY
 )
 """The motors are off, and the last order does not let them turn."""
-MOTORS_OFF_DESPITE_ORDER = Condition(
-    "motors off despite an order", _are_motors_off_despite_order, depends_on=RequiredData.TELEMETRY
+MOTORS_OFF_DESPITE_THRUST_ORDER = Condition(
+    "motors off despite an order",
+    _are_motors_off_despite_thrust_order,
+    depends_on=RequiredData.TELEMETRY,
 )
 """The motors are off although the last order was raw thrust: the supervisor has ended the flight.
 It soon lets them turn by that order again (docs/firmware.md, "Supervisor")."""
@@ -427,7 +451,7 @@ SUPPORT_CONDITIONS = (
     FULL_WEIGHT_HANGS,
     HANGING,
     MOTORS_STOPPED,
-    MOTORS_OFF_DESPITE_ORDER,
+    MOTORS_OFF_DESPITE_THRUST_ORDER,
     ON_FLOOR,
     CLIMB_BLOCKED,
     SUPPORT_SHOWN_BY_IMU,
@@ -440,7 +464,7 @@ class Support(Enum):
     """What supports the vehicle."""
 
     AIR = "nothing: it flies"
-    PRESSED = "the target or an obstacle, against which it presses"
+    PRESSED_SURFACE = "the target or an obstacle, against which it presses"
     MAGNET = "the target's magnet"
     HELD_BY_OTHER = "something away from the target, on which it hangs or stands"
     FLOOR = "the floor"
@@ -456,12 +480,12 @@ def find_support(b: Belief) -> Support:
     two. The support is also UNKNOWN while thrust or position is unknown, while the vehicle
     accelerates, and in the first tick of a maneuver.
     """
-    if HANGING in b.since:
+    if HANGING in b.condition_start_times_s:
         return _find_what_vehicle_hangs_on(b)
-    if ON_FLOOR in b.since:
+    if ON_FLOOR in b.condition_start_times_s:
         return Support.FLOOR
-    if CONTACT in b.since or CLIMB_BLOCKED in b.since:
-        return Support.PRESSED
+    if CONTACT in b.condition_start_times_s or CLIMB_BLOCKED in b.condition_start_times_s:
+        return Support.PRESSED_SURFACE
     flies = (
         is_flying_at_hover_thrust(b)
         and not is_thrust_too_low_to_fly(b)
@@ -507,6 +531,6 @@ def has_slipped(b: Belief) -> bool:
     fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = b.sent.release_began_s is not None and tel.acc_z_g < complete.slip_acc_g
-    if falls and b.is_imu_fresh and b.climb_mps < RELEASED_FALL_MPS:
+    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_IN_FALL_AFTER_RELEASE_MPS:
         return True
     return b.held_s(SLIPPING) >= complete.slip_dwell_s

@@ -57,6 +57,10 @@ def update_start_times(
     return {each: old.get(each, now_s) for each in conditions if each.holds(knowledge)}
 
 
-def keep_persistent_start_times(since: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
+def keep_persistent_start_times(condition_start_times_s: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the entries that survive a change of phase or a hold."""
-    return {each: began_s for each, began_s in since.items() if each.persists_across_phases}
+    return {
+        each: began_s
+        for each, began_s in condition_start_times_s.items()
+        if each.persists_across_phases
+    }

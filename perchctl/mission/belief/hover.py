@@ -20,7 +20,7 @@ from perchctl.mission.belief.thrust import (
 )
 from perchctl.values import replace
 
-DESCENT_HOVER_DRIFT_PER_SQRT_S = 0.067
+HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S = 0.067
 """Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
 second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
 longer."""
@@ -43,17 +43,18 @@ ROTOR_LAG_S = 0.06
 real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
 MAX_TELEMETRY_AGE_S = 1.0
 """Age beyond which telemetry says nothing about the present thrust, s."""
-MIN_SPECIFIC_FORCE_G = 0.7
+MIN_SPECIFIC_FORCE_FOR_LEARNING_G = 0.7
 """Smallest specific force at which thrust divided by specific force measures hover thrust, g.
 Smaller: a fall corrupts the estimate."""
-MAX_SPECIFIC_FORCE_G = 1.3
+MAX_SPECIFIC_FORCE_FOR_LEARNING_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: a blow corrupts the estimate."""
-MIN_PROPORTIONAL_THRUST_FRACTION = 0.5
-"""Share of the first hover thrust below which thrust is not proportional to force."""
-MIN_CLAMPED_SPECIFIC_FORCE_G = 0.75
+MIN_THRUST_TO_HOVER_RATIO_FOR_LEARNING = 0.5
+"""Share of the hover thrust at the start of the descent below which thrust is not proportional to
+force, so that nothing is learned from it."""
+SPECIFIC_FORCE_CLAMP_MIN_G = 0.75
 """Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
-MAX_CLAMPED_SPECIFIC_FORCE_G = 1.5
+SPECIFIC_FORCE_CLAMP_MAX_G = 1.5
 """Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
 it."""
 
@@ -65,7 +66,7 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry
-    divisor_g = min(MAX_CLAMPED_SPECIFIC_FORCE_G, max(MIN_CLAMPED_SPECIFIC_FORCE_G, tel.acc_z_g))
+    divisor_g = min(SPECIFIC_FORCE_CLAMP_MAX_G, max(SPECIFIC_FORCE_CLAMP_MIN_G, tel.acc_z_g))
     sample = max(MIN_POSITION_MODE_THRUST, tel.thrust / divisor_g)
     return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA)
 
@@ -97,19 +98,19 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     proportional to force."""
     tel, old = b.telemetry, estimate_hover_thrust(b)
     thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
-    first, sigma = old.thrust_sigma_before_descent or (
-        old.thrust,
-        max(MIN_HOVER_THRUST_SIGMA_IN_DESCENT, old.sigma),
+    start = old.estimate_before_descent or HoverThrust(
+        old.thrust, max(MIN_HOVER_THRUST_SIGMA_IN_DESCENT, old.sigma)
     )
-    old = replace(old, thrust_sigma_before_descent=(first, sigma))
+    first, sigma = start.thrust, start.sigma
+    old = replace(old, estimate_before_descent=start)
     shows = (
-        MIN_SPECIFIC_FORCE_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_G
-        and thrust >= MIN_PROPORTIONAL_THRUST_FRACTION * first
+        MIN_SPECIFIC_FORCE_FOR_LEARNING_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_FOR_LEARNING_G
+        and thrust >= MIN_THRUST_TO_HOVER_RATIO_FOR_LEARNING * first
     )
-    is_on_floor = b.sent.floor_detected_s is not None
+    is_on_floor = b.sent.floor_detected_at_s is not None
     if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or is_on_floor:
         return old
-    new = old.propagate(dt_s, DESCENT_HOVER_DRIFT_PER_SQRT_S).with_measurement(
+    new = old.propagate(dt_s, HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S).with_measurement(
         thrust / tel.acc_z_g, dt_s
     )
     most = MAX_DESCENT_CORRECTION_SIGMAS * sigma

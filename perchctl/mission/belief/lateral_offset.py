@@ -26,9 +26,9 @@ LateralVector = tuple[float, float]
 
 ACCELERATION_NOISE_MPS2 = 0.15
 """Standard deviation of the acceleration that the lean does not explain, m/s^2, which lasts for
-`ACCELERATION_NOISE_S`. Larger: the velocity follows the noise of single pictures. Smaller: after a
-gust, the offset lags behind."""
-ACCELERATION_NOISE_S = 0.1
+`ACCELERATION_NOISE_DURATION_S`. Larger: the velocity follows the noise of single pictures. Smaller:
+after a gust, the offset lags behind."""
+ACCELERATION_NOISE_DURATION_S = 0.1
 """Duration of such an acceleration, s."""
 MIN_PICTURE_SIGMA_M = 0.0005
 """Smallest standard deviation of a picture's offset, m: attitude and exposure time are not exact,
@@ -40,16 +40,17 @@ ESTIMATED_VELOCITY_SIGMA_MPS = 0.04
 error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an acceleration that the
 lean does not explain is noticed a picture later. Smaller: the error of the estimate moves the
 vehicle."""
-MAX_GAP_S = 0.5
+MAX_PICTURE_GAP_S = 0.5
 """Longest time from picture to picture, and from the newest picture to a prediction, s. Larger: a
 gust moves the vehicle unnoticed. Smaller: the last centimetres are flown by the state estimate."""
 RESTART_NIS = 20.0
 """Normalized innovation squared, two degrees of freedom, with which a picture restarts the filter:
 exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
 wrong."""
-MAX_VELOCITY_SIGMA_MPS = 0.03
-"""Largest standard deviation of a velocity that is used, m/s. Larger: the vehicle is steered by the
-first pictures' noise."""
+MAX_SIGMA_OF_USED_VELOCITY_MPS = 0.03
+"""Largest standard deviation of the filter's velocity at which its offset and velocity are used,
+m/s; an uncertain velocity is unknown to `predict`. Larger: the vehicle is steered by the first
+pictures' noise."""
 
 
 @dataclass(frozen=True)
@@ -71,19 +72,32 @@ class MotionSample(NamedTuple):
     velocity_mps: LateralVector
 
 
+class OffsetVelocityCovariance(NamedTuple):
+    """Covariance of lateral offset and lateral velocity along one axis; that along x and that along
+    y are equal."""
+
+    offset_m2: float = 0.0  # variance of the offset
+    offset_velocity_m2ps: float = 0.0  # covariance of offset and velocity
+    velocity_m2ps2: float = 0.0  # variance of the velocity
+
+
+UNKNOWN_COVARIANCE = OffsetVelocityCovariance()
+"""Covariance before the first picture; not used."""
+
+
 @dataclass(frozen=True)
 class LateralOffsetFilter:
-    """The filter at the exposure of the newest picture, `t_s`; -inf before the first one.
+    """Kalman filter of the lateral offset from gear to target and of the vehicle's lateral
+    velocity, world axes (x, y): pictures measure the offset, and the lean gives the acceleration.
 
-    `covariance` holds the variance of the offset, its covariance with the velocity, and the
-    variance of the velocity, of either axis (m^2, m^2/s, m^2/s^2). `samples` holds the telemetry
-    since then, and some from before.
+    The state is that at `t_s`, the exposure of the newest picture; -inf before the first one.
+    `samples` holds the telemetry since then, and some from before.
     """
 
     t_s: float = -math.inf
     offset_m: LateralVector = (0.0, 0.0)
     velocity_mps: LateralVector = (0.0, 0.0)
-    covariance: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    covariance: OffsetVelocityCovariance = UNKNOWN_COVARIANCE
     samples: tuple[MotionSample, ...] = ()
 
     def with_sample(self, sample: MotionSample) -> LateralOffsetFilter:
@@ -93,7 +107,7 @@ class LateralOffsetFilter:
         if kept and sample.t_s <= kept[-1].t_s:
             return self
         first = 0
-        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_GAP_S:
+        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_PICTURE_GAP_S:
             first += 1
         return replace(self, samples=(*kept[first:], sample))
 
@@ -104,7 +118,7 @@ class LateralOffsetFilter:
         if t_s <= self.t_s:
             return self
         variance_m2 = max(sigma_m, MIN_PICTURE_SIGMA_M) ** 2
-        if t_s - self.t_s > MAX_GAP_S:
+        if t_s - self.t_s > MAX_PICTURE_GAP_S:
             return self._restart(t_s, offset_m, variance_m2)
         predicted = self._predict(t_s)
         p_ee, p_ev, p_vv = predicted.covariance
@@ -120,15 +134,18 @@ class LateralOffsetFilter:
             predicted,
             offset_m=_add(predicted.offset_m, gain_e, innovation_m),
             velocity_mps=_add(predicted.velocity_mps, gain_v, innovation_m),
-            covariance=((1.0 - gain_e) * p_ee, (1.0 - gain_e) * p_ev, p_vv - gain_v * p_ev),
+            covariance=OffsetVelocityCovariance(
+                (1.0 - gain_e) * p_ee, (1.0 - gain_e) * p_ev, p_vv - gain_v * p_ev
+            ),
         )
 
     def predict(self, t_s: float) -> LateralOffset | None:
-        """Return the estimate at `t_s`; None if the newest picture is older than `MAX_GAP_S`, or
-        while the velocity is less certain than `MAX_VELOCITY_SIGMA_MPS`."""
-        if not 0.0 <= t_s - self.t_s <= MAX_GAP_S:
+        """Return the estimate at `t_s`; None if the newest picture is older than
+        `MAX_PICTURE_GAP_S`, or while the velocity is less certain than
+        `MAX_SIGMA_OF_USED_VELOCITY_MPS`."""
+        if not 0.0 <= t_s - self.t_s <= MAX_PICTURE_GAP_S:
             return None
-        if math.sqrt(self.covariance[2]) > MAX_VELOCITY_SIGMA_MPS:
+        if math.sqrt(self.covariance.velocity_m2ps2) > MAX_SIGMA_OF_USED_VELOCITY_MPS:
             return None
         predicted = self._predict(t_s)
         p_ee, _, p_vv = predicted.covariance
@@ -144,7 +161,7 @@ class LateralOffsetFilter:
             t_s=t_s,
             offset_m=offset_m,
             velocity_mps=(0.0, 0.0),
-            covariance=(variance_m2, 0.0, START_VELOCITY_SIGMA_MPS**2),
+            covariance=OffsetVelocityCovariance(variance_m2, 0.0, START_VELOCITY_SIGMA_MPS**2),
         )
 
     def _predict(self, t_s: float) -> LateralOffsetFilter:
@@ -169,7 +186,7 @@ class LateralOffsetFilter:
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
         """Return the filter at `t_s` after a constant acceleration."""
         dt_s = t_s - self.t_s
-        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_S
+        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_DURATION_S
         p_ee, p_ev, p_vv = self.covariance
         moved_m = _add(self.offset_m, -dt_s, self.velocity_mps)
         return replace(
@@ -177,7 +194,7 @@ class LateralOffsetFilter:
             t_s=t_s,
             offset_m=_add(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
             velocity_mps=_add(self.velocity_mps, dt_s, acceleration_mps2),
-            covariance=(
+            covariance=OffsetVelocityCovariance(
                 p_ee - 2.0 * dt_s * p_ev + dt_s**2 * p_vv + density * dt_s**3 / 3.0,
                 p_ev - dt_s * p_vv - density * dt_s**2 / 2.0,
                 p_vv + density * dt_s,
@@ -194,7 +211,9 @@ class LateralOffsetFilter:
             self,
             offset_m=_add(self.offset_m, gain_e, innovation_mps),
             velocity_mps=_add(self.velocity_mps, gain_v, innovation_mps),
-            covariance=(p_ee - gain_e * p_ev, (1.0 - gain_v) * p_ev, (1.0 - gain_v) * p_vv),
+            covariance=OffsetVelocityCovariance(
+                p_ee - gain_e * p_ev, (1.0 - gain_v) * p_ev, (1.0 - gain_v) * p_vv
+            ),
         )
 
 

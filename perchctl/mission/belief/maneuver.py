@@ -60,9 +60,9 @@ class SentOrders:
     setpoint: PositionSetpoint | None = None
     raw_thrust: int | None = None  # last order; None in position mode
     release_began_s: float | None = None  # start of the release by raw thrust
-    motor_stop_ordered_s: float | None = None  # first order to stop the motors
+    motor_stop_ordered_at_s: float | None = None  # first order to stop the motors
     # time at which a descent by raw thrust detected the floor
-    floor_detected_s: float | None = None
+    floor_detected_at_s: float | None = None
 
     @property
     def is_level_descent(self) -> bool:
@@ -72,7 +72,7 @@ class SentOrders:
     @property
     def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.release_began_s is None and self.motor_stop_ordered_s is None
+        return self.release_began_s is None and self.motor_stop_ordered_at_s is None
 
     def with_frame_shift(
         self, shifted_setpoint: PositionSetpoint | None, by_m: Vector

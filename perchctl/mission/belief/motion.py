@@ -46,20 +46,20 @@ Larger: a short fall goes undetected."""
 MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
 """Largest distance across a silence that the speed before it does not explain, m. Larger: a short
 fall goes undetected."""
-FALL_ACROSS_TELEMETRY_GAP_MPS = -0.3
-"""Vertical speed that a hanging vehicle never reaches, m/s; a fall reaches it after 5 cm. Closer to
-0: noise counts as a fall."""
+MAX_CLIMB_IN_FALL_ACROSS_GAP_MPS = -0.3
+"""Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging one
+never reaches it, a fall reaches it after 5 cm. Closer to 0: noise counts as a fall."""
 MAX_FROZEN_READING_S = 0.2
 """Time of identical readings that counts as a silence, s. Smaller: coarse readings freeze by
 chance."""
-FREE_FALL_G = 0.6
+MAX_FREE_FALL_READING_G = 0.6
 """Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
 fall."""
-FREE_FALL_S = 0.1
-"""Time for which a falling vehicle reads less than `FREE_FALL_G`, s; a rebound is shorter. Larger:
-a fall is detected 5 cm later."""
-FALL_SINK_MPS = -0.25
-"""Downward speed, gained within `SINK_TIME_CONSTANT_S`, at which the vehicle falls whatever the
+MIN_FREE_FALL_DURATION_S = 0.1
+"""Time for which a falling vehicle reads less than `MAX_FREE_FALL_READING_G`, s; a rebound is
+shorter. Larger: a fall is detected 5 cm later."""
+MAX_CLIMB_GAINED_IN_FALL_MPS = -0.25
+"""Climb rate gained within `SINK_TIME_CONSTANT_S` below which the vehicle falls whatever the
 accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
 MAX_RISE_BEFORE_FALL_MPS = 0.5
 """Largest upward speed, gained within `SINK_TIME_CONSTANT_S`, that a vehicle must lose before it
@@ -68,13 +68,13 @@ counts as a fall."""
 SINK_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
-VERTICAL_OFFSET_TIME_CONSTANT_S = 3.0
-"""Time constant with which the vertical offset is learned, s. Smaller: a slow fall is learned as an
-offset."""
-CEILING_IMPACT_G = -0.3
-"""Vertical acceleration beyond which a downward reading is an impact on the ceiling and not a fall,
-g. Closer to 0: the first samples of a fall are cut off."""
-FLOOR_IMPACT_MPS = 0.22
+UP_ACCELERATION_OFFSET_TIME_CONSTANT_S = 3.0
+"""Time constant with which the offset of the vertical acceleration is learned, s. Smaller: a slow
+fall is learned as an offset."""
+MAX_UP_ACCELERATION_CEILING_IMPACT_G = -0.3
+"""Acceleration along the world's upward axis below which a reading is an impact on the ceiling and
+not a fall, g. Closer to 0: the first samples of a fall are cut off."""
+MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
 """Upward speed gained within `FLOOR_IMPACT_TIME_CONSTANT_S` that only the floor can cause, m/s.
 Smaller: an increase of thrust counts as the floor."""
 FLOOR_IMPACT_TIME_CONSTANT_S = 0.1
@@ -94,7 +94,7 @@ MAX_STEADY_LATERAL_DEVIATION_MPS = 0.15
 `MAX_STEADY_CLIMB_DEVIATION_MPS` because the wind shakes the vehicle."""
 LATERAL_VELOCITY_TIME_CONSTANT_S = 0.15
 """Time constant of the mean lateral velocity, s."""
-REST_OFFSET_TIME_CONSTANT_S = 0.5
+ACCELEROMETER_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
 of the floor is learned."""
 MIN_PUSH_G = 0.06
@@ -208,18 +208,19 @@ class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
     Let a be the vertical acceleration minus its slowly learned offset, positive up, without
-    decelerations harder than `CEILING_IMPACT_G`. The climb rate v gained recently is
+    decelerations harder than `MAX_UP_ACCELERATION_CEILING_IMPACT_G`. The climb rate v gained
+    recently is
 
         v' = min(MAX_RISE_BEFORE_FALL_MPS, v + a dt - v dt / SINK_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
-    `FALL_SINK_MPS` (a negative limit), or if the accelerometer has read less than `FREE_FALL_G` for
-    `FREE_FALL_S`, longer than a rebound lasts. A slow sink goes undetected because it is learned as
-    an offset.
+    `MAX_CLIMB_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less than
+    `MAX_FREE_FALL_READING_G` for `MIN_FREE_FALL_DURATION_S`, longer than a rebound lasts. A slow
+    sink goes undetected because it is learned as an offset.
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
-    # time since which the accelerometer has read less than `FREE_FALL_G`
+    # time since which the accelerometer has read less than `MAX_FREE_FALL_READING_G`
     low_g_since_s: float = math.inf
     sink_mps: float = 0.0
     vertical_offset_mps2: float = 0.0
@@ -228,14 +229,17 @@ class FallDetector:
         """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `acc_z_g` is the
         specific force along the body's z axis at the end of that time."""
         offset = self.vertical_offset_mps2 + (
-            max(CEILING_IMPACT_G * GRAVITY_MPS2, min(-CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2))
+            max(
+                MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2,
+                min(-MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2),
+            )
             - self.vertical_offset_mps2
-        ) * min(1.0, dt_s / VERTICAL_OFFSET_TIME_CONSTANT_S)
-        corrected_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
+        ) * min(1.0, dt_s / UP_ACCELERATION_OFFSET_TIME_CONSTANT_S)
+        corrected_mps2 = max(up_mps2, MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2) - offset
         sink = self.sink_mps + corrected_mps2 * dt_s
         sink = min(MAX_RISE_BEFORE_FALL_MPS, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
-        light = min(self.low_g_since_s, t_s) if acc_z_g < FREE_FALL_G else math.inf
-        fell = sink < FALL_SINK_MPS or t_s - light >= FREE_FALL_S
+        light = min(self.low_g_since_s, t_s) if acc_z_g < MAX_FREE_FALL_READING_G else math.inf
+        fell = sink < MAX_CLIMB_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
         return replace(
             self,
             last_fall_at_s=t_s if fell else self.last_fall_at_s,
@@ -255,49 +259,52 @@ class ImpactDetector:
     recent_samples: tuple[Impact, ...] = ()  # states just before a blow that begins now
     newest_impact: Impact = Impact()  # newest blow from below
 
-    def update_impact(self, current: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `current` holds
-        time, speeds and specific force of the new sample, and `z_m` is its estimated height."""
+    def update_impact(self, newest_sample: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
+        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `newest_sample`
+        holds time, speeds and specific force of the new sample, and `z_m` is its estimated
+        height."""
         speed_gained_in_impact_mps = max(
             0.0,
             self.speed_gained_in_impact_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S)
             + up_mps2 * dt_s,
         )
         recent = (
-            m for m in self.recent_samples if current.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S
+            m
+            for m in self.recent_samples
+            if newest_sample.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S
         )
-        recent_samples = (*recent, current)
+        recent_samples = (*recent, newest_sample)
         return replace(
             self,
             speed_gained_in_impact_mps=speed_gained_in_impact_mps,
-            last_impact_at_s=current.t_s
-            if speed_gained_in_impact_mps > FLOOR_IMPACT_MPS
+            last_impact_at_s=newest_sample.t_s
+            if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS
             else self.last_impact_at_s,
             recent_samples=recent_samples,
             newest_impact=_newest_impact(
-                self.newest_impact, current, z_m, recent_samples, speed_gained_in_impact_mps
+                self.newest_impact, newest_sample, z_m, recent_samples, speed_gained_in_impact_mps
             ),
         )
 
 
 def _newest_impact(
     old: Impact,
-    current: Impact,
+    newest_sample: Impact,
     z_m: float,
     recent_samples: tuple[Impact, ...],
     speed_gained_in_impact_mps: float,
 ) -> Impact:
     """Return the newest impact after one more sample.
 
-    An impact begins when the upward speed gained in it exceeds `FLOOR_IMPACT_MPS`. The speeds
-    before it are the lowest of `recent_samples`, since the onboard estimate often includes the
-    whole impact before it is detected. A bounce only adds a lower speed or a harder peak to the old
-    impact.
+    An impact begins when the upward speed gained in it exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`.
+    The speeds before it are the lowest of `recent_samples`, since the onboard estimate often
+    includes the whole impact before it is detected. A bounce only adds a lower speed or a harder
+    peak to the old impact.
     """
-    follows = current.t_s - old.t_s <= BOUNCE_WINDOW_S
-    if speed_gained_in_impact_mps > FLOOR_IMPACT_MPS:
+    follows = newest_sample.t_s - old.t_s <= BOUNCE_WINDOW_S
+    if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
         begun = Impact(
-            current.t_s,
+            newest_sample.t_s,
             min(moment.estimated_climb_before_mps for moment in recent_samples),
             min(moment.imu_climb_before_mps for moment in recent_samples),
             max(moment.peak_g for moment in recent_samples),
@@ -313,7 +320,7 @@ def _newest_impact(
             ),
             imu_climb_before_mps=min(old.imu_climb_before_mps, begun.imu_climb_before_mps),
         )
-    return replace(old, peak_g=max(old.peak_g, current.peak_g)) if follows else old
+    return replace(old, peak_g=max(old.peak_g, newest_sample.peak_g)) if follows else old
 
 
 @dataclass(frozen=True)
@@ -387,14 +394,15 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
     t_s: float = -math.inf  # time of the newest sample
     velocity_mps: Vector = ZERO  # velocity gained since the first sample, world axes
     accelerometer_offset_g: Vector = ZERO  # offset of the accelerometer at rest, body axes
-    last_silence_end_s: float = -math.inf  # end of the newest silence
-    last_fall_hiding_gap_end_s: float = -math.inf  # end of the newest silence that may hide a fall
+    last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest silence
+    # end of the newest silence that may hide a fall
+    last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
     restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
     sunk_while_frozen_m: float = 0.0  # descent by the estimate while the accelerometer was frozen
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
     # errors of roll and pitch due to corrections
     roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
-    roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
+    body_roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
     # corrections of the state estimate, which this motion does not use
     fusion_age: FusionAge = FusionAge()
     # time since which the motors have been off; inf while they turn
@@ -476,11 +484,11 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     sunk_m = min(0.0, motion.sunk_while_frozen_m + new.position_m[2] - last.position_m[2])
     alive = 0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_S and new.start == last.start
     if alive and _excludes_fall(last, new, sunk_m):
-        return replace(motion, last_silence_end_s=new.t_s, sunk_while_frozen_m=sunk_m)
+        return replace(motion, last_telemetry_gap_ended_at_s=new.t_s, sunk_while_frozen_m=sunk_m)
     return replace(
         motion,
-        last_silence_end_s=new.t_s,
-        last_fall_hiding_gap_end_s=new.t_s,
+        last_telemetry_gap_ended_at_s=new.t_s,
+        last_gap_that_may_hide_fall_ended_at_s=new.t_s,
         sunk_while_frozen_m=0.0,
     )
 
@@ -493,7 +501,7 @@ def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return (
-            new.velocity_mps[2] > FALL_ACROSS_TELEMETRY_GAP_MPS
+            new.velocity_mps[2] > MAX_CLIMB_IN_FALL_ACROSS_GAP_MPS
             and sunk_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
         )
     return (
@@ -510,8 +518,10 @@ def _integrate_acceleration(
     motors are off and the vehicle does not fly."""
     offset_g = motion.accelerometer_offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
-        offset_g = _filter_rest_offset(offset_g, new, min(1.0, dt_s / REST_OFFSET_TIME_CONSTANT_S))
-    roll_pitch_error_rad, roll_pitch_rate_radps = _estimate_tilt_error(motion, last, new, dt_s)
+        offset_g = _filter_accelerometer_offset(
+            offset_g, new, min(1.0, dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
+        )
+    roll_pitch_error_rad, body_roll_pitch_rate_radps = _estimate_tilt_error(motion, last, new, dt_s)
     before = ImuMotion.acceleration_mps2(last, offset_g, motion.roll_pitch_error_rad)
     after = ImuMotion.acceleration_mps2(new, offset_g, roll_pitch_error_rad)
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
@@ -521,7 +531,7 @@ def _integrate_acceleration(
         velocity_mps=(x, y, z),
         accelerometer_offset_g=offset_g,
         roll_pitch_error_rad=roll_pitch_error_rad,
-        roll_pitch_rate_radps=roll_pitch_rate_radps,
+        body_roll_pitch_rate_radps=body_roll_pitch_rate_radps,
     )
     return motion, dv[2] / dt_s
 
@@ -530,7 +540,7 @@ class TiltError(NamedTuple):
     """Error of the estimated roll and pitch, and the body's true rates about both axes."""
 
     roll_pitch_error_rad: tuple[float, float]
-    roll_pitch_rate_radps: tuple[float, float]
+    body_roll_pitch_rate_radps: tuple[float, float]
 
 
 def _estimate_tilt_error(
@@ -545,7 +555,7 @@ def _estimate_tilt_error(
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
-    (roll, pitch), rates = motion.roll_pitch_error_rad, motion.roll_pitch_rate_radps
+    (roll, pitch), rates = motion.roll_pitch_error_rad, motion.body_roll_pitch_rate_radps
     if gained_mps <= MIN_ESTIMATE_VELOCITY_STEP_MPS + ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 * dt_s:
         return TiltError((kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s))
     error = (
@@ -589,7 +599,7 @@ def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     )
 
 
-def _filter_rest_offset(old: Vector, sample: Telemetry, share: float) -> Vector:
+def _filter_accelerometer_offset(old: Vector, sample: Telemetry, share: float) -> Vector:
     cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
     cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
     x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr

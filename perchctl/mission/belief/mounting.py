@@ -24,10 +24,11 @@ MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
 MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
 """Share of the vehicle's motion by which the target moves: below the first it stands still, above
 the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
-MIN_TARGET_SPREAD_M = 0.05
-"""Least spread of the target's positions that shows a motion, m."""
+MIN_TARGET_POSITION_SPREAD_RMS_M = 0.05
+"""Least RMS distance of the target's estimated world positions from their mean that shows a motion
+of the target, m."""
 MAX_ROTATION_FIT_RESIDUAL_FRACTION = 0.45  # share of the target's spread
-MIN_FITTED_ROTATION_MAGNITUDE = 0.5  # magnitude of M; near 0, the world frame drifts
+MIN_ROTATION_FIT_GAIN = 0.5  # magnitude of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 MIN_WRONG_ROTATION_RAD = math.radians(65.0)
 REQUIRED_CONTRADICTIONS = 4
@@ -37,9 +38,10 @@ TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 """`TARGET_JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the
 distance plus twice the vehicle's motion within the time was moved. `JUMP_PAUSE_S` is the pause
 after a move, s."""
-ESTIMATE_JUMP_M = 0.05
-"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS`,
-above which the estimate has jumped. Larger: sightings from before and after a jump are compared."""
+MIN_ONBOARD_POSITION_JUMP_M = 0.05
+"""Motion of the vehicle's estimated position between two sightings, m, beyond
+`ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS`, above which the state estimate has jumped. Larger: sightings
+from before and after a jump are compared."""
 ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
 """Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
 fast vehicle are dropped."""
@@ -60,7 +62,7 @@ class MountingSample:
     up_axis_offset_xy_m: complex = 0j
 
     @property
-    def up_axis_intersection_xy_m(self) -> complex:
+    def up_axis_at_target_height_world_xy_m(self) -> complex:
         """Point where the vehicle's upward axis meets the target's plane."""
         return self.vehicle_world_xy_m + self.up_axis_offset_xy_m
 
@@ -88,13 +90,14 @@ class MountingMonitor:
     sightings: tuple[MountingSample, ...] = ()
     paused_until_s: float = -math.inf
     # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
-    is_confirmed: bool = False
+    is_camera_mounting_confirmed: bool = False
     is_target_stationary: bool = False  # the target has stood still so far
     contradictions: int = 0  # successive sightings that contradict the mounting
-    rotation_rad: float = 0.0  # rotation of the mounting with which the target would stand still
+    # rotation of the mounting with which the target would stand still
+    camera_yaw_error_rad: float = 0.0
 
     @property
-    def is_wrong(self) -> bool:
+    def is_camera_mounting_wrong(self) -> bool:
         """True once enough successive sightings contradict the mounting."""
         return self.contradictions >= REQUIRED_CONTRADICTIONS
 
@@ -102,12 +105,12 @@ class MountingMonitor:
     def is_awaiting_evidence(self) -> bool:
         """True until the vehicle has moved far enough to show that the target stands still, as it
         does if the mounting is right."""
-        return not (self.is_confirmed or self.is_target_stationary)
+        return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 
 def update_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
     """Return the monitor after one more sighting of a measured target."""
-    if old.is_confirmed or old.is_wrong:
+    if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
     kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_WINDOW_S)
     if kept and _is_jump(kept, sample):
@@ -124,7 +127,7 @@ def update_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMoni
 
 def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool:
     last = before[-1]
-    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (sample.t_s - last.t_s)
+    far = MIN_ONBOARD_POSITION_JUMP_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (sample.t_s - last.t_s)
     if abs(sample.vehicle_world_xy_m - last.vehicle_world_xy_m) > far:
         return True
     for s in reversed(before):
@@ -133,7 +136,7 @@ def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool
             return False
         target_m, vehicle_m = (
             abs(sample.target_world_xy_m - s.target_world_xy_m),
-            abs(sample.up_axis_intersection_xy_m - s.up_axis_intersection_xy_m),
+            abs(sample.up_axis_at_target_height_world_xy_m - s.up_axis_at_target_height_world_xy_m),
         )
         for jump_m, within_s in TARGET_JUMPS:
             if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
@@ -143,7 +146,7 @@ def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool
 
 def _judge_mounting(monitor: MountingMonitor, previous_contradictions: int) -> MountingMonitor:
     aims, targets = (
-        [s.up_axis_intersection_xy_m for s in monitor.sightings],
+        [s.up_axis_at_target_height_world_xy_m for s in monitor.sightings],
         [s.target_world_xy_m for s in monitor.sightings],
     )
     n, first = len(aims), aims[0]
@@ -155,19 +158,23 @@ def _judge_mounting(monitor: MountingMonitor, previous_contradictions: int) -> M
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
     if abs(along) < MAX_STATIONARY_RATIO:
         return replace(
-            monitor, is_confirmed=moved_m >= MIN_PROVEN_MOTION_M, is_target_stationary=True
+            monitor,
+            is_camera_mounting_confirmed=moved_m >= MIN_PROVEN_MOTION_M,
+            is_target_stationary=True,
         )
     spread_m = math.sqrt(sum(abs(q) ** 2 for _, q in pairs) / n)
     unexplained_m = math.sqrt(sum(abs(q - along * p) ** 2 for p, q in pairs) / n)
     turn = 1.0 - along
     if (
         abs(along) >= MIN_MOVING_RATIO
-        and abs(turn) >= MIN_FITTED_ROTATION_MAGNITUDE
+        and abs(turn) >= MIN_ROTATION_FIT_GAIN
         and abs(cmath.phase(turn)) >= MIN_WRONG_ROTATION_RAD
-        and spread_m >= MIN_TARGET_SPREAD_M
+        and spread_m >= MIN_TARGET_POSITION_SPREAD_RMS_M
         and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_FRACTION * spread_m
     ):
         return replace(
-            monitor, contradictions=previous_contradictions + 1, rotation_rad=-cmath.phase(turn)
+            monitor,
+            contradictions=previous_contradictions + 1,
+            camera_yaw_error_rad=-cmath.phase(turn),
         )
     return monitor

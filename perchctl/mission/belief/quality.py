@@ -25,7 +25,7 @@ def _does_estimate_contradict_imu(b: Belief) -> bool:
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
-        and math.hypot(*b.reckoning.lateral_gain_of_estimate_only_mps)
+        and math.hypot(*b.reckoning.lateral_velocity_unseen_by_imu_mps)
         > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
     )
 
@@ -44,17 +44,18 @@ def _is_battery_low(b: Belief) -> bool:
 
 TILTED = Condition("tilted", _is_tilted, persists_across_phases=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
-LATERAL_BLOW = Condition[Belief](
+LATERAL_SPEED_BEYOND_DRAUGHT = Condition[Belief](
     "lateral blow",
     lambda b: b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_DRAUGHT_SPEED_MPS,
 )
 """The vehicle moves laterally faster than any draught moves it."""
-VARIANCE_TOO_LARGE = Condition[Belief](
+ESTIMATE_VARIANCE_TOO_LARGE = Condition[Belief](
     "variance too large", lambda b: b.is_estimate_variance_too_large, persists_across_phases=True
 )
 """The variance of the state estimate is too large for position control."""
 TARGET_BELOW = Condition[Belief](
-    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -MIN_TARGET_BELOW_M
+    "target below",
+    lambda b: b.target.is_fresh and b.target.gear_to_target_z_m < -MIN_TARGET_BELOW_M,
 )
 """The target appears below the vehicle, so the mounting must be wrong."""
 BATTERY_LOW = Condition("battery low", _is_battery_low, persists_across_phases=True)
@@ -65,8 +66,8 @@ ESTIMATE_CONTRADICTS_IMU = Condition(
 """The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (
     TILTED,
-    LATERAL_BLOW,
-    VARIANCE_TOO_LARGE,
+    LATERAL_SPEED_BEYOND_DRAUGHT,
+    ESTIMATE_VARIANCE_TOO_LARGE,
     TARGET_BELOW,
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
@@ -102,9 +103,9 @@ def position_loss_text(b: Belief) -> str:
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
         why = why or NO_CORRECTION_TEXT
-    if b.obs.rejected_sighting_distance_m > 0.0:
+    if b.obs.rejected_sighting_to_estimate_m > 0.0:
         why = (
-            f"the target shows the vehicle {b.obs.rejected_sighting_distance_m:.2f} m from its "
+            f"the target shows the vehicle {b.obs.rejected_sighting_to_estimate_m:.2f} m from its "
             f"estimate"
         )
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
@@ -114,11 +115,11 @@ def position_loss_text(b: Belief) -> str:
 def variance_text(b: Belief) -> str:
     """Return which variance is too large, and the limit."""
     safety = b.profile.safety
-    what, variance, unit = "velocity", b.velocity_variance_m2ps2, "(m/s)^2"
+    what, variance, unit = "velocity", b.worst_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2
     if variance <= most:
         what = "height" if b.profile.positioning.source.is_deck else "position"
-        variance, most, unit = b.position_variance_m2, safety.flight_variance_m2, "m^2"
+        variance, most, unit = b.worst_axis_position_variance_m2, safety.flight_variance_m2, "m^2"
     if math.isinf(variance):
         return f"the {what}'s variance is unknown"
     return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"

@@ -22,10 +22,10 @@ from dataclasses import dataclass
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
+    ACCELEROMETER_OFFSET_TIME_CONSTANT_S,
     MAX_FROZEN_READING_S,
     MAX_PUSH_TO_ESTIMATE_DELAY_S,
     MAX_TELEMETRY_GAP_S,
-    REST_OFFSET_TIME_CONSTANT_S,
     ZERO,
     ImuMotion,
     Vector,
@@ -48,8 +48,8 @@ a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gus
 CLIMB_UNCERTAINTY_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
-MAX_CLIMB_DURING_SILENCE_MPS = 1.0
-"""Largest climb rate during a silence, m/s: the limit of the position mode."""
+MAX_CLIMB_IN_TELEMETRY_GAP_MPS = 1.0
+"""Largest climb rate during a gap in the telemetry, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
@@ -84,15 +84,15 @@ MAX_UP_TO_DATE_POSITION_LAG_S = 0.05
 BIAS_SIGMA_MPS2 = 0.06
 """Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
 is claimed too precisely."""
-VELOCITY_SIGMA_MPS = 0.01
-"""Standard deviation of the velocity at the last sighting, m/s. Smaller: the offset of a contact is
-claimed too precisely."""
+VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
+"""Standard deviation of the reckoned velocity at the last sighting, m/s. Smaller: the offset of a
+contact is claimed too precisely."""
 SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
 WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
-`lateral_gain_of_estimate_only_mps`."""
+`lateral_velocity_unseen_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a silence."""
 
@@ -105,18 +105,19 @@ class DeadReckoning:
     imu: ImuMotion | None = None  # motion up to which this value is integrated
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO  # error of accelerometer and attitude
-    mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # mean lateral reading of the accelerometer
+    # mean lateral reading of the accelerometer
+    mean_specific_force_world_xy_mps2: tuple[float, float] = (0.0, 0.0)
     estimated_velocity_mps: Vector = ZERO
     # lateral velocity gained recently by the state estimate alone
-    lateral_gain_of_estimate_only_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_velocity_unseen_by_imu_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
-    lateral_gain_of_imu_only_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_velocity_unseen_by_estimate_mps: tuple[float, float] = (0.0, 0.0)
     # distance of the gear below the target; inf if unseen or fallen
-    distance_below_m: float = math.inf
-    # lower bound of `distance_below_m`: allows for climbs in silences, and falls only add to it
-    min_distance_below_m: float = math.inf
+    gear_below_target_m: float = math.inf
+    # lower bound of `gear_below_target_m`: allows for climbs in silences, and falls only add to it
+    min_gear_below_target_m: float = math.inf
     # end of the newest silence after which the magnet may hold the vehicle
-    last_possible_catch_gap_end_s: float = -math.inf
+    last_gap_magnet_may_attach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
     lateral_offset_m: tuple[float, float] = (0.0, 0.0)
     lateral_sigma_m: float = math.inf  # standard deviation of `lateral_offset_m`; inf if unknown
@@ -126,9 +127,11 @@ class DeadReckoning:
     position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
     last_position_step_s: float = -math.inf  # time of the newest step
     climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
-    velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
-    mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
-    mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
+    # lateral bias of the estimated velocity
+    estimated_velocity_bias_world_xy_mps: tuple[float, float] = (0.0, 0.0)
+    # low-passed estimated velocity
+    mean_estimated_velocity_world_xy_mps: tuple[float, float] = (0.0, 0.0)
+    mean_estimated_world_xy_m: tuple[float, float] | None = None  # low-passed estimated position
     time_under_position_control_s: float = 0.0  # total time in free air under position control
 
 
@@ -139,28 +142,30 @@ def advance_reckoning(
     *,
     is_estimate_believed: bool,
     is_position_diverged: bool = False,
-    is_position_correcting_velocity: bool = False,
+    is_estimated_velocity_being_corrected: bool = False,
     ignores_lateral_estimate: bool = False,
 ) -> DeadReckoning:
     """Return the reckoning one tick later.
 
-    - `is_estimate_believed`: adopt the sample's estimated velocity, and learn the bias from it.
-    - `is_position_correcting_velocity`: positions have corrected the estimated velocity recently.
-    - `ignores_lateral_estimate`: adopt only its vertical part, because the firmware's estimator
-      does not see a lateral push until a position corrects it.
+    - `is_estimate_believed`: adopt the sample's estimated velocity, and learn from it the bias of
+      the acceleration, which is due to accelerometer and attitude.
+    - `is_estimated_velocity_being_corrected`: positions have corrected the estimated velocity
+      recently.
+    - `ignores_lateral_estimate`: of the estimated velocity, adopt only the vertical part, because
+      the firmware's estimator does not see a lateral push until a position corrects it.
     - `is_position_diverged`: the estimated velocity may be in wrong axes, so keep the reckoned one,
-      even after a silence.
+      even after a gap in the telemetry.
     """
     estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
     if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
-        carried = not old.imu.t_s < imu.last_silence_end_s <= impact.t_s
+        carried = not old.imu.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
         carried_mps = old.velocity_mps[2] + impact.imu_climb_before_mps - old.imu.velocity_mps[2]
         old = replace(
             old,
             climb_before_impact_mps=carried_mps if carried else impact.estimated_climb_before_mps,
         )
     frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_S
-    if old.imu is None or imu.last_silence_end_s > old.imu.t_s or frozen:
+    if old.imu is None or imu.last_telemetry_gap_ended_at_s > old.imu.t_s or frozen:
         return _restart(
             old,
             imu,
@@ -174,7 +179,7 @@ def advance_reckoning(
         imu,
         sample,
         is_estimate_believed=is_estimate_believed,
-        is_position_correcting_velocity=is_position_correcting_velocity,
+        is_estimated_velocity_being_corrected=is_estimated_velocity_being_corrected,
         ignores_lateral_estimate=ignores_lateral_estimate,
     )
 
@@ -196,7 +201,7 @@ def _restart(
     velocity_mps = estimated_velocity_mps if is_estimate_believed else ZERO
     if is_position_diverged:
         vx, vy, vz = old.velocity_mps
-        if old.imu is not None and imu.last_silence_end_s <= old.imu.t_s:
+        if old.imu is not None and imu.last_telemetry_gap_ended_at_s <= old.imu.t_s:
             vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
         velocity_mps = (vx, vy, vz)
     elif not is_estimate_believed and old.imu is not None:
@@ -212,12 +217,12 @@ def _restart(
         imu=imu,
         velocity_mps=velocity_mps,
         estimated_velocity_mps=estimated_velocity_mps,
-        lateral_gain_of_estimate_only_mps=(0.0, 0.0),
-        lateral_gain_of_imu_only_mps=(0.0, 0.0),
+        lateral_velocity_unseen_by_imu_mps=(0.0, 0.0),
+        lateral_velocity_unseen_by_estimate_mps=(0.0, 0.0),
     )
     if old.imu is None:
         return unknown
-    if imu.last_silence_end_s > old.imu.t_s:
+    if imu.last_telemetry_gap_ended_at_s > old.imu.t_s:
         # Motors that were off on both sides of the silence, or a restarted vehicle, cannot have
         # climbed under power.
         off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
@@ -225,14 +230,16 @@ def _restart(
         climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_UNCERTAINTY_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MAX_CLIMB_DURING_SILENCE_MPS * (imu.t_s - old.imu.t_s)
-        min_distance_below_m = old.min_distance_below_m - climb_m
-        near = min_distance_below_m < MAGNET_REACH_M
+            climb_m = MAX_CLIMB_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
+        min_gear_below_target_m = old.min_gear_below_target_m - climb_m
+        near = min_gear_below_target_m < MAGNET_REACH_M
         unknown = replace(
             unknown,
-            min_distance_below_m=min_distance_below_m,
-            last_possible_catch_gap_end_s=imu.t_s if near else old.last_possible_catch_gap_end_s,
-            distance_below_m=old.distance_below_m if near or flew else math.inf,
+            min_gear_below_target_m=min_gear_below_target_m,
+            last_gap_magnet_may_attach_ended_at_s=imu.t_s
+            if near
+            else old.last_gap_magnet_may_attach_ended_at_s,
+            gear_below_target_m=old.gear_below_target_m if near or flew else math.inf,
         )
     return replace(unknown, lateral_sigma_m=math.inf)
 
@@ -244,17 +251,17 @@ def _integrate_sample(
     sample: Telemetry,
     *,
     is_estimate_believed: bool,
-    is_position_correcting_velocity: bool,
+    is_estimated_velocity_being_corrected: bool,
     ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
     """Return the reckoning one sample after `before`, by the equations in the module docstring."""
     estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - before.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, lateral_gain_of_estimate_only_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    velocity, bias, lateral_velocity_unseen_by_imu_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
     remembers = (
         math.exp(-dt_s / IMU_ONLY_VELOCITY_TIME_CONSTANT_S)
-        if is_position_correcting_velocity
+        if is_estimated_velocity_being_corrected
         else 1.0
     )
     keeps = math.exp(-dt_s / ESTIMATE_ONLY_VELOCITY_TIME_CONSTANT_S)
@@ -265,17 +272,17 @@ def _integrate_sample(
         GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
         GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
     )
-    mean_lateral_mps2 = [*old.mean_lateral_mps2]
+    mean_specific_force_world_xy_mps2 = [*old.mean_specific_force_world_xy_mps2]
     for i in range(3):
         gained = imu.velocity_mps[i] - before.velocity_mps[i]
-        if i == 2 and is_estimate_believed and old.distance_below_m < MAX_BOUNCE_DISTANCE_M:
+        if i == 2 and is_estimate_believed and old.gear_below_target_m < MAX_BOUNCE_DISTANCE_M:
             gained = (
                 estimated_velocity_mps[2] - old.estimated_velocity_mps[2] + old.bias_mps2[2] * dt_s
             )
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
         if i < 2:
             alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
-            missed[i] = remembers * old.lateral_gain_of_imu_only_mps[i] + alone
+            missed[i] = remembers * old.lateral_velocity_unseen_by_estimate_mps[i] + alone
         if is_estimate_believed and (i == 2 or not ignores_lateral_estimate):
             v += (estimated_velocity_mps[i] - v) * min(
                 1.0, dt_s / RECKONED_VELOCITY_TIME_CONSTANT_S
@@ -283,14 +290,16 @@ def _integrate_sample(
             wrong = (gained - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])) / dt_s
             if calm and i < 2:
                 more = estimated_velocity_mps[i] - old.estimated_velocity_mps[i] - gained + b * dt_s
-                lateral_gain_of_estimate_only_mps[i] = (
-                    keeps * old.lateral_gain_of_estimate_only_mps[i] + more
+                lateral_velocity_unseen_by_imu_mps[i] = (
+                    keeps * old.lateral_velocity_unseen_by_imu_mps[i] + more
                 )
             if abs(wrong) <= MAX_BIAS_INNOVATION_MPS2:
                 share = min(1.0, dt_s / BIAS_TIME_CONSTANT_S)
                 b = max(-MAX_BIAS_MPS2, min(MAX_BIAS_MPS2, b + share * (wrong - b)))
                 if i < 2:
-                    mean_lateral_mps2[i] += share * (reads_mps2[i] - mean_lateral_mps2[i])
+                    mean_specific_force_world_xy_mps2[i] += share * (
+                        reads_mps2[i] - mean_specific_force_world_xy_mps2[i]
+                    )
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity
@@ -298,7 +307,7 @@ def _integrate_sample(
     fell = imu.last_fall_at_s > max(before.last_fall_at_s, old.last_sighting_at_s)
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
-        VELOCITY_SIGMA_MPS + BIAS_SIGMA_MPS2 * unseen_s
+        VELOCITY_SIGMA_AT_SIGHTING_MPS + BIAS_SIGMA_MPS2 * unseen_s
     ) * dt_s + SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
     ex, ey = old.lateral_offset_m
     return replace(
@@ -306,17 +315,20 @@ def _integrate_sample(
         imu=imu,
         velocity_mps=(vx, vy, vz),
         bias_mps2=(bias[0], bias[1], bias[2]),
-        mean_lateral_mps2=(mean_lateral_mps2[0], mean_lateral_mps2[1]),
-        estimated_velocity_mps=estimated_velocity_mps,
-        lateral_gain_of_estimate_only_mps=(
-            lateral_gain_of_estimate_only_mps[0],
-            lateral_gain_of_estimate_only_mps[1],
+        mean_specific_force_world_xy_mps2=(
+            mean_specific_force_world_xy_mps2[0],
+            mean_specific_force_world_xy_mps2[1],
         ),
-        lateral_gain_of_imu_only_mps=(missed[0], missed[1]),
-        distance_below_m=math.inf
+        estimated_velocity_mps=estimated_velocity_mps,
+        lateral_velocity_unseen_by_imu_mps=(
+            lateral_velocity_unseen_by_imu_mps[0],
+            lateral_velocity_unseen_by_imu_mps[1],
+        ),
+        lateral_velocity_unseen_by_estimate_mps=(missed[0], missed[1]),
+        gear_below_target_m=math.inf
         if fell
-        else old.distance_below_m - (vz + CLIMB_UNCERTAINTY_MPS) * dt_s,
-        min_distance_below_m=old.min_distance_below_m - vz * dt_s,
+        else old.gear_below_target_m - (vz + CLIMB_UNCERTAINTY_MPS) * dt_s,
+        min_gear_below_target_m=old.min_gear_below_target_m - vz * dt_s,
         lateral_offset_m=(ex - vx * dt_s, ey - vy * dt_s),
         lateral_sigma_m=old.lateral_sigma_m + growth_m,
     )
@@ -335,8 +347,12 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return reset_velocity_bias_means(old)
     share = 1.0 - math.exp(-dt_s / VELOCITY_BIAS_TIME_CONSTANT_S)
-    before_m = old.mean_position_m or new.position_m[:2]
-    before_mps = old.velocity_bias_mps if old.mean_position_m is None else old.mean_velocity_mps
+    before_m = old.mean_estimated_world_xy_m or new.position_m[:2]
+    before_mps = (
+        old.estimated_velocity_bias_world_xy_mps
+        if old.mean_estimated_world_xy_m is None
+        else old.mean_estimated_velocity_world_xy_mps
+    )
     velocity, position, bias = [], [], []
     for i in range(2):
         velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
@@ -346,9 +362,9 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
     part = 1.0 if size_mps <= MAX_VELOCITY_BIAS_MPS else MAX_VELOCITY_BIAS_MPS / size_mps
     return replace(
         old,
-        velocity_bias_mps=(part * bias[0], part * bias[1]),
-        mean_velocity_mps=(velocity[0], velocity[1]),
-        mean_position_m=(position[0], position[1]),
+        estimated_velocity_bias_world_xy_mps=(part * bias[0], part * bias[1]),
+        mean_estimated_velocity_world_xy_mps=(velocity[0], velocity[1]),
+        mean_estimated_world_xy_m=(position[0], position[1]),
         time_under_position_control_s=old.time_under_position_control_s + dt_s,
     )
 
@@ -362,11 +378,11 @@ def learn_bias_at_rest(
     if (
         before is None
         or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
-        or now.last_silence_end_s > before.t_s
+        or now.last_telemetry_gap_ended_at_s > before.t_s
     ):
         return old
     dt_s = now.t_s - before.t_s
-    share = 1.0 - math.exp(-dt_s / REST_OFFSET_TIME_CONSTANT_S)
+    share = 1.0 - math.exp(-dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
     x_mps2, y_mps2 = ((now.velocity_mps[i] - before.velocity_mps[i]) / dt_s for i in range(2))
     bx, by, bz = old.bias_mps2
     bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
@@ -376,13 +392,17 @@ def learn_bias_at_rest(
 def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning after an interruption of the velocity-bias learning: the bias is kept,
     and the low-pass filters restart."""
-    return old if old.mean_position_m is None else replace(old, mean_position_m=None)
+    return (
+        old
+        if old.mean_estimated_world_xy_m is None
+        else replace(old, mean_estimated_world_xy_m=None)
+    )
 
 
 def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning with a corrected bias: positions in wrong axes have given the estimate a
     velocity that the accelerometer has not measured, and a tilt error in proportion to it."""
-    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_gain_of_estimate_only_mps
+    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_velocity_unseen_by_imu_mps
     return replace(
         old,
         bias_mps2=(
@@ -426,19 +446,19 @@ def add_sighting(
     old: DeadReckoning,
     t_s: float,
     lateral_offset_m: tuple[float, float],
-    distance_below_m: float,
+    gear_below_target_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
     """Return the reckoning restarted at a sighting.
 
     `lateral_offset_m` is the vector from the gear to the target (world x, y), with the standard
-    deviation `sigma_m`; `distance_below_m` is how far the gear is below the target.
+    deviation `sigma_m`; `gear_below_target_m` is how far the gear is below the target.
     """
     return replace(
         old,
         last_sighting_at_s=t_s,
         lateral_offset_m=lateral_offset_m,
-        distance_below_m=distance_below_m,
-        min_distance_below_m=distance_below_m,
+        gear_below_target_m=gear_below_target_m,
+        min_gear_below_target_m=gear_below_target_m,
         lateral_sigma_m=sigma_m,
     )

@@ -34,24 +34,27 @@ class TargetBelief:
     """Position of the target. Every value is unknown until the first measurement.
 
     Attributes:
-        world_m, world_yaw_rad: position (3,) in the world frame of the state estimate, and heading;
-            None while unknown.
-        error_xy_m, error_z_m, error_yaw_rad: offset from the gear to the target in the level frame;
-            infinite while unknown.
-        body_z_touching_target_m: height of the body at which the gear touches the target.
+        world_position_m, world_yaw_rad: position (3,) in the world frame of the state estimate, and
+            heading; None while unknown.
+        gear_to_target_distance_xy_m, gear_to_target_z_m: horizontal distance between gear and
+            target, and height of the target above the gear; infinite while unknown.
+        vehicle_to_target_yaw_rad: heading of the target relative to the vehicle's, positive
+            counter-clockwise from above; infinite while unknown.
+        vehicle_world_z_when_touching_m: world z of the body's origin at which the gear touches the
+            target.
         age_s: time since the exposure of the last frame that measured the target.
-        is_tracked: the target is visible, or the filter coasts for at most n_max frames.
-        is_fresh: the last measurement is as recent as the latency allows.
-        is_small_marker_fresh: the last measurement of the small marker is as recent as the latency
-            allows.
+        is_tracked: the target is visible, or the filter has predicted it without a measurement for
+            at most n_max frames.
+        is_fresh: it is tracked, and `age_s` is at most `ascend.fresh_s` plus the camera's latency.
+        is_small_marker_fresh: the last measurement of the small marker is no older than that.
     """
 
-    world_m: Array | None = None
+    world_position_m: Array | None = None
     world_yaw_rad: float | None = None
-    error_xy_m: float = math.inf
-    error_z_m: float = math.inf
-    error_yaw_rad: float = math.inf
-    body_z_touching_target_m: float = math.inf
+    gear_to_target_distance_xy_m: float = math.inf
+    gear_to_target_z_m: float = math.inf
+    vehicle_to_target_yaw_rad: float = math.inf
+    vehicle_world_z_when_touching_m: float = math.inf
     age_s: float = math.inf
     is_tracked: bool = False
     is_fresh: bool = False
@@ -61,7 +64,7 @@ class TargetBelief:
     def is_far_above(self) -> bool:
         """True if the target is so far above the gear that its magnet cannot be holding the
         vehicle."""
-        return self.world_m is not None and self.error_z_m > MIN_FAR_ABOVE_M
+        return self.world_position_m is not None and self.gear_to_target_z_m > MIN_FAR_ABOVE_M
 
     @classmethod
     def from_estimate(
@@ -77,12 +80,12 @@ class TargetBelief:
         limit_s = profile.planner.ascend.fresh_s + camera_latency_s
         age_s = t_s - target.measured_s
         return cls(
-            world_m=target.world_m,
+            world_position_m=target.world_m,
             world_yaw_rad=target.world_yaw_rad,
-            error_xy_m=math.hypot(target.e_m[0], target.e_m[1]),
-            error_z_m=float(target.e_m[2]),
-            error_yaw_rad=target.e_yaw_rad,
-            body_z_touching_target_m=goal_z_m,
+            gear_to_target_distance_xy_m=math.hypot(target.e_m[0], target.e_m[1]),
+            gear_to_target_z_m=float(target.e_m[2]),
+            vehicle_to_target_yaw_rad=target.e_yaw_rad,
+            vehicle_world_z_when_touching_m=goal_z_m,
             age_s=age_s,
             is_tracked=target.tracked,
             is_fresh=target.tracked and age_s <= limit_s,

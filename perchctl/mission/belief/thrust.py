@@ -17,11 +17,11 @@ from perchctl.values import replace
 
 MIN_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-THRUST_SIGMA = 0.02
-"""Standard deviation, as a share, of measurements averaged over one second; position control varies
-the thrust by 1 to 2 % for half a second. Larger: the filter follows a sagging battery late.
-Smaller: the filter learns these variations."""
-QUIET_HOVER_DRIFT_PER_SQRT_S = 0.01
+THRUST_MEASUREMENT_SIGMA_FRACTION = 0.02
+"""Standard deviation of a hover-thrust measurement averaged over one second, as a share of the
+thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter follows
+a sagging battery late. Smaller: the filter learns these variations."""
+HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S = 0.01
 """Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
 the filter learns a lasting push. Smaller: it follows a sagging battery late."""
 ACCELEROMETER_HOVER_THRUST_SIGMA = 0.03
@@ -39,13 +39,13 @@ class HoverThrust:
     Attributes:
         thrust: 0..65535; 0 while unknown.
         sigma: standard deviation, as a share of `thrust`.
-        thrust_sigma_before_descent: `thrust` and `sigma` at the start of a descent by thrust; None
-            before one.
+        estimate_before_descent: the estimate at the start of a descent by raw thrust; None before
+            one.
     """
 
     thrust: float = 0.0
     sigma: float = math.inf
-    thrust_sigma_before_descent: tuple[float, float] | None = None
+    estimate_before_descent: HoverThrust | None = None
 
     @property
     def is_imprecise(self) -> bool:
@@ -60,7 +60,7 @@ class HoverThrust:
     def propagate_unmeasured(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
-        sigma = self.propagate(dt_s, QUIET_HOVER_DRIFT_PER_SQRT_S).sigma
+        sigma = self.propagate(dt_s, HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S).sigma
         return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)))
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
@@ -69,8 +69,10 @@ class HoverThrust:
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma):
-            return replace(self, thrust=thrust, sigma=THRUST_SIGMA / math.sqrt(dt_s))
+            return replace(
+                self, thrust=thrust, sigma=THRUST_MEASUREMENT_SIGMA_FRACTION / math.sqrt(dt_s)
+            )
         variance = self.sigma**2
-        gain = variance / (variance + THRUST_SIGMA**2 / dt_s)
+        gain = variance / (variance + THRUST_MEASUREMENT_SIGMA_FRACTION**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
         return replace(self, thrust=corrected, sigma=math.sqrt((1.0 - gain) * variance))

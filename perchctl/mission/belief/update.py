@@ -62,14 +62,15 @@ from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawTh
 
 BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions of the belief."""
-MAX_TARGET_SUPPORT_DISTANCE_M = 0.3
-"""Distance below the target within which any support is the target, m."""
+MAX_GEAR_BELOW_TARGET_IF_HELD_M = 0.3
+"""Distance of the gear below the target within which whatever holds the vehicle is the target,
+m."""
 REST_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
 MAX_SAMPLE_DURATION_S = 0.1
 """Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
 single sample has the weight of many."""
-MAX_THRUST_MISMATCH_FRACTION = 0.12
+MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION = 0.12
 """Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
 KEEPALIVE_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
@@ -86,26 +87,26 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
     A wrong observation makes the belief wrong for up to some seconds, until the filters forget it.
     """
     b = replace(belief, obs=obs, profile=profile, sent=sent, world_frame_shift_m=ZERO)
-    sample = MotionSample(obs.telemetry.t_s, b.acceleration_from_lean_mps2, b.velocity_mps[:2])
+    sample = MotionSample(obs.telemetry.t_s, b.lean_acceleration_world_xy_mps2, b.velocity_mps[:2])
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
-    if has_gap(belief, obs, profile):
+    if has_tick_gap(belief, obs, profile):
         b = _reset_after_gap(b)
     if b.is_position_stale:
         b = replace(b, position_last_stale_at_s=obs.t_s)
-    if obs.has_estimate_jumped:
+    if obs.has_estimated_position_jumped:
         b = _shift_belief_frame(b)
     if obs.heading_jump_rad > math.radians(profile.safety.heading_lost_deg):
         b = replace(b, heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
     b = _compare_ordered_thrust(b)
     b = _update_dead_reckoning(b)
     comes_down = sent.maneuver.descends and sent.is_under_power
-    if comes_down and b.dead_reckoning_since_s is None and b.has_no_position_for_descent:
+    if comes_down and b.dead_reckoning_since_s is None and b.has_only_imu_for_descent:
         b = start_dead_reckoning(b)
     return _update_estimators(b)
 
 
-def has_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
+def has_tick_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
     """True if more time has passed since the planner's last tick than a position may be missing,
     `positioning.hold_s`."""
     return belief.last_telemetry is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
@@ -124,7 +125,9 @@ def start_dead_reckoning(b: Belief) -> Belief:
 def reset_evidence(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: all conditions restart, except for those that
     are independent of the phase."""
-    return replace(b, since=keep_persistent_start_times(b.since))
+    return replace(
+        b, condition_start_times_s=keep_persistent_start_times(b.condition_start_times_s)
+    )
 
 
 def update_after_command(b: Belief, command: Command) -> Belief:
@@ -132,7 +135,7 @@ def update_after_command(b: Belief, command: Command) -> Belief:
     that the reported thrust follows the ordered raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
-    return replace(b, thrust_mismatch_since_s=None)
+    return replace(b, thrust_differs_from_order_since_s=None)
 
 
 # --- Direct consequences of the observation ---
@@ -163,15 +166,15 @@ def _update_target(b: Belief) -> Belief:
 def _reset_after_gap(b: Belief) -> Belief:
     """Return the belief after a gap in which the planner did not run: all conditions restart."""
     imu = b.obs.imu
-    kept: dict[Condition[Any], float] = keep_persistent_start_times(b.since)
-    off_s = max(imu.motors_off_since_s, imu.last_silence_end_s)
-    if MOTORS_STOPPED in b.since and math.isfinite(off_s):
+    kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
+    off_s = max(imu.motors_off_since_s, imu.last_telemetry_gap_ended_at_s)
+    if MOTORS_STOPPED in b.condition_start_times_s and math.isfinite(off_s):
         # All samples from the gap have arrived, and the motors are off in each. Without this
         # exception, a loop with a gap in every tick would never see the end of a landing.
-        kept[MOTORS_STOPPED] = max(off_s, b.since[MOTORS_STOPPED])
+        kept[MOTORS_STOPPED] = max(off_s, b.condition_start_times_s[MOTORS_STOPPED])
     return replace(
         b,
-        since=kept,
+        condition_start_times_s=kept,
         position_last_stale_at_s=b.obs.t_s
         if b.is_positioned_by_target
         else b.position_last_stale_at_s,
@@ -203,7 +206,7 @@ def _shift_belief_frame(b: Belief) -> Belief:
         moved_m = (0.0, 0.0, 0.0)
     setpoint = b.sent.setpoint
     if setpoint is not None:
-        z_m = z if b.last_contact_body_z_m is None else setpoint.z_m + moved_m[2]
+        z_m = z if b.vehicle_world_z_at_last_contact_m is None else setpoint.z_m + moved_m[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
     return replace(
         b,
@@ -211,9 +214,9 @@ def _shift_belief_frame(b: Belief) -> Belief:
         takeoff_position_m=None
         if b.takeoff_position_m is None
         else _translate(b.takeoff_position_m, moved_m),
-        last_contact_body_z_m=None
-        if b.last_contact_body_z_m is None
-        else b.last_contact_body_z_m + moved_m[2],
+        vehicle_world_z_at_last_contact_m=None
+        if b.vehicle_world_z_at_last_contact_m is None
+        else b.vehicle_world_z_at_last_contact_m + moved_m[2],
         sent=b.sent.with_frame_shift(setpoint, moved_m),
         world_frame_shift_m=moved_m,
         first_estimate_jump_at_s=first_estimate_jump_at_s,
@@ -226,15 +229,22 @@ def _translate(place_m: Vector, by_m: Vector) -> Vector:
 
 def _compare_ordered_thrust(b: Belief) -> Belief:
     """Return the belief with the loop time since when the reported thrust has differed from the
-    ordered raw thrust by more than `MAX_THRUST_MISMATCH_FRACTION`; None while they agree."""
+    ordered raw thrust by more than `MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION`; None while they
+    agree."""
     order = b.sent.raw_thrust
     if order is None:
         return b
     wanted = 0.0 if order < KEEPALIVE_THRUST else min(MAX_RAW_THRUST, order)
-    apart = abs(b.telemetry.thrust - wanted) > MAX_THRUST_MISMATCH_FRACTION * FULL_THRUST
-    since_s = b.obs.t_s if b.thrust_mismatch_since_s is None else b.thrust_mismatch_since_s
-    b = replace(b, thrust_mismatch_since_s=since_s if apart else None)
-    return b if b.is_thrust_known else replace(b, last_thrust_mismatch_s=b.obs.t_s)
+    apart = (
+        abs(b.telemetry.thrust - wanted) > MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION * FULL_THRUST
+    )
+    since_s = (
+        b.obs.t_s
+        if b.thrust_differs_from_order_since_s is None
+        else b.thrust_differs_from_order_since_s
+    )
+    b = replace(b, thrust_differs_from_order_since_s=since_s if apart else None)
+    return b if b.is_thrust_known else replace(b, thrust_last_differed_from_order_at_s=b.obs.t_s)
 
 
 # --- Dead reckoning ---
@@ -271,14 +281,14 @@ def _integrate_reckoning(b: Belief) -> DeadReckoning:
         obs.telemetry,
         is_estimate_believed=is_estimate_believed,
         is_position_diverged=b.is_position_diverged and not source.is_target,
-        is_position_correcting_velocity=b.is_position_correcting_velocity,
+        is_estimated_velocity_being_corrected=b.is_estimated_velocity_being_corrected,
         # A motion that no sighting has corrected yet is not a bias of the accelerometer.
-        ignores_lateral_estimate=source.is_target and not b.is_position_correcting_velocity,
+        ignores_lateral_estimate=source.is_target and not b.is_estimated_velocity_being_corrected,
     )
     in_free_air = b.sent.maneuver.in_free_air and b.height_m > MAX_STANDING_HEIGHT_M
     if (
         is_estimate_believed
-        and b.is_position_correcting_velocity
+        and b.is_estimated_velocity_being_corrected
         and in_free_air
         and b.last_telemetry
     ):
@@ -300,8 +310,8 @@ def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
         and obs.t_s - obs.imu.last_fall_at_s > HANGING_DWELL_S
     )
     hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
-    touched = b.last_contact_body_z_m is not None or hangs
-    if not touched or not new.distance_below_m < MAGNET_REACH_M or not rests:
+    touched = b.vehicle_world_z_at_last_contact_m is not None or hangs
+    if not touched or not new.gear_below_target_m < MAGNET_REACH_M or not rests:
         return new
     is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < REST_DWELL_S
     x_mps, y_mps, _ = new.velocity_mps
@@ -368,14 +378,14 @@ def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
     near = (
         b.is_positioned_by_target
         and not b.sent.maneuver.descends
-        and new.distance_below_m < MAX_TARGET_SUPPORT_DISTANCE_M
+        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_HELD_M
     )
     if not near or b.held_s(SUPPORT_SHOWN_BY_IMU) < b.profile.planner.perch.contact_dwell_s:
         return new
     return replace(
         new,
-        distance_below_m=min(0.0, new.distance_below_m),
-        min_distance_below_m=min(0.0, new.min_distance_below_m),
+        gear_below_target_m=min(0.0, new.gear_below_target_m),
+        min_gear_below_target_m=min(0.0, new.min_gear_below_target_m),
         velocity_mps=(*new.velocity_mps[:2], 0.0),
     )
 
@@ -387,14 +397,14 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
     if not b.sent.is_under_power:
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the reckoning says.
-    near = new.distance_below_m < MAGNET_REACH_M and b.sent.floor_detected_s is None
-    if b.last_contact_body_z_m is None and not near:
+    near = new.gear_below_target_m < MAGNET_REACH_M and b.sent.floor_detected_at_s is None
+    if b.vehicle_world_z_at_last_contact_m is None and not near:
         return None
     # A vehicle caught below the magnet may be drawn to it again, so an earlier fall proves nothing.
     again = (
         in_magnet_reach_since_s is not None
         and b.imu.last_fall_at_s > in_magnet_reach_since_s
-        and new.distance_below_m < MAGNET_REACH_M
+        and new.gear_below_target_m < MAGNET_REACH_M
     )
     return b.obs.t_s if in_magnet_reach_since_s is None or again else in_magnet_reach_since_s
 
@@ -408,9 +418,9 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
     tel = obs.telemetry
     heard_again = (
-        obs.imu.last_silence_end_s > before.t_s
+        obs.imu.last_telemetry_gap_ended_at_s > before.t_s
         and b.is_telemetry_fresh
-        and not obs.has_estimate_jumped
+        and not obs.has_estimated_position_jumped
     )
     if heard_again and last is not None and tel.start == last.start:
         return tel.position_m[2] - last.position_m[2]
@@ -425,15 +435,18 @@ def _update_estimators(b: Belief) -> Belief:
     obs, maneuver = b.obs, b.sent.maneuver
     held = bool(hold_reason(b, maneuver))
     fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]
-    since: dict[Condition[Any], float] = update_start_times(b.since, fresh, b, obs.t_s)
+    condition_start_times_s: dict[Condition[Any], float] = update_start_times(
+        b.condition_start_times_s, fresh, b, obs.t_s
+    )
     if held:
-        since = keep_persistent_start_times(since)  # a hold interrupts the evidence
+        # a hold interrupts the evidence
+        condition_start_times_s = keep_persistent_start_times(condition_start_times_s)
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     # 0: no new sample
     sample_dt_s = max(0.0, min(MAX_SAMPLE_DURATION_S, obs.telemetry.t_s - last_s))
     near_m = b.profile.planner.ascend.near_m
-    away = not maneuver.climbs_to_target or b.target.error_z_m > near_m
+    away = not maneuver.climbs_to_target or b.target.gear_to_target_z_m > near_m
     b = replace(
         b,
         hover_thrust_estimate=b.hover_thrust_estimate.propagate_unmeasured(dt_s),
@@ -449,10 +462,10 @@ def _update_estimators(b: Belief) -> Belief:
         b,
         t_s=obs.t_s,
         last_telemetry=obs.telemetry,
-        since=since,
+        condition_start_times_s=condition_start_times_s,
         hover_thrust_estimate=found,
         battery_fit=update_from_telemetry(
-            b.battery_fit, obs.telemetry, obs.battery_age_s, dt_s, mah
+            b.battery_fit, obs.telemetry, obs.battery_reading_age_s, dt_s, mah
         ),
         mounting=b.mounting if held else _update_mounting(b),
         mean_lean_sine_world_xy=_filter_lean(b, sample_dt_s),

@@ -8,7 +8,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low
+from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low_to_continue
 from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
 from perchctl.mission.phases.recover import has_recovered
@@ -24,8 +24,8 @@ ALIGNED = Condition[Context](
     "aligned",
     lambda c: (
         c.belief.target.is_fresh
-        and c.belief.target.error_xy_m <= c.planner.align.xy_m
-        and abs(c.belief.target.error_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
+        and c.belief.target.gear_to_target_distance_xy_m <= c.planner.align.xy_m
+        and abs(c.belief.target.vehicle_to_target_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
     ),
 )
 """The vehicle is below a fresh target, with its heading."""
@@ -41,11 +41,13 @@ def is_aligned(c: Context) -> bool:
     return c.held_s(ALIGNED) >= c.planner.align.dwell_s
 
 
-def is_charge_too_low_to_begin(c: Context) -> bool:
+def is_charge_too_low_for_attempt(c: Context) -> bool:
     """True if an attempt or a retry is about to begin and the battery has too little charge for
     it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
-    return begins and c.state.failed_attempts < c.planner.attempts and is_charge_too_low(c)
+    return (
+        begins and c.state.failed_attempts < c.planner.attempts and is_charge_too_low_to_continue(c)
+    )
 
 
 def hover_height_m(c: Context) -> float | None:
@@ -53,7 +55,9 @@ def hover_height_m(c: Context) -> float | None:
     if the mission does not hover."""
     hover, b = c.planner.hover, c.belief
     return (
-        None if hover is None else b.target.body_z_touching_target_m - hover.below_m - b.ground_z_m
+        None
+        if hover is None
+        else b.target.vehicle_world_z_when_touching_m - hover.below_m - b.ground_z_m
     )
 
 
@@ -104,7 +108,7 @@ ALIGN = PhaseDefinition(
         land_row(
             "too-little-left",
             {Phase.ALIGN, Phase.RECOVER},
-            is_charge_too_low_to_begin,
+            is_charge_too_low_for_attempt,
             battery_shortfall_text,
         ),
         land_row(

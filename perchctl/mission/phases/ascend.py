@@ -9,7 +9,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Claim, Phase, Severity
+from perchctl.mission.phase import Phase, Severity, VehicleClaim
 from perchctl.mission.setpoints import (
     MAX_IN_PLACE_SPEED_MPS,
     Action,
@@ -20,7 +20,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
-CLIMB_ALLOWED_CONE_FRACTION = 0.7
+MAX_CONE_RADIUS_FRACTION_TO_CLIMB = 0.7
 """Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
 returns to ALIGN."""
 MAX_SETPOINT_LEAD_M = 0.15
@@ -44,7 +44,7 @@ def cone_radius_m(c: Context) -> float:
     """Return the radius of the cone at the present height, m: the largest offset from the target's
     axis."""
     ascend = c.planner.ascend
-    return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.error_z_m)
+    return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.gear_to_target_z_m)
 
 
 def standoff_m(c: Context) -> float:
@@ -55,20 +55,22 @@ def standoff_m(c: Context) -> float:
 
 def is_near_standoff(c: Context) -> bool:
     """True if the gear has reached the height at which the ascent settles."""
-    return c.belief.target.error_z_m <= standoff_m(c) + c.planner.ascend.settle_z_m
+    return c.belief.target.gear_to_target_z_m <= standoff_m(c) + c.planner.ascend.settle_z_m
 
 
 def _is_settled(c: Context) -> bool:
     """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
     the small marker recently."""
     ascend, target, offset = c.planner.ascend, c.belief.target, c.belief.lateral_offset
-    error_xy_m = target.error_xy_m if offset is None else math.hypot(*offset.offset_m)
+    gear_to_target_distance_xy_m = (
+        target.gear_to_target_distance_xy_m if offset is None else math.hypot(*offset.offset_m)
+    )
     return (
         target.is_fresh
         and target.is_small_marker_fresh
         and is_near_standoff(c)
-        and error_xy_m <= ascend.settle_xy_m
-        and abs(target.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
+        and gear_to_target_distance_xy_m <= ascend.settle_xy_m
+        and abs(target.vehicle_to_target_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.belief.speed_mps <= ascend.settle_speed_mps
     )
 
@@ -78,21 +80,21 @@ def _is_at_hover_place(c: Context) -> bool:
     hovers. The tolerances are those of ALIGN, since the small marker may be too far away to be
     seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
-    goal_z_m = target.body_z_touching_target_m - standoff_m(c)
+    goal_z_m = target.vehicle_world_z_when_touching_m - standoff_m(c)
     return (
         target.is_fresh
         and setpoint is not None
         and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_TOLERANCE_M
-        and abs(target.error_z_m - standoff_m(c)) <= HOVER_HEIGHT_TOLERANCE_M
-        and target.error_xy_m <= align.xy_m
-        and abs(target.error_yaw_rad) <= math.radians(align.yaw_deg)
+        and abs(target.gear_to_target_z_m - standoff_m(c)) <= HOVER_HEIGHT_TOLERANCE_M
+        and target.gear_to_target_distance_xy_m <= align.xy_m
+        and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
         and c.belief.speed_mps <= MAX_IN_PLACE_SPEED_MPS
     )
 
 
 def is_climbing_back(state: PlannerState) -> bool:
     """True if this ascent returns a vehicle that has sunk during its hover to the hover's place."""
-    return state.phase is Phase.ASCEND and Claim.RESUMES_HOVER in state.entry.claims
+    return state.phase is Phase.ASCEND and VehicleClaim.RESUMES_HOVER in state.entry.claims
 
 
 def is_target_lost(c: Context) -> bool:
@@ -126,12 +128,14 @@ def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
-    goal_z = target.body_z_touching_target_m - standoff_m(c)
-    may_climb = target.is_fresh and target.error_xy_m < CLIMB_ALLOWED_CONE_FRACTION * cone_radius_m(
-        c
+    goal_z = target.vehicle_world_z_when_touching_m - standoff_m(c)
+    may_climb = (
+        target.is_fresh
+        and target.gear_to_target_distance_xy_m
+        < MAX_CONE_RADIUS_FRACTION_TO_CLIMB * cone_radius_m(c)
     )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
-    speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
+    speed = ascend.near_speed_mps if target.gear_to_target_z_m < ascend.near_m else ascend.speed_mps
     speed = min(speed, max(MIN_CLIMB_MPS, goal_z - setpoint.z_m))
     return fly_under_target(
         c, goal_z, up_mps=speed if may_climb and lag_m < MAX_SETPOINT_LEAD_M else 0.0
@@ -160,7 +164,7 @@ ASCEND = PhaseDefinition(
         Transition(
             "outside-cone",
             {Phase.ASCEND},
-            lambda c: c.belief.target.error_xy_m > cone_radius_m(c),
+            lambda c: c.belief.target.gear_to_target_distance_xy_m > cone_radius_m(c),
             Phase.ALIGN,
             "drifted out of the cone",
             Severity.HOLD,

@@ -13,7 +13,7 @@ from perchctl.mission.belief.contact import (
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.phase import Outcome, Phase, VehicleClaim
 from perchctl.mission.release import lower_thrust, release_by_thrust, stop_motors
 from perchctl.mission.rest import is_still_hanging
 from perchctl.mission.setpoints import Action
@@ -29,7 +29,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
     belief = replace(
         state.belief,
-        last_contact_body_z_m=before.telemetry.position_m[2],
+        vehicle_world_z_at_last_contact_m=before.telemetry.position_m[2],
         last_contact_offset=gear_offset_at_last_touch_or_now(before.belief),
     )
     return replace(state, belief=belief, release_began_s=None)
@@ -38,21 +38,23 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 def act(c: Context) -> Action:
     """Release in two stages, stop the motors once the whole weight hangs, and monitor the
     vehicle."""
-    if c.state.motor_stop_ordered_s is not None:
+    if c.state.motor_stop_ordered_at_s is not None:
         return stop_motors(c)
     holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
     return release_by_thrust(c) if holds or c.state.release_began_s is not None else lower_thrust(c)
 
 
-def time_since_stop_s(c: Context) -> float:
+def time_since_motor_stop_order_s(c: Context) -> float:
     """Seconds since the first order to stop the motors; -1 before it."""
-    return -1.0 if c.state.motor_stop_ordered_s is None else c.t_s - c.state.motor_stop_ordered_s
+    return (
+        -1.0 if c.state.motor_stop_ordered_at_s is None else c.t_s - c.state.motor_stop_ordered_at_s
+    )
 
 
 def is_release_monitoring_over(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return (
-        time_since_stop_s(c) >= c.planner.complete.watch_s
+        time_since_motor_stop_order_s(c) >= c.planner.complete.watch_s
         and c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S
     )
 
@@ -69,20 +71,20 @@ COMPLETE = PhaseDefinition(
             lambda c: has_slipped(c.belief),
             lambda c: (
                 "slipped while hanging"
-                if c.state.motor_stop_ordered_s
+                if c.state.motor_stop_ordered_at_s
                 else "the magnet does not hold"
             ),
-            claims=Claim.SLIPPED,
+            claims=VehicleClaim.SLIPPED,
         ),
         back_off_row(
             "not-released",
             {Phase.COMPLETE},
             lambda c: (
-                c.state.motor_stop_ordered_s is None
+                c.state.motor_stop_ordered_at_s is None
                 and c.in_phase_s > c.planner.complete.release_timeout_s
             ),
             "the release was not completed in time",
-            claims=Claim.STILL_ATTACHED,
+            claims=VehicleClaim.STILL_ATTACHED,
         ),
         Transition(
             "perched",
@@ -101,7 +103,9 @@ COMPLETE = PhaseDefinition(
         land_row(
             "not-stopped",
             {Phase.COMPLETE},
-            lambda c: time_since_stop_s(c) > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S,
+            lambda c: (
+                time_since_motor_stop_order_s(c) > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S
+            ),
             lambda c: (
                 f"motors stopped, but telemetry still reports a thrust of {c.telemetry.thrust:.0f}"
             ),

@@ -15,7 +15,7 @@ UNTRACKED_TIMEOUT_S = 1.0
 
 UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
 """The target is not tracked."""
-ESTIMATED = Condition[Context](
+TARGET_POSITION_STEADY = Condition[Context](
     "estimated",
     lambda c: (
         c.belief.target.is_fresh
@@ -36,7 +36,7 @@ ESTIMATE = PhaseDefinition(
         in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
     ),
     act=act,
-    conditions=(UNTRACKED, ESTIMATED),
+    conditions=(UNTRACKED, TARGET_POSITION_STEADY),
     exits=(
         Transition(
             "estimate-lost",
@@ -52,7 +52,7 @@ ESTIMATE = PhaseDefinition(
         Transition(
             "estimated",
             {Phase.ESTIMATE},
-            lambda c: c.held_s(ESTIMATED) >= c.planner.estimate.dwell_s,
+            lambda c: c.held_s(TARGET_POSITION_STEADY) >= c.planner.estimate.dwell_s,
             Phase.ALIGN,
             "pose is steady",
         ),

@@ -13,7 +13,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Claim, Outcome, Phase, Severity
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
 from perchctl.mission.phases.ascend import cone_radius_m, is_climbing_back, is_target_lost
 from perchctl.mission.setpoints import Action, fly_under_target, hold_here
 from perchctl.mission.state import HoverErrors, PlannerState
@@ -38,7 +38,7 @@ MAX_HOVER_HEIGHT_ERROR_M = 0.15
 """Vertical distance from its place at which the vehicle has left it, m. Larger: a hover that sinks
 or rises still counts. Smaller: a gust starts the time anew."""
 
-SUNK = Condition[Context]("sunk", lambda c: height_error_m(c) > MAX_HOVER_SINK_M)
+SUNK = Condition[Context]("sunk", lambda c: distance_below_hover_height_m(c) > MAX_HOVER_SINK_M)
 """The vehicle is too low for a hover."""
 
 
@@ -69,26 +69,33 @@ def act(c: Context) -> Action:
     """Stay under the target at the setpoint's height; sink if the target is nearer than it should
     be."""
     old = c.state.setpoint or hold_here(c)
-    goal_z_m = c.belief.target.body_z_touching_target_m - hover_config(c).below_m
+    goal_z_m = c.belief.target.vehicle_world_z_when_touching_m - hover_config(c).below_m
     return fly_under_target(c, min(old.z_m, goal_z_m + MAX_HOVER_RISE_M))
 
 
-def height_error_m(c: Context) -> float:
+def distance_below_hover_height_m(c: Context) -> float:
     """Return how far the vehicle is below its place, m; negative above it."""
-    return c.belief.target.error_z_m - hover_config(c).below_m
+    return c.belief.target.gear_to_target_z_m - hover_config(c).below_m
 
 
 def has_left_place(c: Context) -> bool:
     """True if the vehicle is outside the cone, or too high or too low."""
-    lateral_m = c.belief.target.error_xy_m
-    return lateral_m > cone_radius_m(c) or abs(height_error_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
+    lateral_m = c.belief.target.gear_to_target_distance_xy_m
+    return (
+        lateral_m > cone_radius_m(c)
+        or abs(distance_below_hover_height_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
+    )
 
 
 def left_place_reason(c: Context) -> str:
     """Return how far the vehicle is from its place."""
+    aside_m, below_m = (
+        c.belief.target.gear_to_target_distance_xy_m,
+        distance_below_hover_height_m(c),
+    )
     return (
-        f"moved {c.belief.target.error_xy_m:.2f} m to the side and {abs(height_error_m(c)):.2f} m "
-        f"{'down' if height_error_m(c) > 0.0 else 'up'} from its place"
+        f"moved {aside_m:.2f} m to the side and {abs(below_m):.2f} m "
+        f"{'down' if below_m > 0.0 else 'up'} from its place"
     )
 
 
@@ -136,8 +143,8 @@ HOVER = PhaseDefinition(
             {Phase.HOVER},
             lambda c: c.held_s(SUNK) >= HOVER_SINK_DWELL_S,
             Phase.ASCEND,
-            lambda c: f"{height_error_m(c):.2f} m too low: climbing back",
-            claims=Claim.RESUMES_HOVER,
+            lambda c: f"{distance_below_hover_height_m(c):.2f} m too low: climbing back",
+            claims=VehicleClaim.RESUMES_HOVER,
         ),
     ),
 )

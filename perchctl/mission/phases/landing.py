@@ -7,10 +7,10 @@ from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.descent import DESCENT_MANEUVER, act, enter_descent
-from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.phase import Outcome, Phase, VehicleClaim
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
-from perchctl.mission.transition import Predicate, Transition, abort_landing_row
+from perchctl.mission.transition import Predicate, Transition, abort_during_landing_row
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
@@ -23,16 +23,18 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     claims, b = state.entry.claims, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.
-    capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong
-    if Claim.POSITIONS_WRONG in claims or (Claim.MOUNTING_WRONG in claims and capture):
+    capture = b.profile.positioning.source.is_mocap and b.mounting.is_camera_mounting_wrong
+    if VehicleClaim.EXTERNAL_POSITIONS_WRONG in claims or (
+        VehicleClaim.MOUNTING_WRONG in claims and capture
+    ):
         reckoning = (
             b.reckoning if b.is_position_diverged else correct_bias_for_wrong_positions(b.reckoning)
         )
         b = replace(b, is_position_diverged=True, reckoning=reckoning)
-    if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
+    if before.state.phase is Phase.RECOVER and VehicleClaim.HANGS not in claims:
         b = replace(b, last_contact_offset=None)  # no evidence of a support at that position
     # With a wrong mounting, the setpoint leads in a wrong direction.
-    setpoint = None if Claim.MOUNTING_WRONG in claims else state.setpoint
+    setpoint = None if VehicleClaim.MOUNTING_WRONG in claims else state.setpoint
     return enter_descent(replace(state, belief=b, setpoint=setpoint), before.state)
 
 
@@ -95,23 +97,23 @@ LANDING = PhaseDefinition(
                 )
             ),
         ),
-        abort_landing_row(
+        abort_during_landing_row(
             "held-elsewhere",
             make_rest_predicate(RestState.HELD),
             "motors off; something holds the vehicle away from the target: look before you touch "
             "it",
         ),
-        abort_landing_row(
+        abort_during_landing_row(
             "hangs-or-stands",
             lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_RECHECK_DURATION_S,
             "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
             "whether the vehicle hangs or stands: look before you touch it",
         ),
-        abort_landing_row(
+        abort_during_landing_row(
             "landing-timeout",
             lambda c: c.in_phase_s > c.planner.landing.timeout_s,
             unconfirmed_landing_reason,
-            claims=Claim.LANDING_UNCONFIRMED,
+            claims=VehicleClaim.LANDING_UNCONFIRMED,
         ),
     ),
 )

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import CONTACT, current_gear_offset
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.quality import LATERAL_BLOW, position_loss_text
+from perchctl.mission.belief.quality import LATERAL_SPEED_BEYOND_DRAUGHT, position_loss_text
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase
@@ -29,7 +29,7 @@ from perchctl.mission.setpoints import (
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
-LATERAL_BLOW_DWELL_S = 0.04
+LATERAL_SPEED_BEYOND_DRAUGHT_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
 MAX_BLIND_PRESS_S = 1.25
 """Longest press after the last sighting, s, since the last centimetres are flown without the target
@@ -47,9 +47,9 @@ def act(c: Context) -> Action:
     if perch.mode == "raw":
         return c.state, RawThrust(perch.thrust)
     old = c.state.setpoint or hold_here(c)
-    if target.world_m is None:
+    if target.world_position_m is None:
         return fly_to(c, old, corrects_height=False)
-    goal = setpoint_under_target(c, target.body_z_touching_target_m + perch.press_m)
+    goal = setpoint_under_target(c, target.vehicle_world_z_when_touching_m + perch.press_m)
     setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
     return fly_to(c, setpoint, corrects_height=False)
 
@@ -59,7 +59,7 @@ def is_in_contact(c: Context) -> bool:
     return c.held_s(CONTACT) >= c.planner.perch.contact_dwell_s
 
 
-def contact_reason(c: Context) -> str:
+def contact_evidence_text(c: Context) -> str:
     """Return what proves the contact, and its offset."""
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
@@ -81,7 +81,7 @@ PERCH = PhaseDefinition(
             ),
             lambda c: f"contact {current_gear_offset(c.belief).text}",
         ),
-        Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_reason),
+        Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_evidence_text),
         back_off_row(
             "pressed-blindly",
             {Phase.PERCH},
@@ -95,7 +95,9 @@ PERCH = PhaseDefinition(
         back_off_row(
             "knocked-aside",
             {Phase.PERCH},
-            lambda c: c.held_s(LATERAL_BLOW) >= LATERAL_BLOW_DWELL_S,
+            lambda c: (
+                c.held_s(LATERAL_SPEED_BEYOND_DRAUGHT) >= LATERAL_SPEED_BEYOND_DRAUGHT_DWELL_S
+            ),
             "pushed sideways under the target",
         ),
         back_off_row(

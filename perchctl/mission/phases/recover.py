@@ -15,10 +15,10 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.phase import Outcome, Phase, VehicleClaim
 from perchctl.mission.release import (
     catch_slip,
-    choose_catch_setpoint_above_m,
+    choose_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
 )
@@ -34,7 +34,7 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_THRUST_RATIO_WITHOUT_CATCH = 0.85
+MIN_THRUST_TO_HOVER_WITHOUT_CATCH = 0.85
 """Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
 CONTACT_CLEARANCE_M = 0.05
@@ -54,34 +54,38 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     """Record the last touch, and prepare a catch if the vehicle falls."""
     old, b, claims = before.state, before.belief, state.entry.claims
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
-    touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
+    touched = old.phase is Phase.PERCH or VehicleClaim.BLOCKED in claims
     # A vehicle whose motors carry most of its weight hardly falls.
-    falls = Claim.SLIPPED in claims and thrust < MIN_THRUST_RATIO_WITHOUT_CATCH * b.hover_thrust
+    falls = (
+        VehicleClaim.SLIPPED in claims
+        and thrust < MIN_THRUST_TO_HOVER_WITHOUT_CATCH * b.hover_thrust
+    )
     belief = replace(
         state.belief,
         last_contact_offset=_find_touch_offset(before, claims),
         # The vehicle counts as within the magnet's reach until its position is below.
-        last_contact_body_z_m=z_m if touched else b.last_contact_body_z_m,
+        vehicle_world_z_at_last_contact_m=z_m if touched else b.vehicle_world_z_at_last_contact_m,
     )
     return replace(
         state,
         belief=belief,
-        motor_stop_ordered_s=None,
+        motor_stop_ordered_at_s=None,
         release_began_s=None,
-        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_m(b.hover_thrust, thrust)
+        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(b.hover_thrust, thrust)
         if falls
         else None,
-        blocked_z_m=z_m if Claim.BLOCKED in claims else old.blocked_z_m,
+        blocked_z_m=z_m if VehicleClaim.BLOCKED in claims else old.blocked_z_m,
     )
 
 
-def _find_touch_offset(before: Context, claims: Claim) -> ContactOffset | None:
+def _find_touch_offset(before: Context, claims: VehicleClaim) -> ContactOffset | None:
     """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
     old, b = before.state, before.belief
-    if Claim.STILL_ATTACHED in claims:  # the contact was proven, and the vehicle has not come off
+    # the contact was proven, and the vehicle has not come off
+    if VehicleClaim.STILL_ATTACHED in claims:
         return b.last_contact_offset
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
-        return b.last_contact_offset if b.last_contact_body_z_m is not None else None
+        return b.last_contact_offset if b.vehicle_world_z_at_last_contact_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
     # `SUPPORT_SHOWN_BY_IMU` includes that dwell time
     carried = proven or b.held_s(SUPPORT_SHOWN_BY_IMU) >= 0.0
@@ -110,7 +114,7 @@ def act(c: Context) -> Action:
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
     target = c.belief.target
-    if target.world_m is not None and target.age_s < MAX_FOLLOWED_SIGHTING_AGE_S:
+    if target.world_position_m is not None and target.age_s < MAX_FOLLOWED_SIGHTING_AGE_S:
         x, y = body_world_xy_under_target(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
@@ -123,7 +127,7 @@ def has_recovered(c: Context) -> bool:
     """True if the vehicle has been steady for `recover.dwell_s`, away from its contact."""
     dwell_s = c.planner.recover.dwell_s
     steady = c.held_s(STEADY) >= dwell_s and c.in_phase_s >= dwell_s
-    return steady and c.belief.last_contact_body_z_m is None
+    return steady and c.belief.vehicle_world_z_at_last_contact_m is None
 
 
 def unsteady_reason(c: Context) -> str:
@@ -134,7 +138,7 @@ def unsteady_reason(c: Context) -> str:
         x_m, y_m, _ = c.telemetry.position_m
         lateral_offset_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
         seen.append(f"{lateral_offset_m:.2f} m from its setpoint")
-    if b.last_contact_body_z_m is not None:
+    if b.vehicle_world_z_at_last_contact_m is not None:
         seen.append("still at its contact")
     text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
     return f"{text}: {', '.join(seen)}" if seen else text

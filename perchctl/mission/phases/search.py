@@ -49,13 +49,13 @@ def act(c: Context) -> Action:
         )
         c = Context(state)
     x, y, z = state.entry.position_m
-    if b.target.world_m is not None:
+    if b.target.world_position_m is not None:
         there = body_world_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_awaiting_evidence
         x, y = (
             _limit_move_before_mounting_check(b.mounting, (x, y), there) if unconfirmed else there
         )
-        height = min(z, b.target.body_z_touching_target_m - c.planner.ascend.near_m)
+        height = min(z, b.target.vehicle_world_z_when_touching_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
