@@ -14,7 +14,8 @@ from perchctl.vehicle import Telemetry
 
 
 class Context:
-    """Belief and planner state in one tick; the argument of all rows and actions.
+    """Belief and planner state in one tick: the argument of all functions of the transition table's
+    rows, and of the phases' actions (`act`).
 
     Attributes:
         state: the decisions of the planner so far, `PlannerState`.

@@ -15,7 +15,8 @@ from perchctl.mission.transition import Transition
 
 
 def keep_state(state: PlannerState, before: Context) -> PlannerState:
-    """Enter a phase that needs no preparation."""
+    """Return the state unchanged: the `enter` function of a phase that needs no preparation.
+    `before` is not used."""
     del before
     return state
 

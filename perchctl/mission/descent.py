@@ -117,8 +117,9 @@ MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the descent without the mission's table, for watchdog and rescue. The first
-    call begins the landing. `state` is None if the planner has not run yet."""
+    """Fly one tick of the descent without the mission's transition table: for the watchdog, which
+    takes over from a silent loop, and for the rescue after an exception. The first call begins the
+    landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
@@ -126,7 +127,8 @@ def step_landing(
 
 
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
-    """Return the state at the end of a tick that has decided on `command`, and the command."""
+    """Store in the state what later ticks need to know of `command` (raw thrust, time, end of the
+    thrust check), and return both as the result of the tick."""
     order = state.raw_thrust_order
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
@@ -300,7 +302,8 @@ def _is_standing(c: Context) -> bool:
 
 
 def _restart_landing_with_catch(c: Context) -> Action:
-    """Restart the landing at the present height, with a catch."""
+    """Restart the landing at the present height, and first stop the fall by a setpoint above the
+    vehicle (a catch)."""
     tel, b = c.telemetry, c.belief
     belief = replace(
         b,
@@ -336,7 +339,8 @@ def _catch_fall(c: Context) -> Action | None:
 
 
 def _descend_by_setpoints(c: Context) -> Action:
-    """Sink straight down from the start of the landing, at the landing's speed."""
+    """Lower the setpoint at `landing.speed_mps`, vertically below the position at which the landing
+    began."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = hold_here(c)
     start = here

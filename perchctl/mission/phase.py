@@ -123,8 +123,8 @@ _EXIT_CODES: dict[Outcome, int] = {
 
 
 class VehicleClaim(Flag):
-    """What a row claims about the vehicle, in addition to its reason. The next phase starts from
-    the claims. Code that needs such a fact tests the claim, never the name of a row."""
+    """What a transition claims about the vehicle, in addition to its reason. The next phase starts
+    from the claims. Code that needs such a fact tests the claim, never the name of a row."""
 
     NONE = 0
     BLOCKED = auto()

@@ -86,7 +86,8 @@ def _update_before_decision(
 
 
 def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """Return the state with the position error of the observation's frame."""
+    """Return the state with the position error of the hover, as measured in the observation's new
+    picture, added to the sums."""
     target, below_m = obs.target, (profile.planner.hover or HoverConfig()).below_m
     assert target is not None
     x_m, y_m, z_m = (float(each) for each in target.e_m)

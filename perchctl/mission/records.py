@@ -48,8 +48,9 @@ class Event:
     def note_from_rescue(
         cls, t_s: float, error: BaseException, rest: RestState, text: str
     ) -> Event:
-        """Return the note on the vehicle's rest state after an error in flight, as the rescue found
-        it."""
+        """Return the event in which the rescue, the emergency landing after an exception in the
+        loop, notes the exception `error` and the vehicle's rest state; `text` says in words where
+        the vehicle rests."""
         reason = f"{type(error).__name__} in flight: {text}"
         return cls(t_s, EventKind.NOTE, reason, rest=rest)
 

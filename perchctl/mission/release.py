@@ -100,7 +100,9 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def lower_thrust(c: Context) -> Action:
-    """First stage of the release: lower the setpoint, or the raw thrust of a press, in steps."""
+    """First stage of the transfer of the weight from the rotors to the magnet: lower, in steps, the
+    setpoint to `complete.release_drop_m` below the contact or, in a press by raw thrust, the thrust
+    to just below the holding thrust, until the magnet is seen to carry the vehicle."""
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -172,8 +174,9 @@ def has_thrust_ramped_down(c: Context) -> bool:
 
 
 def stop_motors(c: Context) -> Action:
-    """Send stop and notify `STOP_ORDER_COUNT` times because one lost notify would lock a hanging
-    vehicle; send more while the telemetry shows thrust."""
+    """Send the stop command, and with it the message that ends high-level setpoints (notify),
+    `STOP_ORDER_COUNT` times: if a single notify were lost, the firmware's supervisor would lock the
+    hanging vehicle. Send more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.motor_stop_ordered_at_s is None:
         return replace(

@@ -25,7 +25,8 @@ table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems 
 
 
 class RestState(Enum):
-    """The rest state of a vehicle with its motors off, in words without a full stop."""
+    """Where a vehicle with its motors off rests: on the magnet, on the floor, held elsewhere, or
+    unknown. Each value is a phrase without a full stop."""
 
     HANGS = "the vehicle hangs on the magnet with its motors off"
     HELD = "something holds the vehicle away from the target; the motors are off"

@@ -267,7 +267,7 @@ def wrong_mounting_reason(c: Context) -> str:
 
 
 def is_held_by_target(c: Context) -> bool:
-    """True if the target's magnet already holds the vehicle."""
+    """True if the target's magnet holds the vehicle although no press has proven a contact."""
     hangs = c.held_s(HANGING) >= HANGING_DWELL_S
     return hangs and c.support is Support.MAGNET
 

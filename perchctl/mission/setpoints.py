@@ -131,8 +131,9 @@ def step_towards(
 
 
 def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = True) -> Action:
-    """Store the reference and send it corrected; without `corrects_height`, its height is not
-    corrected."""
+    """Store the setpoint `reference`, where the vehicle should be, and send the one that brings it
+    there in spite of wind and onboard control errors (`correct_setpoint`). Without
+    `corrects_height`, the height sent is that of `reference`."""
     return replace(c.state, setpoint=reference), limit_setpoint(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
@@ -150,8 +151,9 @@ def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
 
 
 def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """Return the integral (x, y) of the position error to `goal_xy_m`, m, world axes, which removes
-    the offset that a steady wind leaves.
+    """Return the integral (x, y) over time of the lateral position error to `goal_xy_m`, times the
+    gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset which a
+    steady wind leaves.
 
     The integral is limited, and frozen while the vehicle is still on its way: a large error
     accumulates, and the integral may become large, only while the vehicle hovers in place.
@@ -219,8 +221,9 @@ def correct_setpoint(
 
 
 def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Return the lateral feedback on top of the onboard controllers; zero far from the target or
-    with old telemetry."""
+    """Return the shift (x, y) of the setpoint, m, world axes, that adds feedback of lateral
+    position, velocity and lean to that of the onboard controllers; zero far from the target or with
+    old telemetry."""
     near = (
         LATERAL_FEEDBACK_START_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
     ) / LATERAL_FEEDBACK_FADE_IN_M
@@ -280,7 +283,7 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
 
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """Return the setpoint moved inside the fence, below the height limit and (fault 36) at least
+    """Return the setpoint moved inside the fence, below the height limit, and at least
     `GROUND_CLEARANCE_M` above the ground; in a take-off, at least at the ground."""
     ground, safety = c.belief.takeoff_position_m, c.safety
     if ground is None:

@@ -52,7 +52,8 @@ class Transition:
 def motor_cut_row(
     name: str, when: Predicate, reason: str, outcome: Outcome = Outcome.SAFETY
 ) -> Transition:
-    """Return a row that cuts and locks the motors at once, in any airborne phase."""
+    """Return a row that stops the motors at once in any airborne phase and locks the vehicle: the
+    firmware then refuses to fly until it is restarted."""
     return _abort_row(name, when, reason, outcome, EmergencyStop())
 
 
@@ -108,7 +109,8 @@ def back_off_row(
 def abort_during_landing_row(
     name: str, when: Predicate, reason: Reason, claims: VehicleClaim = VehicleClaim.NONE
 ) -> Transition:
-    """Return a row that ends a landing which could not be completed normally."""
+    """Return a row from LANDING to ABORTED, where the motors are stopped, for a landing that could
+    not be completed normally."""
     return Transition(
         name,
         {Phase.LANDING},

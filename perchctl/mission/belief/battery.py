@@ -65,17 +65,20 @@ MAX_BATTERY_READING_AGE_S = 1.0
 
 
 class SagModel(NamedTuple):
-    """The two parameters that the fit determines."""
+    """The two fitted parameters of the battery model: the voltage sag at full thrust, V, and the
+    true discharge rate divided by the rate counted from the assumed current."""
 
     full_thrust_sag_v: float
     true_to_counted_discharge_ratio: float
 
 
 class FitSums(NamedTuple):
-    """Weighted sums over the readings: the normal equations of the least-squares fit.
+    """Weighted sums over the voltage readings: the normal equations of the least-squares fit.
 
-    A reading's error is its deviation from the typical model. It is explained by the thrust times
-    the sag's deviation, plus the drop of the resting voltage times the factor's deviation.
+    The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
+    `TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO` predict. The fit explains it by the thrust, as a share
+    of full thrust, times the deviation of the sag, plus the counted drop of the resting voltage
+    since take-off, V, times the deviation of the discharge ratio.
     """
 
     thrust_squared: float = 0.0

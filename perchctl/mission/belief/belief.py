@@ -130,8 +130,9 @@ class Belief:
         )
 
     def with_observation(self, obs: Observation, profile: Profile) -> Belief:
-        """Return a copy with a newer observation. Properties use it at once; the fields change only
-        in the next `update_belief`."""
+        """Return a copy with a newer observation. Properties that read the observation, such as
+        telemetry and ages, are new at once; the filtered fields keep their values until
+        `update_belief`."""
         return replace(self, obs=obs, profile=profile)
 
     def held_s(self, condition: Condition[Belief]) -> float:
@@ -163,8 +164,8 @@ class Belief:
 
     @cached_property
     def telemetry_age_s(self) -> float:
-        """Age of the oldest part of the telemetry, s; a frozen reading is as old as its first
-        sample."""
+        """Age of the oldest part of the telemetry, s. A reading that keeps repeating exactly, as no
+        real one does, is as old as the first sample with that value."""
         tel, imu = self.obs.telemetry, self.obs.imu
         oldest_s = max(tel.behind_s, imu.only_attitude_frozen_for_s, imu.only_position_frozen_for_s)
         return self.obs.t_s - tel.t_s + oldest_s
@@ -183,16 +184,16 @@ class Belief:
 
     @cached_property
     def worst_axis_velocity_variance_m2ps2(self) -> float:
-        """Variance of the estimated velocity, (m/s)^2. Infinite if it is missing; 0 if
-        `link.unreported` says that the vehicle never reports it, so that no variance limit
-        applies."""
+        """Variance of the estimated velocity along its most uncertain axis, (m/s)^2. Infinite if it
+        is missing; 0 if `link.unreported` says that the vehicle never reports it, so that no
+        variance limit applies."""
         return self._variance_or_default(self.obs.telemetry.velocity_variance_m2ps2)
 
     @cached_property
     def worst_axis_position_variance_m2(self) -> float:
-        """Variance of the estimated position, m^2; with decks, of the height alone, because a Flow
-        deck measures no other position. Infinite if unknown, 0 if `link.unreported` says that the
-        vehicle does not report it."""
+        """Variance of the estimated position along its most uncertain axis, m^2; with decks, of the
+        height alone, because a Flow deck measures no other position. Infinite if unknown, 0 if
+        `link.unreported` says that the vehicle does not report it."""
         tel = self.obs.telemetry
         by_deck = self.profile.positioning.source.is_deck
         return self._variance_or_default(
@@ -229,8 +230,8 @@ class Belief:
     @cached_property
     def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `POSITION_SETTLING_AFTER_GAP_S`, have not diverged and, if they come from pictures, agree
-        with the accelerometer."""
+        `POSITION_SETTLING_AFTER_GAP_S`, have not led the vehicle away from its setpoint (diverged)
+        and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
             self.is_positioned_by_target and self.obs.camera_imu_mismatch is not None
         )
@@ -253,8 +254,8 @@ class Belief:
 
     @cached_property
     def is_estimated_velocity_being_corrected(self) -> bool:
-        """True while the newest position still corrects the estimated velocity: it is at most
-        `MAX_POSITION_AGE_BEYOND_LATENCY_S` older than the latency."""
+        """True while the newest external position still corrects the estimated velocity: it is at
+        most `MAX_POSITION_AGE_BEYOND_LATENCY_S` older than the camera's latency."""
         return self.position_age_s <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_LATENCY_S
 
     @cached_property
@@ -276,7 +277,9 @@ class Belief:
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
-        """True if the height, the telemetry stream or the control loop is unreliable."""
+        """True if the state estimate has jumped, the telemetry is older than
+        `safety.telemetry_hold_s`, the link reports a problem, or the loop runs late. A descent is
+        then left to the firmware's own landing where that is possible."""
         safety = self.profile.safety
         return (
             self.obs.link_problem is not None
@@ -287,7 +290,9 @@ class Belief:
 
     @cached_property
     def can_descend_by_target(self) -> bool:
-        """True if the position from the target is good enough for a descent."""
+        """True if the estimate is good enough for a descent with the target as the only position
+        source: the positions are trusted (recent, not diverged), no gust is uncorrected, and the
+        flight data is reliable."""
         return (
             self.is_position_trusted
             and not self.has_uncorrected_gust
@@ -296,14 +301,20 @@ class Belief:
 
     @cached_property
     def has_only_imu_for_descent(self) -> bool:
-        """True if only accelerometer and attitude remain for a descent."""
+        """True if only accelerometer and attitude remain for a descent: with the target as the
+        position source, once `can_descend_by_target` is false; with a deck or motion capture, while
+        positions are missing or too new to be trusted, but not once they have diverged."""
         if self.is_positioned_by_target:
             return not self.can_descend_by_target
         return not (self.is_position_trusted or self.is_position_diverged)
 
     @cached_property
     def can_descend_by_position(self) -> bool:
-        """True if the vehicle can descend under position control."""
+        """True if the vehicle can descend under position control, by a position from any source
+        (deck, motion capture or target): positions have not diverged, dead reckoning has not
+        replaced them, and the heading is not lost (unless the telemetry is too old for the
+        alternative, raw thrust). With the target as the source, `can_descend_by_target` must hold
+        as well."""
         lost = self.is_position_diverged or self.dead_reckoning_since_s is not None
         if lost or (self.is_positioned_by_target and not self.can_descend_by_target):
             return False
@@ -359,9 +370,9 @@ class Belief:
     @cached_property
     def lean_acceleration_world_xy_mps2(self) -> tuple[float, float]:
         """Lateral acceleration (x, y), m/s^2, world axes, that follows from the difference between
-        the present lean and the mean lean. The mean lean itself causes none: it balances the wind,
-        an unbalanced vehicle, or an error of the estimated attitude. Wrong after a change of the
-        wind, until the mean has followed."""
+        the present lean and its mean (low-passed with `LEAN_TIME_CONSTANT_S`). The mean lean itself
+        causes none: it balances the wind, an unbalanced vehicle, or an error of the estimated
+        attitude. Wrong after a change of the wind, until the mean has followed."""
         (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
@@ -414,9 +425,10 @@ class Belief:
 
     @cached_property
     def lateral_offset(self) -> LateralOffset | None:
-        """Lateral offset from the gear to the target and velocity, from pictures and lean. None if
-        the last pictures are too old or too few, or once they contradict the vehicle's motion: with
-        a rotated camera, this velocity would damp nothing."""
+        """Vector from the gear to the target and the vehicle's velocity, lateral and in world axes,
+        from pictures and lean. None if the last pictures are too old or too few, or contradict the
+        vehicle's motion: the camera may then be mounted rotated, and feedback of this velocity
+        would not damp the motion."""
         if self.mounting.is_camera_mounting_wrong or self.obs.camera_imu_mismatch is not None:
             return None
         return self.lateral_offset_filter.predict(self.obs.t_s)

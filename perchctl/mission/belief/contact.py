@@ -132,8 +132,9 @@ def current_gear_offset(b: Belief) -> ContactOffset:
 
 
 def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
-    """Return the `current_gear_offset` of the last touch, during a retreat only. None with a fresh
-    sighting, or once motion capture shows that the vehicle has left the position of that touch."""
+    """Return the gear's offset from the target's axis at the last touch, while the vehicle retreats
+    from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, or once motion
+    capture shows that the vehicle has left the position of that touch."""
     if not b.sent.maneuver.retreats or b.last_contact_offset is None or b.target.is_fresh:
         return None
     x_m, y_m, _ = b.telemetry.position_m
@@ -150,12 +151,12 @@ def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
 
 
 def contact_height_tolerance_m(b: Belief) -> float:
-    """Return the largest height difference between gear and target, m, at which a support may be
-    the target.
+    """Return the largest height difference between gear and target, m, at which whatever holds the
+    vehicle may be the target.
 
     It grows with the time since the last sighting, because the estimated height drifts, up to twice
-    `perch.contact_z_m`, so that an obstacle further below the target is not taken for it. `CONTACT`
-    has tolerances of its own.
+    `perch.contact_z_m`, so that an obstacle further below the target is not taken for it. The
+    condition `CONTACT`, which proves a touch of the target, has tolerances of its own.
     """
     planner = b.profile.planner
     drift_mps = (
@@ -185,8 +186,9 @@ def max_press_thrust(profile: Profile) -> float:
 
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
-    """True if the thrust equals hover thrust: nothing supports, presses or accelerates the
-    vehicle."""
+    """True if the present thrust is hover thrust: speed, climb rate and specific force are within
+    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_MPS` and `MAX_HOVER_DEVIATION_FROM_1G_G` of those in
+    hover, and nothing blocks a climb."""
     tel, setpoint = b.telemetry, b.sent.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
@@ -220,9 +222,9 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 
 
 def is_above_hover_thrust(b: Belief) -> bool:
-    """True if the thrust exceeds hover thrust, or is so close to its maximum that it cannot exceed
-    hover thrust by more. The maximum is the ordered thrust during a press by raw thrust, otherwise
-    full thrust."""
+    """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If its
+    maximum leaves less room than that, a thrust close to the maximum is enough. The maximum is the
+    ordered thrust during a press by raw thrust, otherwise full thrust."""
     most = SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
         most = MIN_PRESS_TO_ORDERED_THRUST_RATIO * max_press_thrust(b.profile)
@@ -258,14 +260,15 @@ def is_slipping(b: Belief) -> bool:
 
 
 def is_motionless(b: Belief) -> bool:
-    """True if the vehicle is motionless and supported: the accelerometer reads 1 g."""
+    """True if the vehicle is supported and does not move vertically: the accelerometer reads 1
+    g."""
     return b.is_reading_one_g and (
         abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_MPS or not b.is_position_valid
     )
 
 
 def _is_in_contact(b: Belief) -> bool:
-    """True if position, acceleration and thrust together show a contact (fault 40).
+    """True if position, acceleration and thrust together show a contact.
 
     The gear has stopped at the target's height, the accelerometer reads 1 g, and the thrust exceeds
     hover thrust, so the ceiling must take the difference.
@@ -384,7 +387,8 @@ def _is_blocked(b: Belief) -> bool:
 
 def _shows_support_by_imu(b: Belief) -> bool:
     """True if accelerometer and thrust alone show that something supports or presses the vehicle:
-    in the air, thrust this far above or below hover thrust would make it climb or sink."""
+    in the air, a thrust that differs from hover thrust by as much as
+    `MIN_PRESS_TO_HOVER_THRUST_RATIO` says, upwards or downwards, would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
         0 < hover < MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS * FULL_THRUST
@@ -476,9 +480,10 @@ def find_support(b: Belief) -> Support:
 
     A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
     is on something else only if the gear is certainly outside, or at another height than the
-    target. If neither is certain, the support is UNKNOWN, and a row must assume the worse of the
-    two. The support is also UNKNOWN while thrust or position is unknown, while the vehicle
-    accelerates, and in the first tick of a maneuver.
+    target. If neither is certain, the support is UNKNOWN, and a row of the transition table must
+    assume the more dangerous of the two: the magnet or something else. The support is also UNKNOWN
+    while thrust or position is unknown, while the vehicle accelerates, and in the first tick of a
+    maneuver.
     """
     if HANGING in b.condition_start_times_s:
         return _find_what_vehicle_hangs_on(b)
@@ -527,7 +532,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 
 def has_slipped(b: Belief) -> bool:
-    """True if the vehicle has slipped off its contact: after a dwell time, or at once in free
+    """True if the vehicle has slipped off its contact: `is_slipping` has been true for
+    `complete.slip_dwell_s` or, once raw thrust transfers the weight, at the first sign of free
     fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = b.sent.release_began_s is not None and tel.acc_z_g < complete.slip_acc_g

@@ -58,7 +58,8 @@ def update_start_times(
 
 
 def keep_persistent_start_times(condition_start_times_s: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
-    """Return the entries that survive a change of phase or a hold."""
+    """Return the start times of those conditions that do not restart when the phase changes or a
+    hold pauses the mission: the ones with `persists_across_phases`."""
     return {
         each: began_s
         for each, began_s in condition_start_times_s.items()

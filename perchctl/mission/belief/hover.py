@@ -60,9 +60,10 @@ it."""
 
 
 def estimate_hover_thrust(b: Belief) -> HoverThrust:
-    """Return the filter's estimate. Without one, return the mean ratio of thrust to specific force
-    in flight, and without that, the ratio of the newest sample. Both fallbacks have the standard
-    deviation `FALLBACK_HOVER_THRUST_SIGMA`."""
+    """Return the hover thrust measured by the filter (`HoverThrust`). While it has measured
+    nothing, return the mean ratio of thrust (0..65535) to specific force (g) in flight, and without
+    that, the ratio in the newest sample. Both fallbacks have the standard deviation
+    `FALLBACK_HOVER_THRUST_SIGMA`."""
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry

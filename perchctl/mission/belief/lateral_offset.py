@@ -48,9 +48,8 @@ RESTART_NIS = 20.0
 exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
 wrong."""
 MAX_SIGMA_OF_USED_VELOCITY_MPS = 0.03
-"""Largest standard deviation of the filter's velocity at which its offset and velocity are used,
-m/s; an uncertain velocity is unknown to `predict`. Larger: the vehicle is steered by the first
-pictures' noise."""
+"""Largest standard deviation of the filter's velocity with which the filter is used, m/s; with a
+larger one, `predict` returns None. Larger: the vehicle is steered by the first pictures' noise."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,8 @@ class LateralOffset:
 
 
 class MotionSample(NamedTuple):
-    """Acceleration of the lean and estimated velocity of a telemetry sample, world axes (x, y)."""
+    """Lateral acceleration that the vehicle's lean causes, m/s^2, and estimated lateral velocity,
+    m/s, of the telemetry sample at `t_s`; world axes (x, y)."""
 
     t_s: float
     acceleration_mps2: LateralVector
@@ -202,7 +202,8 @@ class LateralOffsetFilter:
         )
 
     def _with_velocity(self, velocity_mps: LateralVector) -> LateralOffsetFilter:
-        """Return the filter after a measurement of the velocity at its own time."""
+        """Return the filter after a measurement of the vehicle's velocity at the filter's time,
+        `t_s`."""
         p_ee, p_ev, p_vv = self.covariance
         variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
         gain_e, gain_v = p_ev / variance, p_vv / variance

@@ -71,14 +71,16 @@ class SentOrders:
 
     @property
     def is_under_power(self) -> bool:
-        """True until the release by raw thrust begins or the motors are stopped."""
+        """True until raw thrust begins to transfer the vehicle's weight to the magnet (the
+        release), or the motors are ordered to stop."""
         return self.release_began_s is None and self.motor_stop_ordered_at_s is None
 
     def with_frame_shift(
         self, shifted_setpoint: PositionSetpoint | None, by_m: Vector
     ) -> SentOrders:
-        """Return the same orders with the start of the maneuver shifted by `by_m`, the motion
-        of the estimate's world frame, and with `shifted_setpoint`, which is in the new frame."""
+        """Return the same orders after the estimate's world frame has moved by `by_m`: the position
+        at which the maneuver began is shifted by it, and the setpoint is `shifted_setpoint`, which
+        is in the new frame."""
         x, y, z = self.maneuver_start_m
         return replace(
             self,

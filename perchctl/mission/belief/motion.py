@@ -360,8 +360,9 @@ class SteadySpeed:
 
 @dataclass(frozen=True)
 class PushDetector:
-    """Time of the last lateral push: the mean specific force across the body's z axis exceeded
-    `MIN_PUSH_G`, more than drag in flight causes."""
+    """Time of the last lateral push: the specific force perpendicular to the body's z axis,
+    averaged with the time constant `PUSH_TIME_CONSTANT_S`, exceeded `MIN_PUSH_G`, more than drag in
+    flight causes."""
 
     mean_lateral_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     last_push_at_s: float = -math.inf  # time of the last lateral push
@@ -467,8 +468,9 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
 
 
 def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """Return the motion after its first sample or after a silence: the detectors start again, and
-    the learned offsets stay. Record the silence, and whether a fall may have happened in it."""
+    """Return the motion after its first sample, or after a gap in the telemetry: the detectors
+    start again, and the learned offsets of the accelerometer stay. Record when the gap ended, and
+    whether a fall may have happened in it."""
     motion = replace(
         motion,
         climb_steady_since_s=new.t_s,

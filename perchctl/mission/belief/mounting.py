@@ -63,7 +63,8 @@ class MountingSample:
 
     @property
     def up_axis_at_target_height_world_xy_m(self) -> complex:
-        """Point where the vehicle's upward axis meets the target's plane."""
+        """Point, world x + iy in m, where the vehicle's upward axis meets the horizontal plane at
+        the target's height."""
         return self.vehicle_world_xy_m + self.up_axis_offset_xy_m
 
 

@@ -372,9 +372,10 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
 def learn_bias_at_rest(
     old: DeadReckoning, before: ImuMotion | None, now: ImuMotion
 ) -> DeadReckoning:
-    """Return the reckoning of a vehicle that is held still, so that all lateral acceleration
-    between the two motions is bias. The bias must be learned anew: in wind, the estimated attitude
-    has an error, which disappears within a second after the contact."""
+    """Return the reckoning of a vehicle that is held still, so that the whole lateral acceleration
+    between `before` and `now` is the combined bias of accelerometer and attitude. The bias must be
+    learned anew: in wind, the estimated attitude has an error, which disappears within a second
+    after the contact."""
     if (
         before is None
         or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
@@ -400,8 +401,9 @@ def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the reckoning with a corrected bias: positions in wrong axes have given the estimate a
-    velocity that the accelerometer has not measured, and a tilt error in proportion to it."""
+    """Return the reckoning with its acceleration bias corrected after positions in wrong axes. They
+    have given the state estimate a velocity that the accelerometer has not measured and, in
+    proportion to it, a wrong tilt, which was learned as a bias."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_velocity_unseen_by_imu_mps
     return replace(
         old,
@@ -437,8 +439,8 @@ def accumulate_position_step(
 
 
 def _position_time_s(sample: Telemetry) -> float:
-    """Return the time of the sample's position; a lag of up to `MAX_UP_TO_DATE_POSITION_LAG_S`
-    counts as none."""
+    """Return the time of the sample's position, s, which is older than its attitude by the sample's
+    `behind_s`. A difference of at most `MAX_UP_TO_DATE_POSITION_LAG_S` counts as none."""
     return sample.t_s - max(0.0, sample.behind_s - MAX_UP_TO_DATE_POSITION_LAG_S)
 
 

@@ -107,8 +107,8 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
 
 
 def has_tick_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
-    """True if more time has passed since the planner's last tick than a position may be missing,
-    `positioning.hold_s`."""
+    """True if more than `positioning.hold_s`, the longest time for which positions may be missing,
+    has passed since the planner's last tick."""
     return belief.last_telemetry is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
 
 
@@ -142,8 +142,8 @@ def update_after_command(b: Belief, command: Command) -> Belief:
 
 
 def _update_target(b: Belief) -> Belief:
-    """Return the belief with the target's position and spread, and the velocity from pictures,
-    after a frame that measured the target."""
+    """Return the belief with the target's position, the scatter of its recent measured positions,
+    and the vehicle's velocity from pictures, after a frame that measured the target."""
     target = b.obs.target
     if not b.obs.has_new_frame or target is None or not target.measured:
         return b
@@ -329,7 +329,8 @@ def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Adopt the velocity on which pictures and accelerometer agree, once per new result."""
+    """Adopt the velocity on which pictures and accelerometer agree, each time the visual-inertial
+    estimate (`VisualInertialMotion`) has a new one."""
     motion, before = b.obs.visual_inertial_motion, b.reckoning.imu
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new

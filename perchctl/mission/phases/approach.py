@@ -36,7 +36,8 @@ AT_TAKEOFF_HEIGHT = Condition[Context](
 
 
 def act(c: Context) -> Action:
-    """Climb on position setpoints, so that the firmware levels the vehicle out if they stop."""
+    """Climb to `takeoff_height_m` above the take-off position by position setpoints, so that the
+    firmware levels the vehicle out if they stop arriving."""
     planner, state, b = c.planner, c.state, c.belief
     assert b.takeoff_position_m is not None
     x, y, z = b.takeoff_position_m

@@ -36,8 +36,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """Release in two stages, stop the motors once the whole weight hangs, and monitor the
-    vehicle."""
+    """Transfer the weight from the rotors to the magnet in two stages (the release), stop the
+    motors once the whole weight hangs, and monitor the vehicle."""
     if c.state.motor_stop_ordered_at_s is not None:
         return stop_motors(c)
     holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s

@@ -26,7 +26,7 @@ TARGET_POSITION_STEADY = Condition[Context](
 
 
 def act(c: Context) -> Action:
-    """Hold the setpoint."""
+    """Hold the setpoint while several frames confirm the target's position."""
     return fly_to(c, c.state.setpoint or hold_here(c))
 
 

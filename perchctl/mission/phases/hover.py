@@ -74,12 +74,14 @@ def act(c: Context) -> Action:
 
 
 def distance_below_hover_height_m(c: Context) -> float:
-    """Return how far the vehicle is below its place, m; negative above it."""
+    """Return how far the vehicle is below its hover place, m; negative above it."""
     return c.belief.target.gear_to_target_z_m - hover_config(c).below_m
 
 
 def has_left_place(c: Context) -> bool:
-    """True if the vehicle is outside the cone, or too high or too low."""
+    """True if the gear's offset from the target's axis exceeds the radius of the approach cone
+    (`cone_radius_m`), or its height differs from that of the hover by more than
+    `MAX_HOVER_HEIGHT_ERROR_M`."""
     lateral_m = c.belief.target.gear_to_target_distance_xy_m
     return (
         lateral_m > cone_radius_m(c)

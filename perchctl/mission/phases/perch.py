@@ -40,8 +40,9 @@ radius. Smaller: a covered marker ends attempts that would succeed."""
 def act(c: Context) -> Action:
     """Raise the setpoint through the target while x, y and heading keep following it.
 
-    The learned integral is frozen and the height correction is off (`lift=False`) because both
-    would wind up against the ceiling. In raw mode, order the thrust instead.
+    The integral of the lateral error is frozen, and the height is not corrected
+    (`corrects_height=False`), because both would wind up against the ceiling. If the profile
+    presses by raw thrust, order that thrust instead of a setpoint.
     """
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":
@@ -60,7 +61,7 @@ def is_in_contact(c: Context) -> bool:
 
 
 def contact_evidence_text(c: Context) -> str:
-    """Return what proves the contact, and its offset."""
+    """Return, in words, what proves the contact, and the gear's offset from the target's axis."""
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
         by = f"acceleration and thrust ({position_loss_text(c.belief)})"

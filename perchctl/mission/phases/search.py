@@ -71,7 +71,7 @@ def _limit_move_before_mounting_check(
     mounting: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the goal, world x and y (m), limited to `MAX_MOVE_BEFORE_MOUNTING_CHECK_M` from the
-    last sighting, else from `start`."""
+    vehicle's position at the last sighting of the target, or from `start` if there was none."""
     if mounting.sightings:
         start = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
