@@ -40,7 +40,7 @@ class Problem:
 class PerchError(Exception):
     """Base of all reported failures; the process ends with its `exit_code`.
 
-    The message is `found`, followed by `advice`, which says what to do, if it is known separately.
+    The message is `found`, followed by `advice` (what to do about it) if that is given.
     """
 
     exit_code = 1

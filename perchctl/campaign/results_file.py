@@ -132,7 +132,7 @@ def campaign_header(
 
 
 def profile_sha256(profile: Profile) -> str:
-    """The SHA-256 of all values of a profile that may change a flight."""
+    """The SHA-256 of all profile values that can affect a flight."""
     values = profile.model_dump(mode="json", exclude={"name", "description"})
     text = json.dumps([values, camera_record(profile)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

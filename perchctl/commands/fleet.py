@@ -187,7 +187,7 @@ def fly(
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the plan, and connect to nothing.")
+        bool, typer.Option("--dry-run", help="Show the plan without connecting to anything.")
     ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")

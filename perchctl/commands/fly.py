@@ -68,7 +68,7 @@ RecordOption = Annotated[
     ),
 ]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Show the resolved plan, and connect to nothing.")
+    bool, typer.Option("--dry-run", help="Show the resolved plan without connecting to anything.")
 ]
 YesOption = Annotated[
     bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")

@@ -205,7 +205,7 @@ def replay(
     ] = True,
     as_json: JsonOption = False,
 ) -> int:
-    """Replay a flight from its log, and verify that every command is identical, bit by bit.
+    """Replay a flight from its log, and verify that every command is bit-for-bit identical.
 
     If there is a recording next to the log, perchctl also processes its pictures again and
     verifies the poses. With --set or --profile, it reports which decisions would have been

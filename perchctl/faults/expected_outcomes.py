@@ -98,7 +98,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "the operator's word",
-        "cutting the motors as the operator ordered locks the vehicle",
+        "cutting the motors on the operator's command locks the vehicle",
         lambda facts: facts.stop_s,
         CUT_DOWN,
     ),

@@ -60,8 +60,8 @@ def read_device_type(cf: Any) -> str | None:
 
 
 def check_airframe(cf: Any, uri: str) -> None:
-    """Raise ConnectionFailed for a kind of vehicle whose thrust or battery perchctl does not
-    know."""
+    """Raise ConnectionFailed for a vehicle type for which perchctl has no thrust or battery
+    figures."""
     device_type = read_device_type(cf)
     if device_type in AIRFRAMES:
         return

@@ -152,5 +152,5 @@ class GuardedLink:
         if not isinstance(sample, Telemetry):
             raise TypeError(f"a sample must be a Telemetry, not {type(sample).__name__}")
         if not sample.t_s <= self._clock() + SAMPLE_AHEAD_S:
-            raise ValueError(f"a sample's t_s must be a past time, not {sample.t_s}")
+            raise ValueError(f"a sample's t_s must be in the past, not {sample.t_s}")
         return sample

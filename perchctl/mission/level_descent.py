@@ -182,7 +182,7 @@ def descend_level(c: Context) -> Action:
     measured_mps = _measured_climb_mps(c)
     climb_mps = measured_mps + descent.climb_change_not_yet_measured_mps
     is_sinking, ramp_per_s = climb_mps <= -MIN_DETECTED_SINK_MPS, THRUST_RAMP_PER_S
-    if _fresh_visual_motion(c) is not None:  # on the floor, recent orders cause no climb
+    if _fresh_visual_motion(c) is not None:  # a vehicle on the floor ignores orders
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_MEASURED_BY_CAMERA_MPS,
             THRUST_RAMP_BY_CAMERA_PER_S,

@@ -27,7 +27,7 @@ _MIN_ACROSS_TO_WITHIN_FIELD_ENERGY = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # a pixel's difference counts above this multiple of the mean difference within the fields
-_MIN_PIXEL_TO_MEAN_FIELD_DIFFERENCE = 5.0
+_MIN_FIELD_DIFFERENCE_OVER_MEAN = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _CLASSIFICATION_PERIOD_FRAMES = 3
@@ -64,7 +64,7 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_MIN_PIXEL_TO_MEAN_FIELD_DIFFERENCE * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
+    least = max(_MIN_FIELD_DIFFERENCE_OVER_MEAN * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)

@@ -150,7 +150,7 @@ def make_pipeline(
 
 def make_camera_only_profile(profile: Profile) -> Profile:
     """Return the profile for tracking with a camera alone: without mounting and gear, so that poses
-    are in the camera frame, and with a pose of each marker."""
+    are in the camera frame, and with a separate pose reported for each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
         update={

@@ -286,7 +286,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
         if points.allows_for_curl:
-            weight = curl_weight_matrix(_whitened_curl_effect(points, scored))
+            weight = curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -335,7 +335,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
-    curl = _whitened_curl_effect(points, scored)
+    curl = _whitened_paper_curl_shift(points, scored)
     weight = curl_weight_matrix(curl) if points.allows_for_curl else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
@@ -353,7 +353,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     return PoseCovariance(cov, chi2 / freedom, curled)
 
 
-def _whitened_curl_effect(points: WeightedCorners, scored: ScoredPose) -> Array:
+def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the change (2n, 2) of the whitened errors by one standard deviation of each mode of
     curl."""
     target_normal_cam = rotation_matrix(scored.rvec)[:, 2]

@@ -185,7 +185,7 @@ _MIN_ROTATION_TO_REPORT_RAD = math.radians(15.0)  # a larger rotation is mention
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # largest share of the squared misfit that the better of two explanations may leave
-_MAX_REMAINING_MISFIT_FRACTION = 0.25
+_MAX_MISFIT_RATIO_TO_ALTERNATIVE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,7 +431,7 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
     unclaimed = _unmodelled_yaw_xyz_sigma(range_m)
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, world_residual))
     calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _MAX_GATE_CHI2
-    return calm and seen < _MAX_REMAINING_MISFIT_FRACTION * jumped
+    return calm and seen < _MAX_MISFIT_RATIO_TO_ALTERNATIVE * jumped
 
 
 def _matches_previous_track(
@@ -453,7 +453,7 @@ def _matches_previous_track(
     )
     return (
         misfit.squared_mahalanobis <= _MAX_GATE_CHI2
-        and before < _MAX_REMAINING_MISFIT_FRACTION * now
+        and before < _MAX_MISFIT_RATIO_TO_ALTERNATIVE * now
     )
 
 

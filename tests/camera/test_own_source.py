@@ -83,8 +83,8 @@ def test_the_first_frame_is_waited_for_and_given_first(opened: Any) -> None:
 @pytest.mark.parametrize(("given", "words"), [
     (ZeroDivisionError("of its author"), "ZeroDivisionError: of its author"),
     (GREY, "must return a Frame or None, not ndarray"),
-    (frame(10.5), r"t_s must be a past time, not 10\.5"),
-    (frame(float("nan")), "t_s must be a past time, not nan"),
+    (frame(10.5), r"t_s must be in the past, not 10\.5"),
+    (frame(float("nan")), "t_s must be in the past, not nan"),
     (frame(9.2, None), "the picture is None"),
 ])  # fmt: skip
 def test_what_it_does_wrong_is_a_lost_camera(given: Any, words: str, opened: Any) -> None:

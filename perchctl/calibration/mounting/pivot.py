@@ -4,7 +4,7 @@ tilted around it.
 The point c in the target's frame and the tip in the camera's frame are the same in every picture:
 ``tip = R_cam_target c + p_cam_target``. Both are found by linear least squares, in which each
 picture is weighted by its own covariance and outliers count little. Neither the vehicle's attitude
-nor the times of the pictures are needed.
+nor the pictures' timestamps are needed.
 """
 
 from __future__ import annotations

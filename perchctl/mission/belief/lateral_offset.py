@@ -25,11 +25,10 @@ from perchctl.values import replace
 LateralVector = tuple[float, float]
 
 ACCELERATION_NOISE_MPS2 = 0.15
-"""Standard deviation of the acceleration that the lean does not explain, m/s^2, which lasts for
-`ACCELERATION_NOISE_DURATION_S`. Larger: the velocity follows the noise of single pictures. Smaller:
-after a gust, the offset lags behind."""
-ACCELERATION_NOISE_DURATION_S = 0.1
-"""Duration of such an acceleration, s."""
+"""Standard deviation of the acceleration that the lean does not explain, m/s^2. Larger: the
+velocity follows the noise of single pictures. Smaller: after a gust, the offset lags behind."""
+ACCELERATION_NOISE_CORRELATION_S = 0.1
+"""Correlation time of that acceleration, s. Larger: as a larger standard deviation."""
 MIN_PICTURE_SIGMA_M = 0.0005
 """Smallest standard deviation of a picture's offset, m: attitude and exposure time are not exact,
 either. Smaller: the velocity follows their errors."""
@@ -186,7 +185,7 @@ class LateralOffsetFilter:
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
         """Return the filter at `t_s` after a constant acceleration."""
         dt_s = t_s - self.t_s
-        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_DURATION_S
+        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_CORRELATION_S
         p_ee, p_ev, p_vv = self.covariance
         moved_m = _add(self.offset_m, -dt_s, self.velocity_mps)
         return replace(

@@ -19,7 +19,9 @@ TARGET_RECHECK_DURATION_S = 2.0
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Start the descent, using the transition's claims about positions, mounting and contact."""
+    """Start the descent. Where the row that ordered it claims that external positions or the
+    mounting are wrong, the descent does not use them, and without a claim that the vehicle hangs,
+    the last contact is forgotten."""
     claims, b = state.entry.claims, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.

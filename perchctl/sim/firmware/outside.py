@@ -179,14 +179,14 @@ class ExternalFilter:
             self.reset()
 
     def update_position(self, measured_m: Vector) -> None:
-        """Correct the estimate by an external position, taken as current."""
+        """Correct the estimate using an external position, taken as current."""
         if all(map(math.isfinite, measured_m)):
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
             sigma_m = self._parameters["locSrv.extPosStdDev"]
             self._correct(POSITION_STATE, (mx - x, my - y, mz - z), sigma_m)
 
     def update_attitude(self, measured: Quaternion) -> None:
-        """Correct the estimate by an external attitude, body to world."""
+        """Correct the estimate using an external attitude (body to world)."""
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
             return
