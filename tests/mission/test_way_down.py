@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.belief.contact import CONTACT
+from perchctl.mission.belief.contact import CONTACT, MOTORS_OFF_DWELL_S
 from perchctl.mission.descent import (
     MAX_HEIGHT_ESTIMATE_DRIFT_M,
     ONBOARD_LANDING_MARGIN_S,
@@ -148,8 +148,22 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     return recent is not None and all(_at_rest(o) and o.telemetry.thrust <= 5000.0 for o in recent)
 
 
+def motors_off(seen: list[Observation]) -> bool:
+    """The motors stand already, as the supervisor may have stopped them."""
+    recent = _was_fresh(seen, MOTORS_OFF_DWELL_S)
+    return recent is not None and all(
+        o.telemetry.thrust == 0.0 and o.telemetry.supervisor == READY for o in recent
+    )
+
+
 @pytest.mark.long
 @settings(max_examples=400)
+@example(
+    bits=[(8, 0.02, 0.0, 1.0, 0.0, 0.01)],
+    begin={"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 9.9},
+    doubt={},
+    flying=False,
+)
 @given(
     bits=st.lists(BITS, min_size=1, max_size=6),
     begin=st.sampled_from(STATES),
@@ -183,7 +197,8 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
                 floor = on_the_floor(
                     seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
                 )
-                assert floor or ((begin or state.release_began_s) and on_the_ceiling(seen))
+                ceiling = (begin or state.release_began_s) and on_the_ceiling(seen)
+                assert floor or ceiling or (state.release_began_s and motors_off(seen))
                 return
             if state.phase is not Phase.LANDING:
                 return
