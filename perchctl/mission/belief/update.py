@@ -148,7 +148,7 @@ def _update_target(b: Belief) -> Belief:
     if not b.obs.has_new_frame or target is None or not target.measured:
         return b
     b = replace(b, visual_motion=b.visual_motion.with_detection(target))
-    if target.measured_offset_m is not None:
+    if target.measured_offset_m is not None and math.isfinite(target.measured_offset_sigma_m):
         x_m, y_m, _ = target.measured_offset_m.tolist()
         filtered = b.lateral_offset_filter.with_picture(
             target.measured_s, (x_m, y_m), target.measured_offset_sigma_m
