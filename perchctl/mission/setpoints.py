@@ -263,8 +263,9 @@ def _lateral_error(
     if offset is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
-    # The reference may still be on its way to the target.
-    x_m, y_m = body_world_xy_under_target(c, reference.yaw_rad)
+    # The reference may still be on its way to the target. The offset is that of the gear as the
+    # vehicle heads now, and the reference's heading may differ.
+    x_m, y_m = body_world_xy_under_target(c, tel.yaw_rad)
     return (
         reference.x_m - x_m + offset.offset_m[0],
         reference.y_m - y_m + offset.offset_m[1],

@@ -19,6 +19,7 @@ from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import (
     HANG_Z_M,
     PROFILE,
+    changed,
     observation,
     remembering,
     state_in,
@@ -291,3 +292,26 @@ def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
     ):
         ticks = fly(state, lambda t_s, c=changes: observation(t_s, Z_M, **c), 0.5).ticks
         assert (ticks[-1].state.belief.lateral_offset is not None) is known
+
+
+@AGAIN
+@given(heading_rad=st.floats(-0.6, 0.6), ahead_m=st.floats(0.01, 0.05))
+def test_a_gear_beside_the_body_turns_with_the_vehicle(heading_rad: float, ahead_m: float) -> None:
+    """While the vehicle still has to turn, its gear is not where it will be: whether the pictures
+    or the state estimate tell where a vehicle at rest is, its setpoint is the same."""
+    profile = changed({"vehicle.gear_body_m": (ahead_m, 0.0, 0.03)})
+    gear_m = (ahead_m * math.cos(heading_rad), ahead_m * math.sin(heading_rad), 0.03)
+    offset_m = np.array([0.0, 0.0, HANG_Z_M - Z_M]) - np.array(gear_m)
+
+    def setpoint(measured_offset_m: np.ndarray | None) -> PositionSetpoint:
+        def look(t_s: float) -> Observation:
+            sample = telemetry(t_s, Z_M, yaw_rad=heading_rad)
+            target = target_at(t_s, body_m=(0.0, 0.0, Z_M), measured_offset_m=measured_offset_m)
+            return observation(t_s, telemetry=sample, target=target)
+
+        command = fly(ascending(), look, 0.5, profile=profile, one_phase=True).command
+        assert isinstance(command, PositionSetpoint)
+        return command
+
+    shown, estimated = setpoint(offset_m), setpoint(None)
+    assert (shown.x_m, shown.y_m) == pytest.approx((estimated.x_m, estimated.y_m), abs=2e-4)
