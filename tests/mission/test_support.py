@@ -73,6 +73,17 @@ def test_what_holds_it_below_the_target_is_something_else(below_m: float) -> Non
     assert supported(hanging(0.0, below_m=below_m)) is Support.HELD_BY_OTHER
 
 
+@given(above_m=st.floats(0.15, 0.4), angle_rad=angles_rad)
+def test_what_holds_it_at_an_impossible_height_may_be_the_target(
+    above_m: float, angle_rad: float
+) -> None:
+    """No vehicle hangs above the plane of a target on the ceiling: the estimate is wrong. Its
+    offset from the axis still counts."""
+    radius_m = PROFILE.planner.perch.contact_xy_m
+    assert supported(hanging(0.5 * radius_m, angle_rad, -above_m)) is Support.UNKNOWN
+    assert supported(hanging(3.0 * radius_m, angle_rad, -above_m)) is Support.HELD_BY_OTHER
+
+
 @given(ratio=st.floats(0.97, 1.03), offset_m=st.floats(0.0, 0.2))
 def test_a_vehicle_with_the_thrust_to_hover_flies(ratio: float, offset_m: float) -> None:
     obs = hanging(offset_m, below_m=0.5)

@@ -479,8 +479,9 @@ def find_support(b: Belief) -> Support:
     """Return what supports the vehicle, from the conditions that are true in this tick.
 
     A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
-    is on something else only if the gear is certainly outside, or at another height than the
-    target. If neither is certain, the support is UNKNOWN, and a row of the transition table must
+    is on something else only if the gear is certainly outside, or certainly below the target. An
+    estimate that places the gear above the target, where the ceiling is, is wrong and does not
+    count as another height. If neither is certain, the support is UNKNOWN, and a row of the transition table must
     assume the more dangerous of the two: the magnet or something else. The support is also UNKNOWN
     while thrust or position is unknown, while the vehicle accelerates, and in the first tick of a
     maneuver.
@@ -506,8 +507,8 @@ def _find_what_vehicle_hangs_on(b: Belief) -> Support:
         return Support.MAGNET
     offset = gear_offset_at_last_touch_or_now(b)
     is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > radius_m
-    at_its_height = touched is not None or is_at_contact_height(b)
-    return Support.UNKNOWN if at_its_height and not is_off_axis else Support.HELD_BY_OTHER
+    is_below = touched is None and b.target.gear_to_target_z_m > contact_height_tolerance_m(b)
+    return Support.HELD_BY_OTHER if is_off_axis or is_below else Support.UNKNOWN
 
 
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
