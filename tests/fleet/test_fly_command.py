@@ -518,7 +518,11 @@ serve_parent()
 @pytest.mark.long
 def test_two_fly_over_one_dongle(tmp_path: Path) -> None:
     """Two simulated vehicles behind a fake dongle, flown as real ones: by the clock on the wall,
-    through a hub in a process of its own."""
+    through a hub in a process of its own.
+
+    A computer that is too busy delivers images and telemetry late, and then a vehicle is right to
+    land: what each ends with depends on the computer, that it ends on the ground or on its target
+    does not."""
     profile, air = load_profile("sim"), uris(2)
     with contextlib.ExitStack() as stack:
         vehicles = [
@@ -545,7 +549,7 @@ def test_two_fly_over_one_dongle(tmp_path: Path) -> None:
         )
     record = json.loads(done.stdout)
     assert all(vehicle["has_flown"] for vehicle in record["vehicles"]), done.stderr
-    assert record["hanging"] >= 1, done.stderr
     assert record["problems"] == []
     for vehicle, uri in zip(record["vehicles"], air, strict=True):
+        assert vehicle["outcome"] != "failed", done.stderr
         assert read_log(Path(record["folder"]) / vehicle["log"]).header["uri"] == uri
