@@ -240,18 +240,26 @@ def _found(
     to it.
 
     A measured latency is first searched among the usable ones: just after the lift-off, any delay
-    explains a target that stood still.
+    explains a target that stood still. A usable latency that leaves more motion than the pictures'
+    noise, and hardly less than the latency in use, explains nothing: it is only the closest to one
+    that is too long to use.
     """
     in_use_s, least_later_s = 0.0, LEAST_LATER_S
-    best = int(np.argmin(wanders_m))
     if measured is not None:
         in_use_s, least_later_s = measured.in_use_s, MEASURED_LATER_S
+    as_it_is_m = float(wanders_m[np.argmin(np.abs(later_s - in_use_s) + np.abs(TURNS_RAD))])
+
+    def refutes_latency_in_use(i: int) -> bool:
+        return as_it_is_m >= max(WANDERS_M, WANDERS_MORE * float(wanders_m[i]))
+
+    best = int(np.argmin(wanders_m))
+    if measured is not None:
         usable = (later_s >= measured.least_s) & (later_s <= measured.most_s) & (TURNS_RAD == 0.0)
         likely = int(np.argmin(np.where(usable, wanders_m, np.inf)))
-        if wanders_m[likely] < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
+        is_as_good = wanders_m[likely] < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best]))
+        if is_as_good and (wanders_m[likely] < WANDERS_M or refutes_latency_in_use(likely)):
             best = likely
-    as_it_is = float(wanders_m[np.argmin(np.abs(later_s - in_use_s) + np.abs(TURNS_RAD))])
-    if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
+    if not refutes_latency_in_use(best):
         return None
     found = CameraImuMismatch(_refined_s(wanders_m, later_s, best), float(TURNS_RAD[best]))
     is_off = (

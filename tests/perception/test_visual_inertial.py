@@ -83,6 +83,7 @@ def watched(
     offset_g: float = 0.0,
     rate_hz: float = RATE_HZ,
     measured: MeasuredLatency | None = None,
+    noise_m: float = 1e-3,
 ) -> VisualInertialWindow:
     rng = np.random.default_rng(0)
     watch = VisualInertialWindow()
@@ -92,7 +93,7 @@ def watched(
         newest = int((t_s + LATENCY_S) * 100.0)
         samples = tuple(flown[newest - 200 : newest + 1])
         x, y, z = swing.way_m(t_s - later_s, turned_rad)
-        x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
+        x, y = x + float(rng.normal(0.0, noise_m)), y + float(rng.normal(0.0, noise_m))
         watch = estimate_motion(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0), measured)
     return watch
 
@@ -157,6 +158,24 @@ def test_a_latency_that_cannot_be_measured_is_the_planner_s_matter(
     turned = watched(Swing(0.05), later_s=in_use_s, turned_rad=math.pi, measured=measured)
     assert turned.correction_s is None
     assert turned.mismatch == CameraImuMismatch(0.0, math.pi)
+
+
+@BRIEFLY
+@given(
+    beyond_s=st.floats(BEYOND_S + STEP_S, 0.08),
+    noise_m=st.floats(0.003, 0.0035),
+    heading_rad=st.floats(-3.0, 3.0),
+)
+def test_the_nearest_usable_latency_does_not_hide_one_just_beyond(
+    beyond_s: float, noise_m: float, heading_rad: float
+) -> None:
+    """Although it explains the sightings about as well, of a vehicle whose attitude is uncertain."""
+    measured, later_s = MeasuredLatency(-0.04, LEAST_S, MOST_S), MOST_S + beyond_s
+    swing = Swing(0.05, heading_rad=heading_rad)
+    watch = watched(swing, later_s=later_s, measured=measured, noise_m=noise_m)
+    assert watch.correction_s is None
+    assert watch.mismatch is not None
+    assert watch.mismatch.camera_latency_error_s == pytest.approx(later_s + 0.04, abs=0.03)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, -1])
