@@ -169,7 +169,7 @@ def test_a_latency_that_cannot_be_measured_is_the_planner_s_matter(
 def test_the_nearest_usable_latency_does_not_hide_one_just_beyond(
     beyond_s: float, noise_m: float, heading_rad: float
 ) -> None:
-    """Although it explains the sightings about as well, of a vehicle whose attitude is uncertain."""
+    """Although it explains noisy sightings about as well."""
     measured, later_s = MeasuredLatency(-0.04, LEAST_S, MOST_S), MOST_S + beyond_s
     swing = Swing(0.05, heading_rad=heading_rad)
     watch = watched(swing, later_s=later_s, measured=measured, noise_m=noise_m)

@@ -481,10 +481,10 @@ def find_support(b: Belief) -> Support:
     A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
     is on something else only if the gear is certainly outside, or certainly below the target. An
     estimate that places the gear above the target, where the ceiling is, is wrong and does not
-    count as another height. If neither is certain, the support is UNKNOWN, and a row of the transition table must
-    assume the more dangerous of the two: the magnet or something else. The support is also UNKNOWN
-    while thrust or position is unknown, while the vehicle accelerates, and in the first tick of a
-    maneuver.
+    count as another height. If neither is certain, the support is UNKNOWN, and a row of the
+    transition table must assume the more dangerous of the two: the magnet or something else. The
+    support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates, and
+    in the first tick of a maneuver.
     """
     if HANGING in b.condition_start_times_s:
         return _find_what_vehicle_hangs_on(b)
