@@ -13,7 +13,7 @@ if is_command_line():
 
 import lazy_loader
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 if sys.platform == "win32":
