@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
@@ -330,6 +331,47 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         sigma_m, abs=1e-3
     )
     assert current_gear_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("image_age_s", "thrust", "below_m", "sees"),
+    [
+        (0.05, 1.3, 0.0, True),
+        (0.2, 1.3, 0.0, True),
+        (0.5, 1.3, 0.0, False),  # exposed before it touched
+        (0.05, 1.0, 0.0, False),  # it hovers: nothing holds the gear in place
+        (0.05, 1.3, 0.2, False),  # an image of before the climb, whatever its time says
+    ],
+)
+def test_an_image_of_the_contact_shows_where_the_gear_is(
+    image_age_s: float, thrust: float, below_m: float, sees: bool
+) -> None:
+    """The state estimate, by which the gear is 12 mm off centre, has wandered."""
+
+    def look(t_s: float) -> Observation:
+        climbs = t_s < BEGIN_S + 0.3
+        exposed_s = t_s - image_age_s
+        target = target_at(
+            t_s,
+            body_m=(0.012, 0.0, HANG_Z_M),
+            measured_s=exposed_s,
+            measured_offset_m=np.array([-0.003, 0.002, below_m]),
+            measured_offset_sigma_m=5e-4,
+        )
+        changes = {
+            "position_m": (0.012, 0.0, HANG_Z_M),
+            "velocity_mps": (0.0, 0.0, 0.3 if climbs else 0.0),
+            "thrust": thrust * HOVER_THRUST,
+        }
+        return at(obs={"target": target, "has_new_frame": True}, **changes)(t_s)
+
+    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.5, MOCAP, feels=True)
+    offset = current_gear_offset(flight.state.belief)
+    if sees:
+        assert offset.lateral_offset_m == pytest.approx(math.hypot(0.003, 0.002), abs=1e-6)
+        assert offset.sigma_m < 0.0015
+    else:
+        assert offset.lateral_offset_m == pytest.approx(0.012, abs=1e-3)
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------

@@ -117,9 +117,41 @@ HANGING_DWELL_S = 1.0
 
 
 def current_gear_offset(b: Belief) -> ContactOffset:
-    """Return the gear's offset from the target's axis, with its standard deviation. With decks, the
-    deviation grows after the last sighting because the estimate drifts and the impact on the
-    ceiling disturbs it."""
+    """Return the gear's offset from the target's axis, with its standard deviation: from an image
+    exposed during the present contact, otherwise by dead reckoning from the last sighting. With
+    decks, the deviation then grows because the estimate drifts and the impact on the ceiling
+    disturbs it."""
+    return _gear_offset_seen_in_contact(b) or _reckoned_gear_offset(b)
+
+
+def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
+    """Return the gear's offset in the newest image that shows the target, if it was exposed during
+    the present contact; otherwise None.
+
+    Friction holds the gear while it is pressed, so the offset in an image remains true until the
+    contact ends, and the state estimate, which wanders by millimetres, has no part in it. Images
+    that contradict the vehicle's motion are not used: they may be older than they seem. The offset
+    is wrong if the vehicle slides after the exposure.
+    """
+    target = b.obs.target
+    if (
+        target is None
+        or target.measured_offset_m is None
+        or b.obs.camera_imu_mismatch is not None
+        or b.mounting.is_camera_mounting_wrong
+        or not _is_in_contact(b)
+        or target.measured_s < b.imu.climb_steady_since_s
+    ):
+        return None
+    x_m, y_m, z_m = target.measured_offset_m.tolist()
+    if abs(z_m) > b.profile.planner.perch.contact_z_m:
+        return None
+    return ContactOffset(
+        math.hypot(x_m, y_m), math.hypot(target.measured_offset_sigma_m, TOUCH_OFFSET_SIGMA_M)
+    )
+
+
+def _reckoned_gear_offset(b: Belief) -> ContactOffset:
     reckoning = b.reckoning
     sigma_m = math.hypot(
         reckoning.lateral_sigma_m, TOUCH_OFFSET_SIGMA_M, *reckoning.position_step_sum_xy_m
