@@ -83,7 +83,7 @@ def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask
     with contextlib.ExitStack() as stack:
         uri, spec, profile = start_if_simulated(options, calibrated, scope, stack)
         mocap = open_room(profile, scope, stack)
-        link = ProbeLink(uri, profile.link, time.monotonic)
+        link = ProbeLink(options.uri, profile.link, time.monotonic, link_uri=uri)
         stack.callback(link.close)
         scope.announce(f"connecting to {options.uri}")
         answers = True

@@ -61,7 +61,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     with contextlib.ExitStack() as stack:
         uri, spec, profile = start_if_simulated(options, calibrated, scope, stack)
         mocap = open_room(profile, scope, stack)
-        probe = ProbeLink(uri, profile.link, time.monotonic)
+        probe = ProbeLink(options.uri, profile.link, time.monotonic, link_uri=uri)
         stack.callback(probe.close)
         session = VehicleChecks(probe, options.uri, profile, mocap, scope)
         take = yield from session.rows()
@@ -126,7 +126,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
 class VehicleChecks:
     """Checks of a vehicle and its motion capture.
 
-    `uri`: the given address; `probe` may have the address of a simulated vehicle.
+    `uri`: the given address; `probe` may open that of a simulated vehicle instead.
     """
 
     probe: ProbeLink

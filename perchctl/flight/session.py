@@ -152,7 +152,9 @@ def fly_session(
             own = make_extension(uri, "link.uri", VehicleLink, clock.now, profile.link)
             link = GuardedLink(own, clock.now)
         else:
-            link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
+            link = CflibLink(
+                options.uri, profile.link, clock.now, positioning=positioning, link_uri=uri
+            )
         try:
             link.connect()
             if before_arming is not None:

@@ -72,6 +72,9 @@ class CflibLink:
     `connection` is None while not connected. `landing_wait_s` is the time for which `close` waits
     for a vehicle that still flies. Unless `positioning` uses decks, the estimator is configured for
     external positions.
+
+    `uri` names the vehicle in every message. `link_uri` is what cflib opens instead, such as the
+    vehicle behind a radio hub; it contains a key and is never shown.
     """
 
     def __init__(
@@ -81,10 +84,12 @@ class CflibLink:
         clock: Callable[[], float],
         landing_wait_s: float = LANDING_WAIT_S,
         positioning: PositioningConfig | None = None,
+        link_uri: str | None = None,
     ) -> None:
         check_uri(uri)
+        check_uri(link_uri or uri)
         self._positioning = positioning or PositioningConfig()
-        self._uri = uri
+        self._uri, self._link_uri = uri, link_uri or uri
         self._config = config
         self._clock = clock
         self._landing_wait_s = landing_wait_s
@@ -97,7 +102,8 @@ class CflibLink:
         self.connection: Connection | None = None
 
     def connect(self) -> None:
-        self.connection = open_connection(self._uri, self._config.connect_timeout_s)
+        timeout_s = self._config.connect_timeout_s
+        self.connection = open_connection(self._link_uri, timeout_s, shown_uri=self._uri)
         try:
             self._prepare(self.connection)
         except BaseException:

@@ -10,6 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -42,10 +43,10 @@ class Connection:
 
     `lost` is None while connected, otherwise the cause in one sentence. `cf` is cflib's object, for
     its tables, parameters and log blocks. `claim`, the vehicle's lock, is closed when the
-    connection ends.
+    connection ends. `shown_uri` replaces the opened URI in cflib's messages.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shown_uri: str | None = None) -> None:
         from cflib.crazyflie import Crazyflie
 
         cache = user_folder("cache") / "toc"
@@ -55,6 +56,7 @@ class Connection:
         self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
         self.cause = Problem("", "")  # of the newest `lost`
+        self._shown_uri = shown_uri
         self.claim = contextlib.ExitStack()
         self._settled = threading.Event()  # set when connected, or failed
         # guards the fields below; cflib is never called with it held
@@ -165,6 +167,8 @@ class Connection:
         self._settled.set()
 
     def _lose(self, cause: Problem) -> None:
+        if self._shown_uri is not None and self.cf.link_uri:
+            cause = replace(cause, found=cause.found.replace(self.cf.link_uri, self._shown_uri))
         self.cause, self.lost = cause, _cause_text(cause)
 
     def _give_up(self, cause: Problem) -> None:
@@ -239,18 +243,19 @@ class _Nowhere:
         return None
 
 
-def open_connection(uri: str, timeout_s: float) -> Connection:
-    """Open a vehicle's connection with all tables and parameters read.
+def open_connection(uri: str, timeout_s: float, *, shown_uri: str | None = None) -> Connection:
+    """Open a vehicle's connection with all tables and parameters read. Messages name the vehicle
+    `shown_uri`, or `uri` without it.
 
     `timeout_s` is shared by `CONNECT_TRIES` attempts, since a single lost packet can block cflib's
     connect permanently (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also if another
     program uses the vehicle.
     """
-    share_s = timeout_s / CONNECT_TRIES
-    with lock_vehicle(uri) as claim:
+    share_s, shown_uri = timeout_s / CONNECT_TRIES, shown_uri or uri
+    with lock_vehicle(uri, shown_uri) as claim:
         init_cflib()
         for _ in range(CONNECT_TRIES):
-            connection = Connection()
+            connection = Connection(shown_uri)
             answered = False
             try:
                 answered = connection.open(uri, share_s)
@@ -259,13 +264,13 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
                     connection.close(farewell=False)
             if answered and connection.lost is not None:
                 cause = connection.cause
-                found, separator = f"no Crazyflie at {uri}: {cause.found}", _separator(cause)
+                found, separator = f"no Crazyflie at {shown_uri}: {cause.found}", _separator(cause)
                 raise ConnectionFailed(found, cause.advice, separator=separator)
             if answered:
                 connection.claim = claim.pop_all()
                 return connection
     raise ConnectionFailed(
-        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s",
+        f"no Crazyflie at {shown_uri}: no answer within {share_s:.0f} s",
         "switch it on and check its address; perchctl check --scan lists the vehicles that answer",
     )
 
@@ -362,8 +367,9 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
 # streams of setpoints would conflict.
 
 
-def lock_vehicle(uri: str) -> contextlib.ExitStack:
-    """Lock the vehicle at `uri` for this process until the result is closed.
+def lock_vehicle(uri: str, shown_uri: str | None = None) -> contextlib.ExitStack:
+    """Lock the vehicle at `uri`, in messages `shown_uri`, for this process until the result is
+    closed.
 
     Nothing is locked if no lock can be created (no writable folder, or Windows). Raises
     ConnectionFailed if another program holds the lock.
@@ -379,7 +385,7 @@ def lock_vehicle(uri: str) -> contextlib.ExitStack:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ConnectionFailed(
-                    f"the vehicle at {uri} is in use by another program",
+                    f"the vehicle at {shown_uri or uri} is in use by another program",
                     "end that program, or name another vehicle",
                     separator=": ",
                 ) from None

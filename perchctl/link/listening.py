@@ -161,8 +161,14 @@ class ProbeLink(ReadOnlyLink):
     NEEDED_PROTOCOL = NEEDED_PROTOCOL
     estimator_parameters = staticmethod(estimator_parameters)
 
-    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
-        super().__init__(uri, config, clock)
+    def __init__(
+        self,
+        uri: str,
+        config: LinkConfig,
+        clock: Callable[[], float],
+        link_uri: str | None = None,
+    ) -> None:
+        super().__init__(uri, config, clock, link_uri=link_uri)
         self.quality: float | None = None
         self.missing: tuple[str, ...] = ()
 

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.errors import Interrupted, UsageError
+from perchctl.errors import ConnectionFailed, Interrupted, UsageError
 from perchctl.flight import OperatorSwitch, cut_key, operator_signals, session
 from perchctl.flight.operator import (
     FASTER_THAN_A_HAND_S,
@@ -467,6 +467,24 @@ def test_without_a_terminal_there_is_no_key() -> None:
     finally:
         os.close(reader)
         os.close(writer)
+
+
+def test_a_flight_behind_a_radio_hub_names_its_vehicle_by_its_own_uri(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    uri, key = "radio://0/80/2M/E7E7E7E701", "0123456789abcdef"
+    monkeypatch.setattr(session, "open_camera", lambda *_, **__: SimpleNamespace(close=int, live=1))
+    options = session.FlyOptions(
+        load_profile("crazyflie"),
+        Path("crazyflie.yaml"),
+        uri,
+        "http://cam/",
+        link_uri=f"hub://127.0.0.1:1/80/2M/E7E7E7E701?key={key}",
+    )
+    with pytest.raises(ConnectionFailed, match=uri) as refused:
+        session.fly_session(options)
+    assert "hub://" not in str(refused.value)
+    assert key not in str(refused.value)
 
 
 def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPatch) -> None:

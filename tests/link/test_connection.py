@@ -259,6 +259,30 @@ def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
     lock_vehicle(RADIO).close()
 
 
+def test_no_message_shows_the_uri_that_is_opened_instead_of_the_vehicles() -> None:
+    """The URI behind a radio hub has a key, with which other programs could take the vehicle."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+    opened = f"hub://127.0.0.1:{port}/80/2M/E7E7E7E701?key=0123456789abcdef"
+    link = CflibLink(RADIO, LinkConfig(), time.monotonic, link_uri=opened)
+    texts = []
+    with pytest.raises(ConnectionFailed) as refused:
+        link.connect()
+    texts.append(str(refused.value))
+    with lock_vehicle(opened), pytest.raises(ConnectionFailed) as refused:
+        link.connect()
+    texts.append(str(refused.value))
+    with pytest.raises(ConnectionFailed) as refused:
+        link.settle_estimator(None)
+    texts.append(str(refused.value))
+    connection = Connection(RADIO)
+    connection.cf.link_uri = opened
+    connection._on_failed(opened, f"No driver found or malformed URI: {opened}")
+    texts += [str(connection.lost), connection.cause.found]
+    assert all(RADIO in text and "127.0.0.1" not in text for text in texts), texts
+
+
 def test_without_a_place_for_the_lock_or_the_tables_it_flies_all_the_same(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

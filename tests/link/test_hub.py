@@ -459,7 +459,9 @@ def test_a_cflib_link_flies_through_the_hub_and_survives_its_dongle(
     port = UsbPort({FOUR[0]: air, FOUR[1]: other})
     attach(port, monkeypatch)
     with served(Hub(FOUR[:2])) as shared:
-        link = CflibLink(shared.uris[FOUR[0]], LINK, time.monotonic, landing_wait_s=0.2)
+        link = CflibLink(
+            FOUR[0], LINK, time.monotonic, landing_wait_s=0.2, link_uri=shared.uris[FOUR[0]]
+        )
         link.connect()
         until(link.telemetry)
         assert link.problem(time.monotonic()) is None
