@@ -268,7 +268,7 @@ class Coordinator:
             self._sent[name], self._sent_s[name] = order, now_s
             if order.may_take_off:  # it may be lost before it has reported its take-off
                 self._may_have_flown.add(name)
-            self._children[name].send(order)
+            self._children[name].send(replace(order, sent_s=now_s))
 
 
 def _explained(result: Result, why: str | None) -> Result:

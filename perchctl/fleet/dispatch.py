@@ -5,6 +5,7 @@
     whoever has ended in another's corridor, or nobody knows where, keeps it on the floor
     a failure before the first take-off ends all; later it ends all with ``on_failure: land-all``
     two in the air that are known to be too near each other land
+    nobody begins to climb while another one is near its climb, or nobody knows where that one is
 
 The reported position is used only for a vehicle that measures it in the room's axes (``frame:
 room``). For all others, the places of the plan are used.
@@ -13,6 +14,10 @@ If a position is old or cannot be trusted, the distances to it are unknown. An u
 lands nobody; otherwise a lost link of one vehicle would end its neighbours' flights. It does not
 count as safe either: `find_unwatched` lists such vehicles for people. Two of them are kept apart by
 the corridor that each vehicle enforces by itself, without any message.
+
+As long as all vehicles keep to their corridors, everybody may climb: the plan keeps the place below
+a target at the separation from all corridors that are flown at the same time. The permission to
+climb guards against a neighbour that has left its corridor, or may have left it.
 """
 
 from __future__ import annotations
@@ -20,15 +25,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from perchctl.corridor import Point
 from perchctl.errors import Interrupted
 from perchctl.fleet.fleet import FleetVehicle
 from perchctl.fleet.messages import Order, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
-from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, gap_text
-from perchctl.mission import OperatorRequest
+from perchctl.fleet.schedule import OBSTACLE_M, ROOM_ERROR_M, TARGET_ALONE_M, gap_text
+from perchctl.mission import OperatorRequest, Phase
 
 FRESH_STATUS_S = 1.0
 """Time without a message after which a vehicle is not ready, s. Longer: a process that hangs counts
@@ -42,6 +47,9 @@ FRESH_PLACE_S = 0.5
 """Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
 other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
 second, distances are unknown all the time."""
+ROUNDING_M = 1e-6
+"""Distance by which a vehicle at the very edge of its corridor may seem too near a climb, m.
+Larger: a climb begins although another vehicle is too near."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +149,14 @@ def decide(
             if obstacle is not None:
                 own, reasons[name] = OperatorRequest.LAND, obstacle
         permitted = started and own is OperatorRequest.NONE and name in group
-        orders[name] = Order(may_take_off=permitted, word=own)
+        flies = started and own is OperatorRequest.NONE and view.is_in_air
+        barred = find_climb_obstacle(plan, name, views) if flies else None
+        orders[name] = Order(
+            may_take_off=permitted,
+            may_climb=flies and barred is None,
+            why_not_climb=barred or "",
+            word=own,
+        )
     return Decision(orders=orders, reasons=reasons)
 
 
@@ -194,6 +209,34 @@ def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point
                 vehicle.flown_to_room(place_m) if place_m and is_known and is_fresh else None
             )
     return places
+
+
+def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]) -> str | None:
+    """Return why this vehicle must not begin to climb to its target now: another one in the air is
+    within the plan's separation of its climb, a column as wide as its corridor, or may be.
+
+    A vehicle without a known position is trusted to be in its corridor only if it cannot share its
+    position, answers and does not land. Otherwise it may be up to `TARGET_ALONE_M` beside its way.
+    """
+    target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
+    least_m = radius_m + plan.separation_m - ROUNDING_M
+    places = air_places(plan, views)
+    for view in views:
+        other = view.name
+        if other == name or not view.is_in_air:
+            continue
+        place_m = places.get(other)
+        if place_m is not None:
+            if math.dist(place_m, target_m) < least_m:
+                return f"{other} is too near its climb"
+            continue
+        lands = view.status is not None and view.status.phase is Phase.LANDING
+        if other in places or lands or view.is_silent:
+            corridor = plan.corridors[other]
+            lost = replace(corridor, radius_m=max(corridor.radius_m, TARGET_ALONE_M))
+            if lost.distance_to_m(target_m) < least_m:
+                return f"nobody knows how near {other} is to its climb"
+    return None
 
 
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:

@@ -7,12 +7,14 @@ Every message contains a whole state, never a change. If one is lost, late or du
 one corrects it, and none has to be answered. The command in the last `Order` that arrives stays
 valid, and without another order the vehicle lands after
 `perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off counts only in the turn in
-which it is read, and a command to land or to cut the motors takes precedence.
+which it is read, a permission to climb only while it is fresh, and a command to land or to cut the
+motors takes precedence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from enum import Enum
 
 from perchctl.corridor import Point
@@ -63,11 +65,17 @@ class Order:
 
     Attributes:
         may_take_off: permission to take off; without meaning in the air.
+        may_climb: permission to begin the climb from below the target; without meaning afterwards.
+        why_not_climb: why there is none, for people.
+        sent_s: `time.monotonic` of the decision, one clock for all processes.
         word: the operator's command; a vehicle never takes back one that it has received.
     """
 
     may_take_off: bool = False
+    may_climb: bool = False
+    why_not_climb: str = ""
     word: OperatorRequest = OperatorRequest.NONE
+    sent_s: float = field(default=-math.inf, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,10 @@ suspension, this process has not yet read the messages that are waiting for it. 
 pause is taken for the parent's silence. Shorter: on a busy computer, a parent's silence is noticed
 late."""
 
+PERMISSION_FRESH_S = 0.5
+"""Age up to which a permission to climb counts, s; it is repeated every `BEAT_S`. Longer: a climb
+may begin although a neighbour has come near since. Shorter: a busy computer delays climbs."""
+
 
 @dataclass
 class ParentSwitch(OperatorSwitch):
@@ -35,6 +39,7 @@ class ParentSwitch(OperatorSwitch):
     may_take_off: bool = False
     lost: str | None = None
     """Why the vehicle lands without the parent's order; otherwise None."""
+    _newest: Order = field(default_factory=Order)
     _heard: bool = False
     _silent_s: float = 0.0
     _read_s: float | None = None
@@ -44,6 +49,7 @@ class ParentSwitch(OperatorSwitch):
         """Process an order. Its command can only add to what was ordered before. A lost parent
         whose orders arrive again can still cut the motors, but cannot give permission."""
         self._heard = True
+        self._newest = order
         if order.word is not OperatorRequest.NONE:
             self.land()
         if order.word is OperatorRequest.STOP:
@@ -51,6 +57,15 @@ class ParentSwitch(OperatorSwitch):
         # Set after the command, so that the permission is not read before it.
         permitted = order.may_take_off and order.word is OperatorRequest.NONE
         self.may_take_off = permitted and self.lost is None
+
+    def climb_withheld(self) -> str | None:
+        """Return why the climb to the target must not begin; None with a fresh permission."""
+        order = self._newest
+        if self.lost is not None:
+            return self.lost
+        if not 0.0 <= self.clock() - order.sent_s <= PERMISSION_FRESH_S:
+            return "the newest order of the parent process is old"
+        return None if order.may_climb else order.why_not_climb or "the fleet is not flying"
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:
         """Land and never take off, since nobody can stop this vehicle any more."""

@@ -80,6 +80,7 @@ def fly_vehicle(
             switch,
             remarks=log.remarks,
             may_take_off=reporter.may_take_off,
+            climb_withheld=switch.climb_withheld,
         )
         outcome = VehicleOutcome.from_phase(report.phase)
         summary = log.close(report, miss_m if outcome is VehicleOutcome.PERCHED else None)
@@ -165,7 +166,7 @@ class ParentLine:
         order = self._next_order()
         while self._channel.poll(0.0):
             if order is not None:
-                self._switch.take(replace(order, may_take_off=False))
+                self._switch.take(replace(order, may_take_off=False, may_climb=False))
             order = self._next_order()
         if order is not None:
             self._switch.take(order)

@@ -80,8 +80,10 @@ class FlightParts:
     `table` is flown instead of the profile's. `begin_turn` is called in the loop's own thread at
     the beginning of each turn, also before take-off. `may_take_off` is called in each turn before
     take-off with what the vehicle still waits for, empty once its own checks have passed; until it
-    returns True, the vehicle stays on the floor, disarmed, and goes on being checked. What a
-    `simulated` flight shows of latency and mounting is no advice for a profile."""
+    returns True, the vehicle stays on the floor, disarmed, and goes on being checked.
+    `climb_withheld` is called in each turn of the mission; while it returns a reason, the vehicle
+    does not begin to climb to its target. What a `simulated` flight shows of latency and mounting
+    is no advice for a profile."""
 
     link: Link
     source: FrameSource
@@ -96,6 +98,7 @@ class FlightParts:
     judges: tuple[Watcher, ...] = ()
     begin_turn: Callable[[], None] = lambda: None
     may_take_off: Callable[[str], bool] = lambda waiting: True
+    climb_withheld: Callable[[], str | None] = lambda: None
     simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
@@ -356,6 +359,7 @@ def _observe(
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator_request=parts.operator(),
+        climb_withheld_reason=parts.climb_withheld(),
         flight_log_problem=flight_log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,

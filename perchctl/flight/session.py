@@ -115,14 +115,15 @@ def fly_session(
     before_arming: Callable[[], None] | None = None,
     rows: Sequence[Transition] = (),
     may_take_off: Callable[[str], bool] = lambda waiting: True,
+    climb_withheld: Callable[[], str | None] = lambda: None,
 ) -> tuple[FlightReport, float | None]:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
     Returns the report, and the gear's distance from the target's centre, m, where a simulator
     measures it.
 
-    `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`: as in
-    `FlightParts`.
+    `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`,
+    `climb_withheld`: as in `FlightParts`.
     `before_arming` is called once vehicle and camera have answered; what it raises ends the session
     on the ground. `rows` are added to the profile's table.
     """
@@ -178,6 +179,7 @@ def fly_session(
                 table,
                 begin_turn=begin_turn,
                 may_take_off=may_take_off,
+                climb_withheld=climb_withheld,
                 simulated=options.simulated,
             )
             with contextlib.ExitStack() as waiting:

@@ -48,6 +48,8 @@ class Observation:
     loop_late_s: float = 0.0  #: delay of the start of this tick
     successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
     operator_request: OperatorRequest = OperatorRequest.NONE
+    #: why the fleet's parent does not permit the climb; None if it does, or without a fleet
+    climb_withheld_reason: str | None = None
     flight_log_problem: str | None = None  #: the flight log cannot be written
     #: latency beyond the profile's, subtracted from the frames' times (`measured`)
     camera_latency_above_profile_s: float = 0.0

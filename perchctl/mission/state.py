@@ -120,7 +120,7 @@ class PlannerState:
     raw_thrust_order: int | None = None  #: last ordered raw thrust; None in position mode
     descent: LevelDescent = LevelDescent()
     hold_reason: str = ""  #: why the vehicle holds its position; empty without a hold
-    waiting_reason: str = ""  #: why your own row keeps the mission in its phase; empty if none does
+    waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
     waited_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
     hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
@@ -137,8 +137,8 @@ class PlannerState:
 
     @property
     def pause_reason(self) -> str:
-        """Why the mission pauses: the reason of the hold or of your own row. Empty if it does not
-        pause."""
+        """Why the mission pauses: the reason of the hold or of a row that waits. Empty if it does
+        not pause."""
         return self.hold_reason or self.waiting_reason
 
     @property

@@ -62,9 +62,9 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
     """Return the first row that applies, or None to stay. A row from a landing to a phase before it
     is skipped, whatever the table contains.
 
-    If one of the user's own rows applies and keeps the mission in its phase, later rows of severity
-    `CONTINUE` (normal progress) no longer count: the user's row is returned unless a later row of a
-    higher severity applies.
+    If a row applies that keeps the mission in its phase, such as one of the user's own, later rows
+    of severity `CONTINUE` (normal progress) no longer count: the waiting row is returned unless a
+    later row of a higher severity applies.
     """
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None

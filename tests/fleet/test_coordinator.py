@@ -252,6 +252,37 @@ def test_one_far_away_flies_on_unless_a_failure_lands_all() -> None:
     assert rig.fleet.reasons["v1"] == "v0 has failed"
 
 
+# --- Permission to climb ---
+
+
+def test_a_climb_is_permitted_again_and_again_until_a_neighbour_is_near() -> None:
+    rig = Rig(order="together").started()
+    for name in rig.children:
+        known = {"telemetry_age_s": 0.1, "loop_age_s": 0.0}
+        rig[name].tell(Stage.FLYING, phase=Phase.ALIGN, place_m=(0.0, 0.5), **known)
+    rig.pass_s()
+    permitted = [child.order for child in rig.children.values()]
+    assert all(order.may_climb for order in permitted)
+    rig.pass_s()
+    assert [child.order.sent_s for child in rig.children.values()] == [rig.now_s] * 4
+    assert permitted[0].sent_s < rig.now_s
+    strays = (3.4, 0.5)  # in its own axes
+    rig["v0"].tell(Stage.FLYING, phase=Phase.LANDING, place_m=strays, **known)
+    rig.pass_s()
+    assert [child.order.may_climb for child in rig.children.values()] == [True, False, True, True]
+    assert rig["v1"].order.why_not_climb == "v0 is too near its climb"
+    assert rig.words == [OperatorRequest.NONE] * 4, "it waits, but does not land"
+    rig.end("v0", ABORTED)
+    assert rig["v1"].order.may_climb
+
+
+def test_with_its_coordinator_failed_nobody_climbs() -> None:
+    rig = Rig(order="together").started()
+    rig.fly(*rig.children)
+    rig.fleet.step_stopping()
+    assert not any(child.order.may_climb for child in rig.children.values())
+
+
 # --- Distances ---
 
 

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.corridor import Point
+from perchctl.errors import InvalidValue
 from perchctl.fleet import make_plan
 from perchctl.fleet.dispatch import (
     FRESH_PLACE_S,
     NEAR_MARGIN_M,
     VehicleView,
+    decide,
+    find_climb_obstacle,
     find_near_pairs,
     find_unwatched,
 )
 from perchctl.fleet.messages import BEAT_S, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.radio import SLOWEST_PERIOD_S
+from perchctl.mission import OperatorRequest, Phase
 from tests.fleet.rig import fleet, on_air
 
 PLAN = make_plan(
@@ -156,3 +162,134 @@ def test_a_simulated_vehicle_is_where_it_flies_from_its_home() -> None:
 
 def test_the_slowest_telemetry_that_perchctl_chooses_is_fresh() -> None:
     assert 2.0 * SLOWEST_PERIOD_S + BEAT_S < FRESH_PLACE_S
+
+
+# --- Permission to climb ---
+
+DENSE = make_plan(
+    fleet([((1.2 * n, 0.0), (1.2 * n, 1.0)) for n in range(3)], order="together")
+)  # as near to each other as the plan allows, but for 0.1 m
+CORRIDORS = DENSE.corridors
+TARGETS = {vehicle.name: vehicle.target_m for vehicle in DENSE.fleet.vehicles}
+CLIMB_M = {name: CORRIDORS[name].radius_m + DENSE.separation_m for name in TARGETS}
+shares, angles = st.floats(0.0, 1.0), st.floats(-math.pi, math.pi)
+
+
+def in_own_axes(name: str, room_m: Point, **status: Any) -> VehicleView:
+    """A vehicle of `DENSE` that flies at this place of the room."""
+    flown = flying(name, DENSE.fleet.vehicle(name).as_flown.to_estimate(room_m))
+    assert flown.status is not None
+    return replace(flown, status=replace(flown.status, **status))
+
+
+def places_in(name: str, beyond_m: float = 0.0) -> st.SearchStrategy[Point]:
+    """Places in the corridor of a vehicle, or up to so far beside it."""
+    corridor = CORRIDORS[name]
+    most_m = corridor.radius_m + beyond_m
+
+    def place(along: float, away: float, angle_rad: float) -> Point:
+        x, y = (
+            a + along * (b - a) for a, b in zip(corridor.home_m, corridor.target_m, strict=True)
+        )
+        return x + away * most_m * math.cos(angle_rad), y + away * most_m * math.sin(angle_rad)
+
+    return st.builds(place, shares, shares, angles)
+
+
+def permitted(views: Sequence[VehicleView], **given: Any) -> dict[str, bool]:
+    given = {"started": True} | given
+    orders = decide(DENSE, views, **given).orders
+    assert not any(order.may_climb and order.why_not_climb for order in orders.values())
+    return {name: order.may_climb for name, order in orders.items()}
+
+
+@given(st.tuples(*[places_in(name) for name in TARGETS]))
+def test_who_keep_to_their_corridors_all_climb(places: tuple[Point, ...]) -> None:
+    views = [in_own_axes(name, place) for name, place in zip(TARGETS, places, strict=True)]
+    assert all(permitted(views).values())
+
+
+@given(st.data())
+def test_no_plan_that_is_accepted_bars_a_climb(data: st.DataObject) -> None:
+    """Of two vehicles that may fly together, none in its corridor is near the other one's climb."""
+    points = st.tuples(lengths, lengths)
+    ends = data.draw(st.tuples(points, points, points, points))
+    (a, b), (c, d) = ends[:2], [(x + 1.5, y) for x, y in ends[2:]]
+    try:
+        plan = make_plan(fleet([(a, b), (c, d)], order="together"))
+    except InvalidValue:
+        assume(False)
+    assume(len(plan.schedule.groups) == 1)
+    corridor = plan.corridors["v0"]
+    share, angle_rad = data.draw(shares), data.draw(angles)
+    way = zip(corridor.home_m, corridor.target_m, strict=True)
+    x_m, y_m = (begin + share * (end - begin) for begin, end in way)
+    x_m += corridor.radius_m * math.cos(angle_rad)
+    y_m += corridor.radius_m * math.sin(angle_rad)
+    flown = plan.fleet.vehicle("v0").as_flown.to_estimate((x_m, y_m))
+    assert find_climb_obstacle(plan, "v1", [flying("v0", flown), flying("v1", None)]) is None
+
+
+@given(st.tuples(*[places_in(name, 2.0) for name in TARGETS]))
+def test_exactly_who_has_another_near_its_climb_waits(places: tuple[Point, ...]) -> None:
+    views = [in_own_axes(name, place) for name, place in zip(TARGETS, places, strict=True)]
+    by_name = dict(zip(TARGETS, places, strict=True))
+    for name, may in permitted(views).items():
+        gaps_m = [
+            math.dist(place, TARGETS[name]) - CLIMB_M[name]
+            for other, place in by_name.items()
+            if other != name
+        ]
+        assert may is (min(gaps_m) >= 0.0) or abs(min(gaps_m)) < 1e-5
+
+
+@given(st.tuples(*[places_in(name, 0.6) for name in TARGETS]), st.floats(0.0, 2.0))
+def test_an_older_position_permits_no_climb(places: tuple[Point, ...], more_s: float) -> None:
+    """Of a vehicle that is as near to its way as one that has lost its position may be."""
+    views = [in_own_axes(name, place) for name, place in zip(TARGETS, places, strict=True)]
+    older = [replace(view, silent_s=view.silent_s + more_s) for view in views]
+    before = permitted(views)
+    assert all(before[name] for name, may in permitted(older).items() if may)
+
+
+@pytest.mark.parametrize(
+    ("status", "waits"),
+    [
+        ({}, ["v0", "v2"]),  # which should be known
+        ({"place_m": (math.nan, 0.0)}, ["v0", "v2"]),
+        ({"phase": Phase.LANDING}, ["v0", "v2"]),
+        ({"stage": Stage.ENDING}, []),
+        ({"stage": Stage.READY}, []),
+    ],
+)
+def test_nobody_beside_a_vehicle_climbs_whose_place_is_unknown(
+    status: dict[str, Any], waits: list[str]
+) -> None:
+    homes = [in_own_axes(name, TARGETS[name]) for name in TARGETS]
+    views = [homes[0], in_own_axes("v1", TARGETS["v1"], **{"place_m": None, **status}), homes[2]]
+    assert [name for name in ("v0", "v2") if not permitted(views)[name]] == waits
+
+
+@pytest.mark.parametrize(
+    ("phase", "silent_s", "may"),
+    [(Phase.ALIGN, 0.1, True), (Phase.LANDING, 0.1, False), (Phase.ALIGN, 2.0, False)],
+)
+def test_a_vehicle_that_cannot_share_its_place_is_trusted_until_it_lands_or_is_silent(
+    phase: Phase, silent_s: float, may: bool
+) -> None:
+    vehicles = tuple(replace(each, frame="home") for each in DENSE.fleet.vehicles)
+    plan = replace(DENSE, fleet=replace(DENSE.fleet, vehicles=vehicles))
+    views = [in_own_axes(name, TARGETS[name], phase=Phase.ALIGN) for name in TARGETS]
+    views[1] = replace(
+        in_own_axes("v1", TARGETS["v1"], phase=phase, place_m=None), silent_s=silent_s
+    )
+    assert decide(plan, views, started=True).orders["v0"].may_climb is may
+
+
+def test_nobody_climbs_before_the_start_or_on_a_command_to_land() -> None:
+    views = [in_own_axes(name, TARGETS[name]) for name in TARGETS]
+    assert not any(permitted(views, started=False).values())
+    assert not any(permitted(views, word=OperatorRequest.LAND).values())
+    assert permitted(views, landed=["v1"]) == {"v0": True, "v1": False, "v2": True}
+    on_floor = [replace(view, status=Status(stage=Stage.READY)) for view in views]
+    assert not any(permitted(on_floor).values())

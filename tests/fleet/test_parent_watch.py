@@ -3,12 +3,18 @@ nobody waits for."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import pytest
 
 from perchctl.fleet.messages import BEAT_S, Order
-from perchctl.fleet.parent_watch import LONGEST_WATCH_STEP_S, PARENT_SILENCE_S, ParentSwitch
+from perchctl.fleet.parent_watch import (
+    LONGEST_WATCH_STEP_S,
+    PARENT_SILENCE_S,
+    PERMISSION_FRESH_S,
+    ParentSwitch,
+)
 from perchctl.mission import OperatorRequest
 
 READ_S = 0.02
@@ -107,3 +113,37 @@ def test_permission_is_taken_back_on_the_floor() -> None:
     switch.take(Order())
     assert not switch.may_take_off
     assert switch.read() is OperatorRequest.NONE
+
+
+# --- Permission to climb ---
+
+
+def test_a_permission_to_climb_counts_while_it_is_fresh() -> None:
+    clock = Clock()
+    switch = ParentSwitch(clock=clock)
+    assert switch.climb_withheld() is not None, "before the first order"
+    switch.take(Order(may_climb=True, sent_s=clock.now_s))
+    assert switch.climb_withheld() is None
+    clock.now_s += PERMISSION_FRESH_S - 0.01
+    assert switch.climb_withheld() is None
+    clock.now_s += 0.02
+    assert "old" in (switch.climb_withheld() or "")
+    switch.take(Order(may_climb=True, sent_s=clock.now_s))
+    assert switch.climb_withheld() is None, "it is repeated"
+    switch.take(Order(why_not_climb="east is too near", sent_s=clock.now_s))
+    assert switch.climb_withheld() == "east is too near"
+
+
+@pytest.mark.parametrize("sent_s", [-math.inf, 98.0, 101.0, math.nan])
+def test_a_permission_that_arrives_late_or_has_no_time_does_not_count(sent_s: float) -> None:
+    switch = ParentSwitch(clock=Clock())
+    switch.take(Order(may_climb=True, sent_s=sent_s))
+    assert switch.climb_withheld() is not None
+
+
+def test_a_lost_parent_permits_nothing() -> None:
+    clock = Clock()
+    switch = ParentSwitch(clock=clock)
+    switch.lose_parent("it is gone")
+    switch.take(Order(may_climb=True, sent_s=clock.now_s))
+    assert switch.climb_withheld() == "it is gone"

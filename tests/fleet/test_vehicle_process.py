@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,8 @@ def test_what_is_no_order_lands_and_the_motors_can_still_be_cut(
     parent.send(Order(may_take_off=True))
     assert switch.read() is OperatorRequest.LAND
     assert not switch.may_take_off
+    parent.send(Order(may_climb=True, sent_s=time.monotonic()))
+    assert switch.climb_withheld() == switch.lost
     parent.send(Order(word=OperatorRequest.STOP))
     until(lambda: switch.read() is OperatorRequest.STOP)
     assert isinstance(parent.receive(1.0), Status), "it goes on telling where it is"

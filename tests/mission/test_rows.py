@@ -259,6 +259,12 @@ CASES: dict[str, Case] = {
         P.ALIGN, P.LANDING, seen(), 0.6, O.SAFETY,
         profile=changed({"safety.max_height_m": 1.04}, HOVERING),
     ),
+    "climb-not-permitted": Case(
+        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), 20.2, O.SAFETY
+    ),
+    "climb-withheld": Case(
+        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), 20.2, O.SAFETY
+    ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
     "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen(), 0.6),
     "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),

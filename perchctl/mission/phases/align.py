@@ -1,4 +1,8 @@
-"""Phase 4, ALIGN: move under the target at constant height, and turn to its heading."""
+"""Phase 4, ALIGN: move under the target at constant height, and turn to its heading.
+
+In a fleet, the vehicle waits here, below its target, until the parent permits the climb. A
+permission that is withdrawn later does not end an ascent.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,11 @@ from perchctl.mission.setpoints import (
 )
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
+MAX_CLIMB_WAIT_S = 20.0
+"""Longest wait for permission to climb, s. Larger: the battery of a vehicle without permission runs
+down. Smaller: a neighbour whose landing or hanging process, which the parent ends after 10 s, bars
+the climb ends this flight, too."""
+
 ALIGNED = Condition[Context](
     "aligned",
     lambda c: (
@@ -29,6 +38,10 @@ ALIGNED = Condition[Context](
     ),
 )
 """The vehicle is below a fresh target, with its heading."""
+CLIMB_WITHHELD = Condition[Context](
+    "climb withheld", lambda c: c.obs.climb_withheld_reason is not None
+)
+"""The fleet's parent does not permit the climb."""
 
 
 def act(c: Context) -> Action:
@@ -89,7 +102,7 @@ ALIGN = PhaseDefinition(
         in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
     ),
     act=act,
-    conditions=(ALIGNED,),
+    conditions=(ALIGNED, CLIMB_WITHHELD),
     exits=(
         Transition(
             "align-lost",
@@ -116,6 +129,22 @@ ALIGN = PhaseDefinition(
             {Phase.ALIGN},
             is_hover_height_unsafe,
             unsafe_hover_reason,
+        ),
+        land_row(
+            "climb-not-permitted",
+            {Phase.ALIGN},
+            lambda c: c.held_s(CLIMB_WITHHELD) > MAX_CLIMB_WAIT_S,
+            lambda c: (
+                f"no permission to climb for {MAX_CLIMB_WAIT_S:g} s: {c.obs.climb_withheld_reason}"
+            ),
+        ),
+        Transition(
+            "climb-withheld",
+            {Phase.ALIGN},
+            lambda c: is_aligned(c) and c.obs.climb_withheld_reason is not None,
+            Phase.ALIGN,
+            lambda c: f"waiting for permission to climb: {c.obs.climb_withheld_reason}",
+            Severity.HOLD,
         ),
         Transition(
             "aligned", {Phase.ALIGN}, is_aligned, Phase.ASCEND, "aligned in position and heading"
