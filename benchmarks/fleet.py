@@ -2,6 +2,7 @@
 
     python benchmarks/fleet.py [-n 3] [--seed 11] [--fleet FLEET.yaml] [--stop 0]
     python benchmarks/fleet.py -n 0 --stop 3
+    python benchmarks/fleet.py -n 0 --recorded 4 [--log FLIGHT.jsonl]
 
 First whole flights of `perchctl fleet fly`, by default of the four shipped simulated vehicles. For
 each flight: the time it took, simulated time over wall time, and the computing time of everything
@@ -11,6 +12,9 @@ clock (p50, p99, largest), and the computing time of its process without its sim
 Then, with `--stop N`, each case N times: the time from a key (or from the death of the parent) to
 the packet that lands or stops the last vehicle. Two vehicles fly together, each behind a wire
 between cflib and its simulator that notes the packets; these simulators do not wait for the loops.
+
+With `--recorded N`, N loops fly a recorded flight instead, without simulators
+(benchmarks/recorded_loops.py): the gaps between setpoints, and what each part costs.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from interrupts import CTRL_C, SPACE, TerminalFlight, Wire, started_vehicle  # noqa: E402
+from recorded_loops import fly_recorded  # noqa: E402
 
 FLIGHT_TIMEOUT_S = 400.0
 SOON_S = 3.0
@@ -233,12 +238,16 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=11, help="of the first flight")
     parser.add_argument("--fleet", help="fleet file instead of the shipped one")
     parser.add_argument("--stop", type=int, default=0, help="repetitions of each way to stop")
+    parser.add_argument("--recorded", type=int, default=0, help="loops that fly a recorded flight")
+    parser.add_argument("--log", type=Path, help="that flight; without one, it is recorded first")
     parser.add_argument("--case", help="only cases with this text in their name")
     given = parser.parse_args()
     words = [] if given.fleet is None else [given.fleet]
     perched = sum(fly(words, given.seed + number) for number in range(given.n))
     if given.n:
         print(f"{perched} of {given.n} flights with all hanging", flush=True)
+    if given.recorded:
+        fly_recorded(given.recorded, given.log, given.seed)
     if given.stop:
         print(f"{'from key to last packet':<40} {'median':>9} {'most':>9}  exit", flush=True)
     for case in CASES if given.stop else ():
