@@ -43,7 +43,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     ),
     "planner": (
         "perchctl.flight.loop:step_mission",
-        "perchctl.mission.records:Event.list_from_tick",
+        "perchctl.mission.records:Event.list_events_of_tick",
     ),
     "history, turns, log": (
         "perchctl.flight.inputs:add_samples",

@@ -34,7 +34,7 @@ from common import table
 from perchctl.geometry import Array
 from perchctl.mission import PlannerState, UnfilteredPose, step_mission
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
+from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
 from perchctl.record import FlightLog, read_log
 
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
@@ -210,7 +210,9 @@ def errors(log: FlightLog) -> Iterator[tuple[float, list[tuple[float, float]]]]:
     for k, moment in enumerate(flown):
         b = moment.belief
         known = (
-            b.is_position_valid and b.dead_reckoning_since_s is None and b.reckoning.imu is not None
+            b.is_position_valid
+            and b.dead_reckoning_since_s is None
+            and b.dead_reckoning.imu is not None
         )
         if not known or b.height_m < LEAST_HEIGHT_M or b.obs.t_s - last_s < BEGINS_EVERY_S:
             continue
@@ -222,7 +224,7 @@ def _blind(
     b: Belief, axes: tuple[Axis, ...], later: list[Moment], truth: Truth
 ) -> Iterator[tuple[float, list[tuple[float, float]]]]:
     begin_s, imu = b.obs.t_s, b.imu
-    old: DeadReckoning = b.reckoning
+    old: DeadReckoning = b.dead_reckoning
     new = [axis.copy(i) for i, axis in enumerate(axes)]
     for axis in new:
         axis.x[0] = 0.0
@@ -238,14 +240,16 @@ def _blind(
         if struck or now.height_m < FLOOR_M or not left:
             return
         gained = np.subtract(now.imu.velocity_mps, imu.velocity_mps)
-        old = advance_reckoning(old, now.imu, now.telemetry, is_estimate_believed=False)
+        old = advance_dead_reckoning(old, now.imu, now.telemetry, is_estimate_trusted=False)
         for axis, dv in zip(new, gained, strict=True):
             axis.predict(float(dv), dt_s)
         imu = now.imu
         if now.obs.t_s - begin_s >= left[0]:
             v = truth.velocity_mps(now.obs.t_s)
             way_m = truth.position_m(now.obs.t_s) - truth.position_m(begin_s)
-            old_way_m = np.subtract(b.reckoning.lateral_offset_m, old.lateral_offset_m)
+            old_way_m = np.subtract(
+                b.dead_reckoning.gear_to_target_world_xy_m, old.gear_to_target_world_xy_m
+            )
             found = np.array([axis.x for axis in new])
             yield (
                 left.pop(0),

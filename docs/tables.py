@@ -30,7 +30,7 @@ from perchctl.mission.phase import (  # noqa: E402
     AIRBORNE_PHASES,
     CAMERA_GUIDED_PHASES,
     FREE_AIR_PHASES,
-    MAGNET_ATTACH_PHASES,
+    PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
     PRE_CONTACT_PHASES,
     PRE_LANDING_PHASES,
 )
@@ -211,7 +211,7 @@ _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (PRE_CONTACT_PHASES, "before contact"),
     (CAMERA_GUIDED_PHASES, "by camera"),
     (FREE_AIR_PHASES, "in the open"),
-    (MAGNET_ATTACH_PHASES, "by camera, PERCH"),
+    (PHASES_IN_WHICH_MAGNET_MAY_ATTACH, "by camera, PERCH"),
     (FREE_AIR_PHASES | {Phase.LANDING}, "in the open, LANDING"),
 )
 

@@ -27,7 +27,7 @@ ROWS = (
     Transition(
         name="waited-long-enough",
         phases={Phase.ALIGN},
-        when=lambda c: not SWITCH.exists() and c.t_s - c.state.started_s > WAIT_S,
+        when=lambda c: not SWITCH.exists() and c.t_s - c.state.flight_started_at_s > WAIT_S,
         to=Phase.LANDING,
         reason="nobody has put the switch on",
         severity=Severity.LAND,

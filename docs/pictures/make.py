@@ -153,7 +153,7 @@ class Flight:
         )  # fmt: skip
         obs = Observation(
             t_s, replace(telemetry, behind_s=r["tel_age_s"]), target,
-            last_good_frame_age_s=r["cam_age_s"], loop_late_s=r["late_s"],
+            last_good_frame_age_s=r["cam_age_s"], tick_start_delay_s=r["late_s"],
         )  # fmt: skip
         turn = TickRecord(
             number=index, role="flown", began_s=t_s, t_s=t_s, inputs=TickInputs(),

@@ -87,7 +87,7 @@ class _Given:
             return None
         image = self._picture_of(seen)
         t_s = seen.t_s + self._later_s if self._taken.is_camera_source_live else seen.t_s
-        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.picture_kind, seen.repeated)
+        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.picture_kind, seen.is_repeated)
 
     def problem(self, now_s: float) -> str | None:
         return self._taken.camera_problem
@@ -101,7 +101,7 @@ class _Given:
     def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
         if self._taken.camera_problem is not None:  # no picture was searched in this turn
             return np.zeros((1, 1), np.uint8)
-        image = self._repeated_picture(seen) if seen.repeated else self._recorded(seen)
+        image = self._repeated_picture(seen) if seen.is_repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
         return image
 

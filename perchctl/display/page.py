@@ -81,7 +81,7 @@ class FlightPage:
             self._past.append((tick.t_s, *_off_and_below_m(tick)))
 
     def event(self, event: Event) -> None:
-        if event.rest is not None:
+        if event.rest_state is not None:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:

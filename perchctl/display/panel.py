@@ -36,7 +36,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
     height_m = tick.telemetry.position_m[2] - state.belief.ground_z_m
     ages = (
         f"link {age_text(tick.telemetry_age_s)}   camera {age_text(tick.last_good_frame_age_s)}"
-        f"   loop late {age_text(tick.loop_late_s)}"
+        f"   loop late {age_text(tick.tick_start_delay_s)}"
     )
     return [
         ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
@@ -58,7 +58,7 @@ def _hover_text(state: PlannerState) -> str:
     errors, hover = state.hover_errors, state.belief.profile.planner.hover
     of = "" if hover is None else f" of {hover.duration_s:g}"
     *axes, yaw_rad = errors.rms_xyz_yaw
-    if not errors.frames:
+    if not errors.frame_count:
         return f"{errors.duration_s:.0f}{of} s"
     x, y, z = (f"{1e3 * each:.1f}" for each in axes)
     return (

@@ -46,7 +46,9 @@ class ExpectedOutcome:
 
 
 def _killed_in_landing(facts: Facts) -> float | None:
-    return facts.killed_s if facts.has_effect(killed) and facts.make_onboard_landing else None
+    return (
+        facts.killed_s if facts.has_effect(killed) and facts.make_onboard_landing_command else None
+    )
 
 
 def _let_go_later(facts: Facts) -> float | None:

@@ -414,4 +414,4 @@ def report_claims(report: FlightReport) -> Claims:
 
 def rescue_claims(event: Event) -> Claims:
     """The claims of a rescue's event; an empty set for any other event."""
-    return set() if event.rest is None else RESCUE_CLAIMS[event.rest]
+    return set() if event.rest_state is None else RESCUE_CLAIMS[event.rest_state]

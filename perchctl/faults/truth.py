@@ -112,7 +112,7 @@ class Facts:
     Attributes:
         effects: the fault's effects, which began at `begin_s`.
         silence_lock_s: when the firmware locked the vehicle because no packet had arrived.
-        make_onboard_landing: the onboard landing was under way when that silence began.
+        make_onboard_landing_command: the onboard landing was under way when that silence began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle rebooted in the air while its motors turned.
         stop_s: when the operator's presses ordered the motors off.
@@ -127,7 +127,7 @@ class Facts:
     effects: tuple[e.Effect, ...] = ()
     begin_s: float | None = None
     silence_lock_s: float | None = None
-    make_onboard_landing: bool = False
+    make_onboard_landing_command: bool = False
     killed_s: float | None = None
     rebooted_s: float | None = None
     stop_s: float | None = None
@@ -176,7 +176,9 @@ class FactsRecorder(Facts):
 
     def _note_silence(self, s: Sample) -> None:
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        self.make_onboard_landing = self.make_onboard_landing or (long and self._landed_alone)
+        self.make_onboard_landing_command = self.make_onboard_landing_command or (
+            long and self._landed_alone
+        )
         locks = s.locked and not (self._before and self._before.locked)
         ordered = self._vehicle.firmware.supervisor.emergency  # cut by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered

@@ -269,7 +269,7 @@ class StatusReporter(Watcher):
         self._line.tell(replace(status, log=self.log, picture_port=self._picture_port))
 
     def event(self, event: Event) -> None:
-        if event.rest is not None:
+        if event.rest_state is not None:
             self._rest = event.reason
 
     def result_of(self, outcome: VehicleOutcome, summary: FlightSummary, log: str) -> Result:

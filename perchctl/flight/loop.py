@@ -156,7 +156,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         with contextlib.suppress(Exception):  # whatever has failed may fail again
             turns.report_failure(inputs, error)
         with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
-            watchers.event(Event.note_from_rescue(parts.clock.now(), error, rest.state, rest.text))
+            watchers.event(Event.make_rescue_note(parts.clock.now(), error, rest.state, rest.text))
         raise
 
 
@@ -295,7 +295,7 @@ def _mission(
         ):
             parts.positions.stop()
             drops_sightings = True
-        events = Event.list_from_tick(before, state, obs, parts.profile)
+        events = Event.list_events_of_tick(before, state, obs, parts.profile)
         notes = watchers.take_notes()
         if obs.flight_log_problem is not None and not log_noted:
             log_noted = True
@@ -357,7 +357,7 @@ def _observe(
     return replace(
         inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
-        loop_late_s=late_s,
+        tick_start_delay_s=late_s,
         operator_request=parts.operator(),
         climb_withheld_reason=parts.climb_withheld(),
         flight_log_problem=flight_log_problem,

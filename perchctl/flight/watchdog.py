@@ -197,7 +197,7 @@ class Watchdog:
             telemetry=history.newest or last.obs.telemetry,
             has_estimated_position_jumped=history.jumped,
             heading_jump_rad=history.turned_rad,
-            loop_late_s=now_s - last.obs.t_s,
+            tick_start_delay_s=now_s - last.obs.t_s,
             position_age_s=age_s,
             imu=history.imu,
             visual_inertial_motion=last.obs.visual_inertial_motion,
@@ -229,7 +229,7 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
     """True also while the weight is on the magnet: its monitored release continues."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
-        and (state.release_began_s is not None or state.motor_stop_ordered_at_s is not None)
+        and (state.release_began_at_s is not None or state.motor_stop_commanded_at_s is not None)
     )
 
 

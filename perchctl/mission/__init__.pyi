@@ -9,7 +9,7 @@ from .phase import OperatorRequest as OperatorRequest
 from .phase import Outcome as Outcome
 from .phase import Phase as Phase
 from .phase import Severity as Severity
-from .phase import VehicleClaim as VehicleClaim
+from .phase import VehicleDiagnosis as VehicleDiagnosis
 from .planner import step_mission as step_mission
 from .records import Event as Event
 from .records import EventKind as EventKind
@@ -26,7 +26,7 @@ from .report import FlightReport as FlightReport
 from .report import HoverReport as HoverReport
 from .report import RestReport as RestReport
 from .report import Touchdown as Touchdown
-from .report import find_row_claims as find_row_claims
+from .report import find_row_diagnosis as find_row_diagnosis
 from .report import report_rest as report_rest
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState

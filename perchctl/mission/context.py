@@ -36,16 +36,17 @@ class Context:
         self.t_s: float = self.obs.t_s
 
     @property
-    def in_phase_s(self) -> float:
+    def time_in_phase_s(self) -> float:
         """Time since the phase began, s."""
         return self.t_s - self.state.entry.t_s
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick. For how long, ask `held_s` of the condition."""
+        """What supports the vehicle in this tick. For how long, ask `true_for_s` of the
+        condition."""
         return find_support(self.belief)
 
-    def held_s(self, condition: Condition[Any]) -> float:
+    def true_for_s(self, condition: Condition[Any]) -> float:
         """Seconds for which a condition has been true; -1 while it is false."""
         began_s = self.belief.condition_start_times_s.get(condition)
         if began_s is None:

@@ -14,10 +14,10 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition
 
 
-def keep_state(state: PlannerState, before: Context) -> PlannerState:
+def keep_state(state: PlannerState, previous_context: Context) -> PlannerState:
     """Return the state unchanged: the `enter` function of a phase that needs no preparation.
-    `before` is not used."""
-    del before
+    `previous_context` is not used."""
+    del previous_context
     return state
 
 
@@ -29,8 +29,8 @@ class PhaseDefinition:
         maneuver: maneuver flown in this phase, as far as the evidence depends on it.
         enter: function that prepares the phase. It takes the state that has just entered the phase
             and the context of the tick before the transition, and returns the new state.
-            `state.entry.claims` holds what the transition asserts about the vehicle
-            (`VehicleClaim`).
+            `state.entry.diagnosis` holds what the transition asserts about the vehicle
+            (`VehicleDiagnosis`).
         act: function that returns the new state and the command of each tick.
         exits: the transitions (rows of the table) out of this phase alone, in the order in which
             they are tried; rows for many phases come before them.

@@ -24,8 +24,8 @@ import math
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import (
     HANGING,
-    HANGING_DWELL_S,
-    MOTORS_OFF_DESPITE_THRUST_ORDER,
+    HANGING_CONFIRMATION_DWELL_S,
+    MOTORS_OFF_DESPITE_THRUST_COMMAND,
     MOTORS_OFF_DWELL_S,
     ON_FLOOR,
     has_slipped,
@@ -33,23 +33,23 @@ from perchctl.mission.belief.contact import (
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_M
-from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
+from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
 from perchctl.mission.belief.update import (
-    KEEPALIVE_THRUST,
-    reset_evidence,
+    KEEPALIVE_RAW_THRUST,
+    reset_conditions,
     start_dead_reckoning,
     update_after_command,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
-    MIN_BELOW_CONTACT_WHEN_RELEASED_M,
-    MIN_ORDERED_TO_HOVER_THRUST_RATIO,
+    MIN_COMMANDED_TO_HOVER_THRUST_RATIO,
+    MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M,
     descend_level,
     should_wait_for_climb_rate,
 )
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
-from perchctl.mission.phase import Phase, Severity, VehicleClaim
+from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_slip,
     choose_catch_setpoint_above_vehicle_m,
@@ -60,8 +60,8 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.setpoints import (
     Action,
-    hold_here,
     limit_setpoint,
+    make_setpoint_at_vehicle,
     move_setpoint_to_vehicle,
     step_towards,
 )
@@ -70,43 +70,43 @@ from perchctl.profile import PlannerConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, HL_ACTIVE, Command, Idle, Land, RawThrust
 
-DESCENT_MANEUVER = Maneuver(descends=True)
+DESCENT_MANEUVER = Maneuver(descends_to_floor=True)
 """Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
-MAX_PEEL_SETPOINT_BELOW_VEHICLE_M = 0.35
+MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M = 0.35
 """Largest distance of a setpoint below the vehicle, m. Larger: a vehicle that comes off the magnet
 falls."""
-PEEL_TIMEOUT_S = 4.0
+PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
-MAX_CLIMB_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
+MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
 """Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
 MAX_LANDED_HEIGHT_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
-MAX_RESTING_CLIMB_MPS = 0.1
+MAX_CLIMB_RATE_OF_MOTIONLESS_VEHICLE_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
 still climbs or sinks."""
-FLOOR_DWELL_S = 0.5
+ON_FLOOR_DWELL_S = 0.5
 """Time for which a vehicle must stand still before its motors are stopped, s."""
 
 # --- by the firmware's own landing ---
-LANDING_ORDER_PERIOD_S = 0.3
+LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing orders, s. Without its notify message, the firmware does not execute an
 order (docs/firmware.md, "Order without notify")."""
-MIN_LANDING_ORDERS = 3
+MIN_LANDING_COMMANDS = 3
 """Number of landing orders before the telemetry can confirm that the vehicle lands."""
-MAX_LANDING_ORDERS = 6
+MAX_LANDING_COMMANDS = 6
 """Largest number of landing orders."""
-ONBOARD_LANDING_MEAN_MPS = 0.35
+ONBOARD_LANDING_MEAN_SPEED_MPS = 0.35
 """Mean speed of the quintic landing trajectory, m/s."""
-ONBOARD_LANDING_MARGIN_S = 1.8
+ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the quintic's duration, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-MAX_HEIGHT_ESTIMATE_DRIFT_M = 1.0
+MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M = 1.0
 """Largest assumed drift of the height, m."""
-MAX_UNSUPPORTED_G = 0.5
+MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
 """Specific force below which the vehicle falls, g: no floor supports it."""
 MAX_DROP_ONTO_FLOOR_SPEED_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
@@ -129,11 +129,11 @@ def step_landing(
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
     """Store in the state what later ticks need to know of `command` (raw thrust, time, end of the
     thrust check), and return both as the result of the tick."""
-    order = state.raw_thrust_order
+    order = state.commanded_raw_thrust
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
     belief = update_after_command(state.belief, command)
-    return replace(state, belief=belief, raw_thrust_order=order, t_s=belief.obs.t_s), command
+    return replace(state, belief=belief, commanded_raw_thrust=order, t_s=belief.obs.t_s), command
 
 
 def begin_landing(state: PlannerState) -> PlannerState:
@@ -147,17 +147,18 @@ def begin_landing(state: PlannerState) -> PlannerState:
         entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
         severity=max(state.severity, Severity.LAND),
         condition_start_times_s={},
-        belief=reset_evidence(b),
+        belief=reset_conditions(b),
         must_end_press=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
-        last_stop_or_land_order_at_s=None,
-        stop_or_land_order_count=0,
+        last_stop_or_land_command_at_s=None,
+        stop_or_land_command_count=0,
     )
     return enter_descent(new, state)
 
 
-def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
-    """Return the state at the start of a landing; `before` is the state before the transition."""
-    b, tel, old = state.belief, state.belief.telemetry, before.belief
+def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerState:
+    """Return the state at the start of a landing; `previous_state` is the state before the
+    transition."""
+    b, tel, old = state.belief, state.belief.telemetry, previous_state.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
     if (
         heard
@@ -167,16 +168,16 @@ def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
     ):
         state = replace(
             state,
-            stop_or_land_order_count=MIN_LANDING_ORDERS,
-            last_stop_or_land_order_at_s=b.obs.t_s,
+            stop_or_land_command_count=MIN_LANDING_COMMANDS,
+            last_stop_or_land_command_at_s=b.obs.t_s,
         )
-    elif heard and tel.thrust < 1 and before.motor_stop_ordered_at_s is None:
+    elif heard and tel.thrust < 1 and previous_state.motor_stop_commanded_at_s is None:
         # The motors were stopped or never ran; no order may start them again.
-        state = replace(state, motor_stop_ordered_at_s=b.obs.t_s)
+        state = replace(state, motor_stop_commanded_at_s=b.obs.t_s)
     vehicle_world_z_at_last_contact_m = old.vehicle_world_z_at_last_contact_m
     pressed_unseen = state.must_end_press and b.is_positioned_by_target
     if vehicle_world_z_at_last_contact_m is None and (
-        before.phase is Phase.PERCH or pressed_unseen
+        previous_state.phase is Phase.PERCH or pressed_unseen
     ):
         # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
         # ceiling. It counts as free only after a sighting from below.
@@ -185,12 +186,12 @@ def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
     state = move_setpoint_to_vehicle(Context(state))
     within = (
         vehicle_world_z_at_last_contact_m is not None
-        or b.reckoning.gear_below_target_m < MAGNET_REACH_M
+        or b.dead_reckoning.gear_below_target_m < MAGNET_REACH_M
     )
     lost = b.has_only_imu_for_descent
     b = replace(
         b,
-        in_magnet_reach_since_s=before.t_s
+        in_magnet_reach_since_s=previous_state.t_s
         if within and old.in_magnet_reach_since_s is None
         else old.in_magnet_reach_since_s,
         vehicle_world_z_at_last_contact_m=vehicle_world_z_at_last_contact_m,
@@ -204,19 +205,23 @@ def act(c: Context) -> Action:
     state = c.state
     if _is_falling_free(c):
         return _restart_landing_with_catch(c)
-    if state.motor_stop_ordered_at_s is None and state.catch_setpoint_above_vehicle_m is not None:
+    if state.motor_stop_commanded_at_s is None and state.catch_setpoint_above_vehicle_m is not None:
         if (caught := _catch_fall(c)) is not None:
             return caught
         c = Context(replace(state, catch_setpoint_above_vehicle_m=None))
-    is_off = c.held_s(MOTORS_OFF_DESPITE_THRUST_ORDER) >= MOTORS_OFF_DWELL_S
-    if c.state.motor_stop_ordered_at_s is not None or is_off or _is_standing(c):
+    is_off = c.true_for_s(MOTORS_OFF_DESPITE_THRUST_COMMAND) >= MOTORS_OFF_DWELL_S
+    if c.state.motor_stop_commanded_at_s is not None or is_off or _is_standing_on_floor(c):
         return stop_motors(c)
-    if c.state.release_began_s is not None:
+    if c.state.release_began_at_s is not None:
         return _complete_transfer_to_magnet(c)
     # changing to another policy during the firmware's own landing would cost height
-    if c.state.stop_or_land_order_count:
-        return _order_onboard_landing(c)
-    return _transfer_weight_to_magnet(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
+    if c.state.stop_or_land_command_count:
+        return _command_onboard_landing(c)
+    return (
+        _transfer_weight_to_magnet(c)
+        if c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
+        else descend(c)
+    )
 
 
 def descend(c: Context) -> Action:
@@ -246,27 +251,29 @@ def descend(c: Context) -> Action:
         c = Context(state)
     low = b.height_m <= landing.handover_m
     if in_reach:
-        gives_up = c.in_phase_s > PEEL_TIMEOUT_S and (b.is_imu_fresh or not doubtful)
+        gives_up = c.time_in_phase_s > PEEL_OFF_MAGNET_TIMEOUT_S and (
+            b.is_imu_fresh or not doubtful
+        )
         return _transfer_weight_to_magnet(c) if gives_up else _descend_by_setpoints(c)
     if b.is_positioned_by_target:
         return _descend_by_thrust(c) if c.state.descent.thrust or low else _descend_by_setpoints(c)
-    overdue = c.in_phase_s > landing.setpoint_time_s
-    return _order_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
+    overdue = c.time_in_phase_s > landing.setpoint_time_s
+    return _command_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
 
 
-def is_landing_over(c: Context) -> bool:
+def has_landing_command_reached_end(c: Context) -> bool:
     """True if a landing has come to its end: the raw thrust is at its minimum, or the setpoint is
     at the floor. The motors must then be stopped, or the firmware's supervisor locks the vehicle
     when the setpoints end."""
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
-        if low and VehicleClaim.LANDING_UNCONFIRMED in c.state.entry.claims:
+        if low and VehicleDiagnosis.LANDING_UNCONFIRMED in c.state.entry.diagnosis:
             return True
     return (
         0.0
         < c.state.descent.thrust
-        <= MIN_ORDERED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust + 1.0
+        <= MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust + 1.0
     )
 
 
@@ -277,27 +284,30 @@ def _is_falling_free(c: Context) -> bool:
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
-    if not state.is_under_power:
+    if not state.is_before_release_and_motor_stop:
         return b.is_in_magnet_reach and has_slipped(b)
-    if state.stop_or_land_order_count:
+    if state.stop_or_land_command_count:
         return False
     caught = state.catch_setpoint_above_vehicle_m is None
     return (
         b.vehicle_world_z_at_last_contact_m is not None
         and caught
-        and b.is_sinking(-MAX_CLIMB_WHEN_FALLING_OFF_MAGNET_MPS)
+        and b.is_sinking(-MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS)
     )
 
 
-def _is_standing(c: Context) -> bool:
+def _is_standing_on_floor(c: Context) -> bool:
     """True if the vehicle is proven to stand on the floor."""
     b = c.belief
-    if b.is_telemetry_fresh and c.held_s(ON_FLOOR) >= FLOOR_DWELL_S:
+    if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
         return True
     placed = b.is_positioned_by_target and b.is_position_valid and b.dead_reckoning_since_s is None
     low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_in_magnet_reach
     return (
-        placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < MAX_RESTING_CLIMB_MPS
+        placed
+        and c.state.descent.thrust > 0.0
+        and low
+        and abs(b.climb_mps) < MAX_CLIMB_RATE_OF_MOTIONLESS_VEHICLE_MPS
     )
 
 
@@ -309,20 +319,20 @@ def _restart_landing_with_catch(c: Context) -> Action:
         b,
         vehicle_world_z_at_last_contact_m=None,
         in_magnet_reach_since_s=None,
-        reckoning=replace(b.reckoning, gear_below_target_m=math.inf),
+        dead_reckoning=replace(b.dead_reckoning, gear_below_target_m=math.inf),
     )
     state = replace(
         c.state,
         belief=belief,
-        release_began_s=None,
-        motor_stop_ordered_at_s=None,
+        release_began_at_s=None,
+        motor_stop_commanded_at_s=None,
         must_end_press=False,
         catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(
             b.hover_thrust, tel.thrust
         ),
         setpoint=None,
-        last_stop_or_land_order_at_s=None,
-        stop_or_land_order_count=0,
+        last_stop_or_land_command_at_s=None,
+        stop_or_land_command_count=0,
         descent=replace(c.state.descent, thrust=0.0),
         entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
     )
@@ -332,7 +342,7 @@ def _restart_landing_with_catch(c: Context) -> Action:
 
 def _catch_fall(c: Context) -> Action | None:
     """Catch the fall by position; None without a heading or with diverged positions."""
-    return None if c.belief.heading_lost or c.belief.is_position_diverged else catch_slip(c)
+    return None if c.belief.is_heading_lost or c.belief.is_position_diverged else catch_slip(c)
 
 
 # --- The four policies ---
@@ -342,19 +352,19 @@ def _descend_by_setpoints(c: Context) -> Action:
     """Lower the setpoint at `landing.speed_mps`, vertically below the position at which the landing
     began."""
     landing, state, b = c.planner.landing, c.state, c.belief
-    here = hold_here(c)
+    here = make_setpoint_at_vehicle(c)
     start = here
     if state.catch_setpoint_above_vehicle_m is None and state.setpoint is not None:
         start = state.setpoint
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry.position_m
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = step_towards(c, start, goal, down_mps=landing.speed_mps, changes_heading=False)
+    setpoint = step_towards(c, start, goal, max_down_mps=landing.speed_mps, changes_heading=False)
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(
-            setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_SETPOINT_BELOW_VEHICLE_M)
+            setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M)
         )
-    state = forget_contact_when_below(state, MIN_BELOW_CONTACT_WHEN_RELEASED_M)
+    state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M)
     state = replace(state, setpoint=setpoint, catch_setpoint_above_vehicle_m=None)
     dx, dy = state.lateral_integral_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
@@ -367,7 +377,7 @@ def _descend_by_thrust(c: Context) -> Action:
     return _descend_by_setpoints(c) if should_wait_for_climb_rate(c) else descend_level(c)
 
 
-def make_onboard_landing(
+def make_onboard_landing_command(
     planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, z_m: float
 ) -> Land:
     """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
@@ -378,56 +388,63 @@ def make_onboard_landing(
     vehicle.
     """
     drifted_m = min(
-        MAX_HEIGHT_ESTIMATE_DRIFT_M, planner.landing.drift_mps * max(0.0, time_in_flight_s)
+        MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M,
+        planner.landing.drift_mps * max(0.0, time_in_flight_s),
     )
     goal_z_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(
         goal_z_m,
-        ONBOARD_LANDING_MARGIN_S
-        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - goal_z_m) / ONBOARD_LANDING_MEAN_MPS,
+        ONBOARD_LANDING_DURATION_MARGIN_S
+        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - goal_z_m) / ONBOARD_LANDING_MEAN_SPEED_MPS,
     )
 
 
-def _order_onboard_landing(c: Context) -> Action:
+def _command_onboard_landing(c: Context) -> Action:
     """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
-    if away is not None and not b.is_flight_data_unreliable and not state.stop_or_land_order_count:
+    if (
+        away is not None
+        and not b.is_flight_data_unreliable
+        and not state.stop_or_land_command_count
+    ):
         return state, away
-    ends = state.stop_or_land_order_count >= MIN_LANDING_ORDERS and not (
+    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMANDS and not (
         b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
     )
-    carried = tel.acc_z_g > MAX_UNSUPPORTED_G or (
+    carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_IN_FALL_G or (
         ends and tel.velocity_mps[2] > -MAX_DROP_ONTO_FLOOR_SPEED_MPS
     )
     if (
         b.is_imu_fresh
         and tel.thrust < 1
         and carried
-        and (state.stop_or_land_order_count or not tel.has_bit(FLYING))
+        and (state.stop_or_land_command_count or not tel.has_bit(FLYING))
     ):
         return state, Idle()  # on the floor, another order would start the motors again
     waited = (
         math.inf
-        if state.last_stop_or_land_order_at_s is None
-        else c.t_s - state.last_stop_or_land_order_at_s
+        if state.last_stop_or_land_command_at_s is None
+        else c.t_s - state.last_stop_or_land_command_at_s
     )
     seen = (
-        state.stop_or_land_order_count >= MIN_LANDING_ORDERS
+        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
     if (
         not seen
-        and waited > LANDING_ORDER_PERIOD_S
-        and state.stop_or_land_order_count < MAX_LANDING_ORDERS
+        and waited > LANDING_COMMAND_PERIOD_S
+        and state.stop_or_land_command_count < MAX_LANDING_COMMANDS
     ):
-        time_in_flight_s = c.t_s - state.started_s
-        order = make_onboard_landing(c.planner, b.ground_z_m, time_in_flight_s, tel.position_m[2])
+        time_in_flight_s = c.t_s - state.flight_started_at_s
+        order = make_onboard_landing_command(
+            c.planner, b.ground_z_m, time_in_flight_s, tel.position_m[2]
+        )
         return replace(
             state,
-            last_stop_or_land_order_at_s=c.t_s,
-            stop_or_land_order_count=state.stop_or_land_order_count + 1,
+            last_stop_or_land_command_at_s=c.t_s,
+            stop_or_land_command_count=state.stop_or_land_command_count + 1,
             setpoint=None,
         ), order
     return state, Idle()
@@ -436,7 +453,7 @@ def _order_onboard_landing(c: Context) -> Action:
 def _transfer_weight_to_magnet(c: Context) -> Action:
     """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than a perch
     does."""
-    return release_by_thrust(c, accepted_telemetry_age_s=c.safety.telemetry_hold_s)
+    return release_by_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
 def _complete_transfer_to_magnet(c: Context) -> Action:
@@ -445,6 +462,6 @@ def _complete_transfer_to_magnet(c: Context) -> Action:
     climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
-    part = MIN_ORDERED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust
-    thrust = int(max(KEEPALIVE_THRUST, min(MIN_POSITION_MODE_THRUST, part)))
-    return replace(c.state, release_began_s=c.t_s), RawThrust(thrust)
+    part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust
+    thrust = int(max(KEEPALIVE_RAW_THRUST, min(MIN_FIRMWARE_POSITION_MODE_THRUST, part)))
+    return replace(c.state, release_began_at_s=c.t_s), RawThrust(thrust)

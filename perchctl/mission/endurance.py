@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
-    MIN_TIME_UNDER_LOAD_S,
+    MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S,
     BatteryFit,
     PowerTrain,
-    charge_from_rest_v,
+    charge_fraction_from_rest_v,
     fit_sag_model,
-    full_thrust_discharge_per_s,
+    full_thrust_discharge_fraction_per_s,
     identify_power_train,
 )
 from perchctl.mission.belief.contact import max_press_thrust
@@ -21,7 +21,7 @@ from perchctl.mission.state import BatteryOutlook
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
-MAX_READING_GAP_S = 5.0
+MAX_BATTERY_READING_GAP_S = 5.0
 """Time without a reading after which the charge is unknown, s."""
 STANDOFF_SETTLING_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
@@ -43,27 +43,29 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     `battery-unknown` lands the vehicle.
     """
     energy = c.belief.battery_fit
-    used_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
+    consumed_charge_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
     thrust_fraction = (
         c.belief.hover_thrust or FULL_THRUST * energy.mean_thrust_fraction
     ) / FULL_THRUST
     counted_s = predict_hover_time_s(
         energy, c.profile, thrust_fraction, identify_power_train(c.telemetry)
     )
-    seconds = None if energy.time_since_battery_reading_s > MAX_READING_GAP_S else counted_s
+    seconds = None if energy.time_since_battery_reading_s > MAX_BATTERY_READING_GAP_S else counted_s
     if c.belief.target.world_position_m is None:
-        return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
+        return BatteryOutlook(seconds, None, consumed_charge_mah, energy.rest_v)
     enough_s, predicted = seconds, predict_durations(c)
     if enough_s is None:
         enough_s = (
-            _no_reading_grace_s(c) if counted_s is None else min(counted_s, _no_reading_grace_s(c))
+            _missing_battery_reading_timeout_s(c)
+            if counted_s is None
+            else min(counted_s, _missing_battery_reading_timeout_s(c))
         )
     spare_s = enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.attempt_s
     left = c.planner.attempts - c.state.failed_attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
         attempts = 1 + math.floor(min(spare_s / predicted.retry_s, max(0, left)))
-    return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
+    return BatteryOutlook(seconds, max(0, min(attempts, left)), consumed_charge_mah, energy.rest_v)
 
 
 def predict_hover_time_s(
@@ -73,7 +75,7 @@ def predict_hover_time_s(
     fires; None if unknown."""
     if (
         state.rest_v is None
-        or state.time_under_load_s < MIN_TIME_UNDER_LOAD_S
+        or state.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
         or not thrust_fraction > 0.0
     ):
         return None
@@ -89,11 +91,11 @@ def predict_hover_time_s(
     end_v = hover_v + sag_v * thrust_fraction
     if profile.planner.hover is None:
         end_v = max(end_v, press_v + sag_v * press_load)
-    share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
+    share = charge_fraction_from_rest_v(state.rest_v) - charge_fraction_from_rest_v(end_v)
     return max(0.0, share) / (
         true_to_counted_discharge_ratio
         * thrust_fraction
-        * full_thrust_discharge_per_s(profile.vehicle.battery_mah, power_train)
+        * full_thrust_discharge_fraction_per_s(profile.vehicle.battery_mah, power_train)
     )
 
 
@@ -113,7 +115,7 @@ def predict_durations(c: Context) -> MissionDurations:
     top_z_m = c.belief.target.vehicle_world_z_when_touching_m - (
         0.0 if hover is None else hover.below_m
     )
-    climb_m = max(0.0, top_z_m - c.telemetry.position_m[2])
+    climb_height_m = max(0.0, top_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s
     if hover is None:
         touch_s += TOUCH_DURATION_S
@@ -128,9 +130,9 @@ def predict_durations(c: Context) -> MissionDurations:
             BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
         )
     retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
-    descent_s = max(0.0, c.belief.height_m + climb_m) / planner.landing.speed_mps
+    descent_s = max(0.0, c.belief.height_m + climb_height_m) / planner.landing.speed_mps
     return MissionDurations(
-        attempt_s=aligned_s + _climb_duration_s(c.profile, climb_m) + touch_s,
+        attempt_s=aligned_s + _climb_duration_s(c.profile, climb_height_m) + touch_s,
         retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
         landing_s=descent_s + LANDING_END_DURATION_S,
     )
@@ -156,14 +158,14 @@ def battery_shortfall_text(c: Context) -> str:
     )
 
 
-def _no_reading_grace_s(c: Context) -> float:
+def _missing_battery_reading_timeout_s(c: Context) -> float:
     """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
     return c.safety.battery_stale_s - max(
         c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
     )
 
 
-def _climb_duration_s(profile: Profile, climb_m: float) -> float:
+def _climb_duration_s(profile: Profile, climb_height_m: float) -> float:
     ascend = profile.planner.ascend
-    near_m = min(climb_m, ascend.near_m)
-    return (climb_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps
+    near_m = min(climb_height_m, ascend.near_m)
+    return (climb_height_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps

@@ -19,7 +19,7 @@ import math
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import MAX_RAW_THRUST
-from perchctl.mission.belief.reckoning import BIAS_TIME_CONSTANT_S
+from perchctl.mission.belief.reckoning import ACCELERATION_BIAS_TIME_CONSTANT_S
 from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, VisualMotion
 from perchctl.mission.context import Context
 from perchctl.mission.release import forget_contact_when_below
@@ -28,72 +28,72 @@ from perchctl.mission.state import PlannerState
 from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
-SINK_SETPOINT_MPS = 0.7
+SINK_RATE_SETPOINT_MPS = 0.7
 """Sink rate setpoint, m/s. The gyroscope's offset moves the vehicle 2 m laterally in 4 s. Larger:
 the vehicle lands harder if the floor is not detected. Smaller: it lands further from the target's
 axis."""
-NEAR_FLOOR_SINK_SETPOINT_MPS = 0.4
+NEAR_FLOOR_SINK_RATE_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
-NEAR_FLOOR_HEIGHT_M = 0.6
-"""Height below which the vehicle sinks at `NEAR_FLOOR_SINK_SETPOINT_MPS`, m."""
+MAX_NEAR_FLOOR_HEIGHT_M = 0.6
+"""Height below which the vehicle sinks at `NEAR_FLOOR_SINK_RATE_SETPOINT_MPS`, m."""
 MAX_SINK_RATE_GAIN_S_PER_M = 0.5
 """Largest gain, in shares of the hover thrust per m/s. Larger: the vehicle oscillates."""
 MIN_SINK_RATE_GAIN_S_PER_M = 0.2
 """Smallest gain, with old telemetry, in shares of the hover thrust per m/s."""
 SINK_RATE_GAIN_TIMES_AGE_S2_PER_M = 0.06
 """Product of gain and age of the vertical speed, between the smallest and the largest gain."""
-THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
+THRUST_TO_HOVER_RATIO_WITHOUT_CLIMB_RATE = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
-SINK_SETPOINT_BY_CAMERA_MPS = 0.4
+SINK_RATE_SETPOINT_BY_CAMERA_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
-MIN_SINK_MEASURED_BY_CAMERA_MPS = 0.2
+MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS = 0.2
 """Sink rate measured by pictures below which the vehicle does not sink, m/s; the error of single
 detections is half of it."""
 CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
 """Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
 like a motion. Smaller: it drifts further."""
-SETPOINT_SETTLING_S = 0.6
+MOTION_SETTLING_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which no speed remains, s."""
-THRUST_RAMP_PER_S = 0.25
+THRUST_RAMP_DOWN_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-THRUST_RAMP_BY_CAMERA_PER_S = 0.1
+THRUST_RAMP_DOWN_BY_CAMERA_PER_S = 0.1
 """Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
 the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
-MIN_DETECTED_SINK_MPS = 0.05
+MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 """Sink rate below which the vehicle does not sink, m/s."""
-MIN_ORDERED_TO_HOVER_THRUST_RATIO = 0.4
+MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
 """Smallest ordered thrust, as a share of the hover thrust."""
-MIN_TILT_COSINE = 0.8
+MIN_TILT_COSINE_TO_COMPENSATE_THRUST = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_GAIN_RAD_PER_MPS = 0.25
 """Lean per lateral speed."""
-MAX_CAMERA_SPEED_AGE_S = 0.5
+MAX_CAMERA_VELOCITY_AGE_S = 0.5
 """Oldest lateral speed from pictures that the vehicle brakes, s. Larger: after the last picture it
 keeps leaning against a speed that is gone. Smaller: a few lost pictures end the braking."""
 MAX_BRAKE_TILT_RAD = 0.22
 """Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
-MAX_WIND_TILT_RAD = 0.2
+MAX_WIND_COMPENSATION_TILT_RAD = 0.2
 """Largest lean against the wind, rad: a wind of 6 m/s. Larger: a blow or a wrong bias moves the
 vehicle far off."""
-MAX_SPEED_AGE_FOR_FULL_BRAKE_S = 0.2
+MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S = 0.2
 """Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
-INITIAL_LATERAL_SIGMA_MPS = 0.05
+INITIAL_LATERAL_VELOCITY_SIGMA_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
-LATERAL_SIGMA_GROWTH_MPS2 = 0.1
+LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 = 0.1
 """Growth of that uncertainty, m/s per second: an attitude error of 0.01 rad adds 0.1."""
-MAX_LATERAL_SIGMA_MPS = 0.3
+MAX_LATERAL_VELOCITY_SIGMA_MPS = 0.3
 """Largest uncertainty of the lateral speed, m/s."""
-MAX_VISUAL_BIAS_AGE_S = 6.0
+MAX_VISUAL_ATTITUDE_BIAS_AGE_S = 6.0
 """Time after which the attitude error that pictures have shown no longer applies, s."""
-MIN_SUPPORTED_G = 0.95
+MIN_SPECIFIC_FORCE_IF_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
 MAX_SUPPORTED_TO_HOVER_THRUST_RATIO = 0.88
 """Largest thrust at which a vehicle that reads 1 g must be resting on something, as a share of the
 hover thrust."""
-MAX_G_STILL_AIRBORNE = 0.85
+MAX_SPECIFIC_FORCE_IF_AIRBORNE_G = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
 TOUCHDOWN_TO_HOVER_THRUST_RATIO = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
@@ -101,28 +101,28 @@ TOUCHDOWN_DURATION_S = 0.25
 """Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
 MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
 """Height below which a blow from below is the floor's, m."""
-DESCENT_OVERDUE_MARGIN_S = 2.0
+TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration after which the vehicle has landed or hangs, s."""
-OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
+TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
 """The same margin without a measured vertical speed, s."""
 MAX_SETPOINT_DESCENT_S = 1.5
 """Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
 its own estimate, s."""
-MIN_MEAN_SINK_MPS = 0.35
+MIN_MEAN_DESCENT_SINK_RATE_MPS = 0.35
 """Least mean speed of the descent, m/s."""
-MIN_BELOW_CONTACT_WHEN_RELEASED_M = 0.1
+MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M = 0.1
 """Distance of the vehicle below its contact from which the magnet has let go, m. Larger: a vehicle
 that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to
 have come off."""
-MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M = 0.2
+MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, at which the magnet
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
-MAX_STANDING_TO_HOVER_THRUST_BY_CAMERA = 0.75
+MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA = 0.75
 """Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
 in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
 Smaller: the motors run on the floor for longer."""
-MAX_RAMP_STEP_S = 0.1
+MAX_THRUST_RAMP_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
 
@@ -150,12 +150,12 @@ def _climb_measured_at_s(c: Context) -> float:
 
 def _is_climb_unknown(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
-    return _climb_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_S
+    return _climb_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
 
 
 def _tick_duration_s(c: Context) -> float:
-    """Return the time since the previous tick, s, at most `MAX_RAMP_STEP_S`."""
-    return max(0.0, min(MAX_RAMP_STEP_S, c.t_s - c.state.t_s))
+    """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_STEP_S`."""
+    return max(0.0, min(MAX_THRUST_RAMP_STEP_S, c.t_s - c.state.t_s))
 
 
 def _climb_measurement_age_s(c: Context) -> float:
@@ -167,7 +167,7 @@ def should_wait_for_climb_rate(c: Context) -> bool:
     """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
     setpoints are then better, for at most `MAX_SETPOINT_DESCENT_S`."""
     begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover_thrust_estimate.is_imprecise
-    return _is_climb_unknown(c) and begins_rough and c.in_phase_s < MAX_SETPOINT_DESCENT_S
+    return _is_climb_unknown(c) and begins_rough and c.time_in_phase_s < MAX_SETPOINT_DESCENT_S
 
 
 def descend_level(c: Context) -> Action:
@@ -179,21 +179,26 @@ def descend_level(c: Context) -> Action:
         _climb_measurement_age_s(c),
         _climb_measured_at_s(c),
     )
-    measured_mps = _measured_climb_mps(c)
+    measured_mps = _last_measured_climb_mps(c)
     climb_mps = measured_mps + descent.climb_change_not_yet_measured_mps
-    is_sinking, ramp_per_s = climb_mps <= -MIN_DETECTED_SINK_MPS, THRUST_RAMP_PER_S
+    is_sinking, ramp_per_s = (
+        climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
+        THRUST_RAMP_DOWN_PER_S,
+    )
     if _fresh_visual_motion(c) is not None:  # a vehicle on the floor ignores orders
         is_sinking, ramp_per_s = (
-            measured_mps <= -MIN_SINK_MEASURED_BY_CAMERA_MPS,
-            THRUST_RAMP_BY_CAMERA_PER_S,
+            measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
+            THRUST_RAMP_DOWN_BY_CAMERA_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
-    height_m = b.height_m if b.dead_reckoning_since_s is None else b.reckoned_height_m
+    height_m = b.height_m if b.dead_reckoning_since_s is None else b.dead_reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
-    if age_s > hover.MAX_TELEMETRY_AGE_S:
-        thrust *= THRUST_FACTOR_WITHOUT_CLIMB_RATE
-    floor_detected_at_s = _find_floor_detection_s(c, hover_thrust, height_m, is_sinking=is_sinking)
+    if age_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S:
+        thrust *= THRUST_TO_HOVER_RATIO_WITHOUT_CLIMB_RATE
+    floor_detected_at_s = _find_floor_detection_time_s(
+        c, hover_thrust, height_m, is_sinking=is_sinking
+    )
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -201,11 +206,11 @@ def descend_level(c: Context) -> Action:
         floor_detected_at_s = None  # the vehicle falls at low thrust, so it did not touch the floor
     carried = (
         b.is_imu_fresh
-        and tel.acc_z_g > MIN_SUPPORTED_G
+        and tel.acc_z_g > MIN_SPECIFIC_FORCE_IF_SUPPORTED_G
         and tel.thrust < MAX_SUPPORTED_TO_HOVER_THRUST_RATIO * hover_thrust
     )
     overdue = _is_touchdown_overdue(c) and not (
-        b.is_imu_fresh and tel.acc_z_g < MAX_G_STILL_AIRBORNE
+        b.is_imu_fresh and tel.acc_z_g < MAX_SPECIFIC_FORCE_IF_AIRBORNE_G
     )
     before = descent.thrust or hover_thrust
     if touched_s < TOUCHDOWN_DURATION_S:
@@ -214,7 +219,7 @@ def descend_level(c: Context) -> Action:
         thrust = before
     elif floor_detected_at_s is not None or carried or not is_sinking or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
-    thrust = max(MIN_ORDERED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
+    thrust = max(MIN_COMMANDED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
     shown_s = (
         0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_at_s)
@@ -234,7 +239,7 @@ def descend_level(c: Context) -> Action:
             climb_measured_at_s=measured_s,
         ),
         setpoint=None,
-        stop_or_land_order_count=0,
+        stop_or_land_command_count=0,
         catch_setpoint_above_vehicle_m=None,
     )
     roll_rad, pitch_rad = (
@@ -243,17 +248,17 @@ def descend_level(c: Context) -> Action:
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
 
-def _measured_climb_mps(c: Context) -> float:
+def _last_measured_climb_mps(c: Context) -> float:
     """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
     the vehicle in place since the last telemetry."""
     seen = _fresh_visual_motion(c)
     if seen is not None:
         return seen.vehicle_velocity_mps[2]
-    held = c.telemetry.t_s < c.state.entry.t_s - SETPOINT_SETTLING_S
+    held = c.telemetry.t_s < c.state.entry.t_s - MOTION_SETTLING_AT_CONSTANT_SETPOINT_S
     return 0.0 if held else c.belief.climb_mps
 
 
-def _find_floor_detection_s(
+def _find_floor_detection_time_s(
     c: Context, hover_thrust: float, height_m: float, *, is_sinking: bool
 ) -> float | None:
     """Return when the floor was first detected; None if it was not.
@@ -267,12 +272,12 @@ def _find_floor_detection_s(
         return descent.floor_detected_at_s
     struck = (
         c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_DURATION_S
-        and b.reckoning.climb_before_impact_mps < 0.0
+        and b.dead_reckoning.climb_before_impact_mps < 0.0
     )
-    weak = 0.0 < descent.thrust < MAX_STANDING_TO_HOVER_THRUST_BY_CAMERA * hover_thrust
+    weak = 0.0 < descent.thrust < MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA * hover_thrust
     stands = (
         seen is not None
-        and seen.target_from_gear_m[2] > MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M
+        and seen.gear_to_target_vector_m[2] > MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M
         and weak
         and not is_sinking
     )
@@ -284,13 +289,13 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
     is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
-    low = height_m <= NEAR_FLOOR_HEIGHT_M or is_height_wrong
-    sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
+    low = height_m <= MAX_NEAR_FLOOR_HEIGHT_M or is_height_wrong
+    sink_mps = NEAR_FLOOR_SINK_RATE_SETPOINT_MPS if low else SINK_RATE_SETPOINT_MPS
     if _fresh_visual_motion(c) is not None:
-        sink_mps = SINK_SETPOINT_BY_CAMERA_MPS
+        sink_mps = SINK_RATE_SETPOINT_BY_CAMERA_MPS
     gain = SINK_RATE_GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
     gain = max(MIN_SINK_RATE_GAIN_S_PER_M, min(MAX_SINK_RATE_GAIN_S_PER_M, gain))
-    tilt = max(MIN_TILT_COSINE, math.cos(b.tilt_rad))
+    tilt = max(MIN_TILT_COSINE_TO_COMPENSATE_THRUST, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
@@ -299,20 +304,21 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
     clearly below it, or the accelerometer a fall; otherwise unchanged."""
     state, b, seen = c.state, c.belief, _fresh_visual_motion(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
-        return forget_contact_when_below(state, MIN_BELOW_CONTACT_WHEN_RELEASED_M)
+        return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M)
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
         in_magnet_reach_since_s, state.entry.t_s
     )
     seen_below = (
-        seen is not None and seen.target_from_gear_m[2] > MIN_BELOW_TARGET_BY_CAMERA_RELEASED_M
+        seen is not None
+        and seen.gear_to_target_vector_m[2] > MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M
     )
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
             vehicle_world_z_at_last_contact_m=None,
             in_magnet_reach_since_s=None,
-            reckoning=replace(b.reckoning, gear_below_target_m=math.inf),
+            dead_reckoning=replace(b.dead_reckoning, gear_below_target_m=math.inf),
             dead_reckoning_since_s=None if b.dead_reckoning_since_s is None else c.t_s,
         )
         return replace(state, belief=belief)
@@ -327,11 +333,13 @@ def _is_touchdown_overdue(c: Context) -> bool:
         return False
     descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoning_since_s or 0.0, state.entry.t_s)
-    measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_S
-    spare_s = DESCENT_OVERDUE_MARGIN_S if measured else OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
+    measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    spare_s = (
+        TOUCHDOWN_OVERDUE_MARGIN_S if measured else TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
+    )
     if not measured and b.hover_thrust_estimate.is_imprecise:
         spare_s += MAX_SETPOINT_DESCENT_S
-    return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_SINK_MPS
+    return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_DESCENT_SINK_RATE_MPS
 
 
 def _compute_braking_attitude(c: Context) -> tuple[float, float]:
@@ -344,15 +352,16 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     estimated lean must therefore be (b - w) / g.
 
     Both b and w are means over the time with a known position, so an offset of the accelerometer
-    cancels. Means over less than `BIAS_TIME_CONSTANT_S` have less weight. Means from wrong
-    positions have none, and the bias that pictures have shown recently is used instead. The present
-    reading is not used, since most of it is the drag of the vehicle's own motion, which brakes it.
+    cancels. Means over less than `ACCELERATION_BIAS_TIME_CONSTANT_S` have less weight. Means from
+    wrong positions have none, and the bias that pictures have shown recently is used instead. The
+    present reading is not used, since most of it is the drag of the vehicle's own motion, which
+    brakes it.
     """
     b = c.belief
-    if b.heading_lost or b.is_in_magnet_reach:
+    if b.is_heading_lost or b.is_in_magnet_reach:
         return 0.0, 0.0
-    reckoning, yaw_rad = b.reckoning, c.telemetry.yaw_rad
-    x_mps, y_mps, _ = reckoning.velocity_mps
+    dead_reckoning, yaw_rad = b.dead_reckoning, c.telemetry.yaw_rad
+    x_mps, y_mps, _ = dead_reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if b.dead_reckoning_since_s is None else c.t_s - b.dead_reckoning_since_s
     visual_age_s = (
@@ -361,34 +370,37 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
         else c.t_s - c.obs.visual_inertial_motion.t_s
     )
     unsure_mps = min(
-        MAX_LATERAL_SIGMA_MPS,
-        INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
+        MAX_LATERAL_VELOCITY_SIGMA_MPS,
+        INITIAL_LATERAL_VELOCITY_SIGMA_MPS
+        + LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
     )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
-    part *= min(1.0, MAX_SPEED_AGE_FOR_FULL_BRAKE_S / max(1e-3, b.attitude_age_s))
+    part *= min(1.0, MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _world_to_heading_xy(part * x_mps, part * y_mps, yaw_rad)
     seen, gain = _fresh_visual_motion(c), BRAKE_GAIN_RAD_PER_MPS
     if seen is not None and b.does_camera_motion_match_vehicle:
         ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
-        if c.t_s - seen.t_s <= MAX_CAMERA_SPEED_AGE_S:
+        if c.t_s - seen.t_s <= MAX_CAMERA_VELOCITY_AGE_S:
             ahead_mps, left_mps, _ = seen.vehicle_velocity_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
-        reckoning.bias_mps2,
-        reckoning.mean_specific_force_world_xy_mps2,
+        dead_reckoning.acceleration_bias_mps2,
+        dead_reckoning.mean_specific_force_world_xy_mps2,
     )
     known = (
         0.0
         if b.is_position_diverged
-        else min(1.0, reckoning.time_under_position_control_s / BIAS_TIME_CONSTANT_S)
+        else min(
+            1.0, dead_reckoning.time_under_position_control_s / ACCELERATION_BIAS_TIME_CONSTANT_S
+        )
     )
-    counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_VISUAL_BIAS_AGE_S)
+    counts = known + (1.0 - known) * max(0.0, 1.0 - visual_age_s / MAX_VISUAL_ATTITUDE_BIAS_AGE_S)
     ahead_mps2, left_mps2 = _world_to_heading_xy(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
     )
     roll_rad, pitch_rad = c.obs.imu.roll_pitch_error_rad
     return (
-        _brake_tilt_rad(-left_mps, gain) - _wind_tilt_rad(left_mps2) + roll_rad,
-        _brake_tilt_rad(ahead_mps, gain) + _wind_tilt_rad(ahead_mps2) + pitch_rad,
+        _brake_tilt_rad(-left_mps, gain) - _wind_compensation_tilt_rad(left_mps2) + roll_rad,
+        _brake_tilt_rad(ahead_mps, gain) + _wind_compensation_tilt_rad(ahead_mps2) + pitch_rad,
     )
 
 
@@ -398,10 +410,12 @@ def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, flo
     return x * cos + y * sin, y * cos - x * sin
 
 
-def _wind_tilt_rad(acceleration_against_wind_mps2: float) -> float:
+def _wind_compensation_tilt_rad(acceleration_against_wind_mps2: float) -> float:
     return max(
-        -MAX_WIND_TILT_RAD,
-        min(MAX_WIND_TILT_RAD, math.atan(acceleration_against_wind_mps2 / GRAVITY_MPS2)),
+        -MAX_WIND_COMPENSATION_TILT_RAD,
+        min(
+            MAX_WIND_COMPENSATION_TILT_RAD, math.atan(acceleration_against_wind_mps2 / GRAVITY_MPS2)
+        ),
     )
 
 

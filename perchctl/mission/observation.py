@@ -25,8 +25,8 @@ class VisualInertialMotion:
     """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are world x and y."""
 
     t_s: float
-    velocity_mps: tuple[float, float]  # lateral velocity
-    bias_mps2: tuple[float, float]  # bias of accelerometer and attitude
+    lateral_velocity_mps: tuple[float, float]
+    acceleration_bias_mps2: tuple[float, float]  # bias of accelerometer and attitude
     climb_mps: float | None  # climb rate; None if the latency it assumes may no longer apply
 
 
@@ -45,7 +45,7 @@ class Observation:
     #: the state estimate moved further than any flight could
     has_estimated_position_jumped: bool = False
     heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
-    loop_late_s: float = 0.0  #: delay of the start of this tick
+    tick_start_delay_s: float = 0.0  #: delay of the start of this tick
     successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
     operator_request: OperatorRequest = OperatorRequest.NONE
     #: why the fleet's parent does not permit the climb; None if it does, or without a fleet

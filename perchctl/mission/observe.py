@@ -28,7 +28,7 @@ def observe(
             setpoint=setpoint,
         )
     known = state.belief.last_telemetry is not None
-    belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
+    belief = update_belief(state.belief, obs, state.command_history(maneuver), profile)
     state = replace(state, belief=belief)
     return _apply_frame_shift(state) if obs.has_estimated_position_jumped and known else state
 
@@ -36,18 +36,24 @@ def observe(
 def _apply_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
     trajectory in the old frame, so the vehicle is caught and the landing ordered again."""
-    b, blocked_z_m = state.belief, state.blocked_z_m
-    if state.phase is Phase.LANDING and state.stop_or_land_order_count and b.telemetry.thrust >= 1:
+    b, obstacle_blocked_at_z_m = state.belief, state.obstacle_blocked_at_z_m
+    if (
+        state.phase is Phase.LANDING
+        and state.stop_or_land_command_count
+        and b.telemetry.thrust >= 1
+    ):
         state = replace(
             state,
             entry=replace(state.entry, t_s=b.obs.t_s),
-            stop_or_land_order_count=0,
-            last_stop_or_land_order_at_s=None,
+            stop_or_land_command_count=0,
+            last_stop_or_land_command_at_s=None,
             catch_setpoint_above_vehicle_m=CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M,
         )
     return replace(
         state,
-        setpoint=b.sent.setpoint,
-        entry=replace(state.entry, position_m=b.sent.maneuver_start_m),
-        blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.world_frame_shift_m[2],
+        setpoint=b.command_history.setpoint,
+        entry=replace(state.entry, position_m=b.command_history.maneuver_start_position_m),
+        obstacle_blocked_at_z_m=None
+        if obstacle_blocked_at_z_m is None
+        else obstacle_blocked_at_z_m + b.world_frame_shift_in_tick_m[2],
     )

@@ -1,4 +1,4 @@
-"""The phases of a mission, the claims of transitions, and the outcomes of a flight."""
+"""The phases of a mission, the diagnoses of transitions, and the outcomes of a flight."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ CAMERA_GUIDED_PHASES = frozenset(
 )
 """Phases in which the camera guides the vehicle: their maneuver is `is_camera_guided`."""
 FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
-"""Phases in which nothing but air should touch the vehicle: their maneuver is `in_free_air`."""
-MAGNET_ATTACH_PHASES = CAMERA_GUIDED_PHASES | {Phase.PERCH}
+"""Phases in which nothing but air should touch the vehicle: their maneuver is `is_in_free_air`."""
+PHASES_IN_WHICH_MAGNET_MAY_ATTACH = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
 PUBLISHED_METHOD_PHASES = (
     Phase.APPROACH,
@@ -87,10 +87,10 @@ class Severity(IntEnum):
     LAND = 3
     STOP = 4
 
-    def escalate(self, transition_severity: Severity) -> Severity:
+    def escalate(self, new_severity: Severity) -> Severity:
         """Return the flight's severity after a transition of severity
-        `transition_severity`."""
-        return max(self, transition_severity) if self >= Severity.LAND else transition_severity
+        `new_severity`."""
+        return max(self, new_severity) if self >= Severity.LAND else new_severity
 
 
 class Outcome(Enum):
@@ -122,28 +122,28 @@ _EXIT_CODES: dict[Outcome, int] = {
 }
 
 
-class VehicleClaim(Flag):
-    """What a transition claims about the vehicle, in addition to its reason. The next phase starts
-    from the claims. Code that needs such a fact tests the claim, never the name of a row."""
+class VehicleDiagnosis(Flag):
+    """What a transition asserts about the vehicle, in addition to its reason. The next phase starts
+    from it. Code that needs such a fact tests the diagnosis, never the name of a row."""
 
     NONE = 0
-    BLOCKED = auto()
+    BLOCKED_BY_OBSTACLE = auto()
     """An obstacle is just above the vehicle."""
-    SLIPPED = auto()
+    SLIPPED_OFF_CONTACT = auto()
     """The vehicle falls off its contact."""
-    STILL_ATTACHED = auto()
+    STILL_AT_PROVEN_CONTACT = auto()
     """The contact was proven, and the vehicle has not come off."""
-    HANGS = auto()
+    HANGING_AT_LAST_TOUCH = auto()
     """The vehicle hangs where it last touched the target."""
-    HELD_BY_OTHER = auto()
+    HELD_BY_OTHER_OBJECT = auto()
     """Something other than the target holds the vehicle."""
     EXTERNAL_POSITIONS_WRONG = auto()
     """External positions lead position control away from its setpoint."""
-    MOUNTING_WRONG = auto()
+    CAMERA_MOUNTING_WRONG = auto()
     """The camera's mounting differs from the profile, or the axes of the positions are wrong."""
     PROFILE_MAY_BE_WRONG = auto()
     """The profile's camera or positioning section may be wrong and should be checked."""
-    RESUMES_HOVER = auto()
+    RETURNING_TO_HOVER_HEIGHT = auto()
     """A hover has sunk below its place, and continues once the vehicle has climbed back."""
     LANDING_UNCONFIRMED = auto()
     """The end of the landing could not be confirmed in time."""

@@ -13,16 +13,16 @@ without a successor, the firmware levels out after 0.5 s and cuts the motors aft
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import is_pressing
-from perchctl.mission.belief.evidence import update_start_times
+from perchctl.mission.belief.evidence import update_condition_start_times
 from perchctl.mission.belief.quality import hold_reason
-from perchctl.mission.belief.update import reset_evidence
+from perchctl.mission.belief.update import reset_conditions
 from perchctl.mission.context import Context
 from perchctl.mission.descent import record_command
 from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_CONTROLLED_HEIGHT_M
+from perchctl.mission.phases.approach import MIN_HEIGHT_TO_CORRECT_HEIGHT_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
@@ -48,9 +48,9 @@ def step_mission(
     if row is None:
         state = replace(state, waiting_reason="")
     elif row.keeps_mission_in(state.phase):
-        waited_in_phase_s = state.waited_in_phase_s + obs.t_s - state.t_s
+        total_wait_in_phase_s = state.total_wait_in_phase_s + obs.t_s - state.t_s
         state = replace(
-            state, waiting_reason=row.reason_text(c), waited_in_phase_s=waited_in_phase_s
+            state, waiting_reason=row.reason_text(c), total_wait_in_phase_s=total_wait_in_phase_s
         )
     else:
         state = _enter_phase(c, row)
@@ -73,7 +73,7 @@ def _update_before_decision(
         if measured and is_hovering(state):
             state = _add_hover_error(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
-    condition_start_times_s = update_start_times(
+    condition_start_times_s = update_condition_start_times(
         state.condition_start_times_s, PHASE_CONDITIONS, Context(state), obs.t_s
     )
     state = replace(
@@ -102,10 +102,10 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
     # An ordered press has wound up the integrators, whatever thrust is reported. A fall that is
     # being caught runs at full thrust without pressing.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
-    presses = state.phase is Phase.PERCH or is_pressing(c.belief)
+    presses_against_target = state.phase is Phase.PERCH or is_pressing(c.belief)
     new = replace(
         state,
-        belief=reset_evidence(c.belief),
+        belief=reset_conditions(c.belief),
         phase=row.to,
         entry=PhaseEntry(
             t_s=c.t_s,
@@ -113,7 +113,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             yaw_rad=c.telemetry.yaw_rad,
             row_name=row.name,
             reason=row.reason_text(c),
-            claims=row.claims,
+            diagnosis=row.diagnosis,
             stop=row.stop,
         ),
         severity=state.severity.escalate(row.severity),
@@ -121,12 +121,14 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         condition_start_times_s={},
         failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
         waiting_reason="",
-        waited_in_phase_s=0.0,
-        search_step_began_s=c.t_s,
+        total_wait_in_phase_s=0.0,
+        search_step_began_at_s=c.t_s,
         consecutive_target_frames=0,
-        must_end_press=ends and state.catch_setpoint_above_vehicle_m is None and presses,
-        last_stop_or_land_order_at_s=None,
-        stop_or_land_order_count=0,
+        must_end_press=ends
+        and state.catch_setpoint_above_vehicle_m is None
+        and presses_against_target,
+        last_stop_or_land_command_at_s=None,
+        stop_or_land_command_count=0,
     )
     return PHASES[row.to].enter(new, c)
 
@@ -141,7 +143,7 @@ def act(c: Context) -> Action:
     )
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (
-            state.phase is not Phase.APPROACH or c.belief.height_m > MIN_CONTROLLED_HEIGHT_M
+            state.phase is not Phase.APPROACH or c.belief.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_M
         )
         return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 from perchctl.geometry import Array
 from perchctl.mission.belief.quality import position_loss_text
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
 from perchctl.mission.rest import RestState
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
@@ -41,41 +41,48 @@ class Event:
     row_name: str = ""  # transition of the table; empty at the start and if there was none
     severity: Severity = Severity.CONTINUE
     simulated_fault: str = ""  # fault of the simulated scenario that caused it
-    rest: RestState | None = None  # rest state found by a rescue; None in all other events
-    claims: VehicleClaim = VehicleClaim.NONE  # claims of the transition
+    rest_state: RestState | None = None  # rest state found by a rescue; None in all other events
+    diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE  # diagnosis of the transition
 
     @classmethod
-    def note_from_rescue(
-        cls, t_s: float, error: BaseException, rest: RestState, text: str
+    def make_rescue_note(
+        cls, t_s: float, error: BaseException, rest_state: RestState, rest_text: str
     ) -> Event:
         """Return the event in which the rescue, the emergency landing after an exception in the
-        loop, notes the exception `error` and the vehicle's rest state; `text` says in words where
-        the vehicle rests."""
-        reason = f"{type(error).__name__} in flight: {text}"
-        return cls(t_s, EventKind.NOTE, reason, rest=rest)
+        loop, notes the exception `error` and the vehicle's rest state; `rest_text` says in words
+        where the vehicle rests."""
+        reason = f"{type(error).__name__} in flight: {rest_text}"
+        return cls(t_s, EventKind.NOTE, reason, rest_state=rest_state)
 
     @classmethod
-    def list_from_tick(
-        cls, before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
+    def list_events_of_tick(
+        cls,
+        previous_state: PlannerState | None,
+        state: PlannerState,
+        obs: Observation,
+        profile: Profile,
     ) -> list[Event]:
-        """Return the events of one tick; `before` is the previous state, None in the first tick."""
+        """Return the events of one tick; `previous_state` is the previous state, None in the first
+        tick."""
         events: list[Event] = []
-        if before is None:
-            before = PlannerState.initial_on_ground(obs, profile)
-            events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
+        if previous_state is None:
+            previous_state = PlannerState.initial_on_ground(obs, profile)
+            events.append(
+                cls(obs.t_s, EventKind.PHASE, previous_state.reason, previous_state.phase)
+            )
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
                 text = f"no battery reading: landing within {grace_s:.0f} s"
-                events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
-        if state.phase is not before.phase:
+                events.append(cls(obs.t_s, EventKind.NOTE, text, previous_state.phase))
+        if state.phase is not previous_state.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row_name, state.severity
-            events.append(cls(obs.t_s, *entered, claims=state.entry.claims))
-        elif state.pause_reason and not before.pause_reason:
+            events.append(cls(obs.t_s, *entered, diagnosis=state.entry.diagnosis))
+        elif state.pause_reason and not previous_state.pause_reason:
             held = EventKind.HOLD, state.pause_reason, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif (
             state.belief.position_last_stale_at_s == obs.t_s
-            and before.belief.position_last_stale_at_s != before.t_s
+            and previous_state.belief.position_last_stale_at_s != previous_state.t_s
             and not state.hold_reason
         ):
             text = position_loss_text(state.belief.with_observation(obs, profile))
@@ -118,7 +125,7 @@ class FrameRecord:
     t_s: float
     t_arrival_s: float
     picture_kind: PictureKind | None = None
-    repeated: bool = False
+    is_repeated: bool = False
     # checksum of the picture; None if it was not searched or not recorded
     checksum: int | None = None
 
@@ -145,7 +152,7 @@ class UnfilteredPose:
     `e_yaw_rad`."""
 
     t_s: float
-    e_m: Array
+    gear_to_target_m: Array
     vehicle_to_target_yaw_rad: float
 
 
@@ -222,8 +229,8 @@ class Tick:
         return self.observation.target
 
     @property
-    def loop_late_s(self) -> float:
-        return self.observation.loop_late_s
+    def tick_start_delay_s(self) -> float:
+        return self.observation.tick_start_delay_s
 
     @property
     def last_good_frame_age_s(self) -> float:

@@ -1,53 +1,53 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
-In position mode, the onboard controller never goes below `MIN_POSITION_MODE_THRUST`. Raw thrust
-continues down to motors at rest (docs/firmware.md, "Release in raw mode"): the whole weight is
-transferred to the magnet and monitored before the motors are stopped.
+In position mode, the onboard controller never goes below `MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw
+thrust continues down to motors at rest (docs/firmware.md, "Release in raw mode"): the whole weight
+is transferred to the magnet and monitored before the motors are stopped.
 """
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import FULL_WEIGHT_HANGS, is_above_hover_thrust
-from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
-from perchctl.mission.belief.update import KEEPALIVE_THRUST
+from perchctl.mission.belief.contact import HANGING_WITH_MOTORS_STOPPED, is_above_hover_thrust
+from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
+from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
 from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (
     Action,
     correct_setpoint,
-    hold_here,
     limit_setpoint,
+    make_setpoint_at_vehicle,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
-MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M = 0.08
+MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M = 0.08
 """Distance of the vehicle below the contact from which it has left it, m."""
-MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
+MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
 """Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
 the vehicle."""
-UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
+INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
 """Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
-UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M = 0.25
+INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M = 0.25
 """The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
 PRESS_END_TIMEOUT_S = 4.0
 """Time after which `end_press` ends, whether or not the vehicle has come off, s."""
 
 # --- release ---
-MIN_RELEASE_TO_HOLDING_THRUST_RATIO = 0.9
+MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
 """Share of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down to
 which the raw thrust of a press is lowered."""
-EXTRA_HANG_IF_THRUST_UNCONFIRMED_S = 1.5
+EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the ordered one, s."""
 
 # --- stop ---
-STOP_ORDER_COUNT = 5
+STOP_COMMAND_COUNT = 5
 """Number of stop orders: a single lost notify message would lock a hanging vehicle."""
-STOP_ORDER_PERIOD_S = 0.1
+STOP_COMMAND_PERIOD_S = 0.1
 """Time between stop orders, s."""
-LATE_STOP_ORDER_PERIOD_S = 0.5
+LATE_STOP_COMMAND_PERIOD_S = 0.5
 """Time after which one more stop order is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
@@ -56,15 +56,15 @@ CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M = 1.0
 CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
-MOTORS_ON_THRUST_FRACTION = 0.5
+MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO = 0.5
 """Share of hover thrust above which the motors count as running."""
 MIN_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
 MAX_CATCH_DURATION_S = 2.0
 """Longest duration of a catch, s."""
-CATCH_END_CLIMB_MPS = -0.1
+MIN_CLIMB_RATE_TO_END_CATCH_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
-MAX_SPEED_USED_FOR_BRAKING_MPS = 1.0
+MAX_BRAKED_LATERAL_SPEED_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no blow that the vehicle survives leaves more."""
 ONBOARD_POSITION_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
@@ -79,18 +79,18 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
-        away_m > MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M
+        away_m > MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M
         and not is_above_hover_thrust(c.belief)
-        and tel.velocity_mps[2] > MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS
+        and tel.velocity_mps[2] > MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS
     )
-    if calm or c.in_phase_s > PRESS_END_TIMEOUT_S:
+    if calm or c.time_in_phase_s > PRESS_END_TIMEOUT_S:
         return replace(state, must_end_press=False), None
     setpoint_below_vehicle_m = (
-        UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M
-        if away_m < MIN_BELOW_CONTACT_WHEN_PRESS_ENDED_M
-        else UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M
+        INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M
+        if away_m < MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M
+        else INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M
     )
-    if tel.velocity_mps[2] < MAX_CLIMB_WHEN_FALLING_AFTER_PRESS_MPS:
+    if tel.velocity_mps[2] < MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS:
         setpoint_below_vehicle_m = 0.0
     dx, dy = state.lateral_integral_m
     setpoint = PositionSetpoint(
@@ -104,14 +104,14 @@ def lower_thrust(c: Context) -> Action:
     setpoint to `complete.release_drop_m` below the contact or, in a press by raw thrust, the thrust
     to just below the holding thrust, until the magnet is seen to carry the vehicle."""
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
-    step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
+    step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
         if not b.is_imu_fresh:
             return hold_contact_by_position(c)
-        lowest = MIN_RELEASE_TO_HOLDING_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
+        lowest = MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
-    setpoint = state.setpoint or hold_here(c)
+    setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     assert b.vehicle_world_z_at_last_contact_m is not None
     slid_m = (
         0.0
@@ -125,35 +125,35 @@ def lower_thrust(c: Context) -> Action:
     return replace(state, setpoint=setpoint), sent
 
 
-def release_by_thrust(c: Context, *, accepted_telemetry_age_s: float = 0.0) -> Action:
+def release_by_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
     """Second stage of the release: reduce raw thrust until the motors stand still, and stop them
     once the whole weight has hung for long enough.
 
     The stage starts again while the telemetry is too old as evidence and also older than
-    `accepted_telemetry_age_s`.
+    `max_telemetry_age_s`.
     """
     complete, state, b = c.planner.complete, c.state, c.belief
-    if not b.is_imu_fresh and b.attitude_age_s > accepted_telemetry_age_s:
+    if not b.is_imu_fresh and b.attitude_age_s > max_telemetry_age_s:
         return hold_contact_by_position(c)
-    release_began_s = state.release_began_s
-    if release_began_s is None:
-        release_began_s, z_m = c.t_s, c.telemetry.position_m[2]
+    release_began_at_s = state.release_began_at_s
+    if release_began_at_s is None:
+        release_began_at_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(
             b,
             vehicle_world_z_at_last_contact_m=z_m
             if b.vehicle_world_z_at_last_contact_m is None
             else b.vehicle_world_z_at_last_contact_m,
         )
-        state = replace(state, release_began_s=release_began_s, belief=b)
-    hung_s = c.held_s(FULL_WEIGHT_HANGS)
-    unconfirmed = b.thrust_last_differed_from_order_at_s >= c.t_s - hung_s
-    extra_s = EXTRA_HANG_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
+        state = replace(state, release_began_at_s=release_began_at_s, belief=b)
+    hung_s = c.true_for_s(HANGING_WITH_MOTORS_STOPPED)
+    unconfirmed = b.thrust_last_differed_from_command_at_s >= c.t_s - hung_s
+    extra_s = EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
-    part = min(1.0, (c.t_s - release_began_s) / complete.ramp_s)
-    start = c.planner.perch.thrust if state.setpoint is None else MIN_POSITION_MODE_THRUST
-    start = min(start, MIN_POSITION_MODE_THRUST)
-    return state, RawThrust(int(start + part * (KEEPALIVE_THRUST - start)))
+    part = min(1.0, (c.t_s - release_began_at_s) / complete.ramp_s)
+    start = c.planner.perch.thrust if state.setpoint is None else MIN_FIRMWARE_POSITION_MODE_THRUST
+    start = min(start, MIN_FIRMWARE_POSITION_MODE_THRUST)
+    return state, RawThrust(int(start + part * (KEEPALIVE_RAW_THRUST - start)))
 
 
 def hold_contact_by_position(c: Context) -> Action:
@@ -164,47 +164,47 @@ def hold_contact_by_position(c: Context) -> Action:
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
         z_m = b.vehicle_world_z_at_last_contact_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M, tel.yaw_rad)
-    return replace(state, setpoint=setpoint, release_began_s=None), limit_setpoint(c, setpoint)
+    return replace(state, setpoint=setpoint, release_began_at_s=None), limit_setpoint(c, setpoint)
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
     """True if raw thrust has brought the motors to rest."""
-    release_began_s = c.state.release_began_s
-    return release_began_s is not None and c.t_s - release_began_s > c.planner.complete.ramp_s
+    release_began_at_s = c.state.release_began_at_s
+    return release_began_at_s is not None and c.t_s - release_began_at_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Action:
     """Send the stop command, and with it the message that ends high-level setpoints (notify),
-    `STOP_ORDER_COUNT` times: if a single notify were lost, the firmware's supervisor would lock the
-    hanging vehicle. Send more while the telemetry shows thrust."""
+    `STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would lock
+    the hanging vehicle. Send more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
-    if state.motor_stop_ordered_at_s is None:
+    if state.motor_stop_commanded_at_s is None:
         return replace(
             state,
-            motor_stop_ordered_at_s=now_s,
-            last_stop_or_land_order_at_s=now_s,
-            stop_or_land_order_count=1,
+            motor_stop_commanded_at_s=now_s,
+            last_stop_or_land_command_at_s=now_s,
+            stop_or_land_command_count=1,
         ), StopMotors()
     waited_s = now_s - (
-        state.last_stop_or_land_order_at_s
-        if state.last_stop_or_land_order_at_s is not None
-        else state.motor_stop_ordered_at_s
+        state.last_stop_or_land_command_at_s
+        if state.last_stop_or_land_command_at_s is not None
+        else state.motor_stop_commanded_at_s
     )
     still_to_send = (
-        state.stop_or_land_order_count < STOP_ORDER_COUNT and waited_s >= STOP_ORDER_PERIOD_S
+        state.stop_or_land_command_count < STOP_COMMAND_COUNT and waited_s >= STOP_COMMAND_PERIOD_S
     )
-    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= LATE_STOP_ORDER_PERIOD_S):
+    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= LATE_STOP_COMMAND_PERIOD_S):
         return replace(
             state,
-            last_stop_or_land_order_at_s=now_s,
-            stop_or_land_order_count=state.stop_or_land_order_count + 1,
+            last_stop_or_land_command_at_s=now_s,
+            stop_or_land_command_count=state.stop_or_land_command_count + 1,
         ), StopMotors()
     return state, Idle()
 
 
 def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, thrust: float) -> float:
     """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
-    turning = thrust > MOTORS_ON_THRUST_FRACTION * hover_thrust
+    turning = thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
     return (
         CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M
         if turning
@@ -218,8 +218,10 @@ def catch_slip(c: Context) -> Action | None:
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_setpoint_above_vehicle_m is None or not b.is_imu_fresh:
         return None
-    begun = c.in_phase_s < MIN_CATCH_DURATION_S
-    if begun or (b.climb_mps < CATCH_END_CLIMB_MPS and c.in_phase_s < MAX_CATCH_DURATION_S):
+    begun = c.time_in_phase_s < MIN_CATCH_DURATION_S
+    if begun or (
+        b.climb_mps < MIN_CLIMB_RATE_TO_END_CATCH_MPS and c.time_in_phase_s < MAX_CATCH_DURATION_S
+    ):
         x, y = _braking_setpoint_m(c) if b.has_uncorrected_gust else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_setpoint_above_vehicle_m, state.entry.yaw_rad
@@ -230,23 +232,26 @@ def catch_slip(c: Context) -> Action | None:
 
 def _braking_setpoint_m(c: Context) -> tuple[float, float]:
     """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
-    tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
+    tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
-        max(-MAX_SPEED_USED_FOR_BRAKING_MPS, min(MAX_SPEED_USED_FOR_BRAKING_MPS, mps))
+        max(-MAX_BRAKED_LATERAL_SPEED_MPS, min(MAX_BRAKED_LATERAL_SPEED_MPS, mps))
         for mps in missing_mps
     )
     x_m, y_m, _ = tel.position_m
     return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S
 
 
-def forget_contact_when_below(state: PlannerState, below_contact_m: float) -> PlannerState:
-    """Return the state without its recorded contact if the vehicle is more than `below_contact_m`
-    below that contact; otherwise unchanged."""
+def forget_contact_when_below(
+    state: PlannerState, min_distance_below_contact_m: float
+) -> PlannerState:
+    """Return the state without its recorded contact if the vehicle is more than
+    `min_distance_below_contact_m` below that contact; otherwise unchanged."""
     b = state.belief
     if (
         b.vehicle_world_z_at_last_contact_m is None
-        or b.telemetry.position_m[2] >= b.vehicle_world_z_at_last_contact_m - below_contact_m
+        or b.telemetry.position_m[2]
+        >= b.vehicle_world_z_at_last_contact_m - min_distance_below_contact_m
     ):
         return state
     return replace(

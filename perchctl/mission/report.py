@@ -10,7 +10,7 @@ from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import MOTORS_STOPPED, current_gear_offset
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Outcome, Phase, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.records import Event
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
@@ -20,13 +20,13 @@ from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraErrors
 
-HARD_TOUCHDOWN_MPS = 0.6
+MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
 MAX_TOUCHDOWN_AGE_S = 5.0
 """Longest time from a touchdown to the stop of the motors, s; an earlier blow was not the floor."""
 MAX_TOUCHDOWN_HEIGHT_M = 0.3
 """Largest height of a blow above the final position for it to be a touchdown, m."""
-SIGMAS_FOR_95_PERCENT = 1.96
+SIGMAS_FOR_95_PERCENT_INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 MIN_REPORTED_LATENCY_ERROR_S = 0.02
 """Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
@@ -36,10 +36,10 @@ MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
 ascent allows."""
 
 
-def find_row_claims(row_name: str) -> VehicleClaim:
-    """Return the claims of the built-in row with this name, as a log stores it; none for any other
-    name, for example that of your own row."""
-    return next((row.claims for row in TABLE if row.name == row_name), VehicleClaim.NONE)
+def find_row_diagnosis(row_name: str) -> VehicleDiagnosis:
+    """Return the diagnosis of the built-in row called `row_name`; logs store that name. `NONE` for
+    any other name, such as that of your own row."""
+    return next((row.diagnosis for row in TABLE if row.name == row_name), VehicleDiagnosis.NONE)
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Touchdown:
 
     @property
     def is_hard(self) -> bool:
-        """True if the vehicle touched down faster than `HARD_TOUCHDOWN_MPS`."""
-        return self.speed_mps > HARD_TOUCHDOWN_MPS
+        """True if the vehicle touched down faster than `MIN_HARD_TOUCHDOWN_SPEED_MPS`."""
+        return self.speed_mps > MIN_HARD_TOUCHDOWN_SPEED_MPS
 
     @property
     def text(self) -> str:
@@ -107,7 +107,7 @@ class CameraFindings:
     @property
     def latency_text(self) -> str:
         """The latency with its 95 % interval, for example ``92 +- 6 ms``."""
-        margin_s = SIGMAS_FOR_95_PERCENT * self.latency_sigma_s
+        margin_s = SIGMAS_FOR_95_PERCENT_INTERVAL * self.latency_sigma_s
         return f"{self.measured_latency_s * 1e3:.0f} +- {margin_s * 1e3:.0f} ms"
 
     @property
@@ -116,7 +116,10 @@ class CameraFindings:
         0.4 +- 1.8 deg``."""
         each = zip(self.rotation_error_deg, self.rotation_sigma_deg, strict=True)
         return (
-            ", ".join(f"{turn:.1f} +- {SIGMAS_FOR_95_PERCENT * sigma:.1f}" for turn, sigma in each)
+            ", ".join(
+                f"{turn:.1f} +- {SIGMAS_FOR_95_PERCENT_INTERVAL * sigma:.1f}"
+                for turn, sigma in each
+            )
             + " deg"
         )
 
@@ -124,7 +127,7 @@ class CameraFindings:
 def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
     """True if the difference exceeds both the threshold and 1.96 `sigma`, the half width of its 95
     % interval."""
-    return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT * sigma)
+    return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT_INTERVAL * sigma)
 
 
 @dataclass(frozen=True)
@@ -133,15 +136,15 @@ class HoverReport:
     (`HoverErrors`): x forward, y left, z up, and heading."""
 
     duration_s: float
-    below_target_m: float
+    hover_distance_below_target_m: float
     gear_to_hover_position_rms_xyz_m: tuple[float, float, float]
-    rms_yaw_rad: float
+    yaw_error_rms_rad: float
 
     @classmethod
     def from_state(cls, state: PlannerState, profile: Profile) -> HoverReport | None:
         """Return the report of the newest hover; None if there was none."""
         hover, errors = profile.planner.hover, state.hover_errors
-        if hover is None or not errors.frames:
+        if hover is None or not errors.frame_count:
             return None
         x_m, y_m, z_m, yaw_rad = errors.rms_xyz_yaw
         return cls(errors.duration_s, hover.below_m, (x_m, y_m, z_m), yaw_rad)
@@ -151,7 +154,7 @@ class HoverReport:
         """The report in words, for example ``20.0 s; RMS error x 4.1, y 3.0, z 6.2 mm, heading 0.8
         deg``."""
         x, y, z = (f"{1e3 * each:.1f}" for each in self.gear_to_hover_position_rms_xyz_m)
-        yaw = f"{math.degrees(self.rms_yaw_rad):.1f}"
+        yaw = f"{math.degrees(self.yaw_error_rms_rad):.1f}"
         return f"{self.duration_s:.1f} s; RMS error x {x}, y {y}, z {z} mm, heading {yaw} deg"
 
 
@@ -175,8 +178,10 @@ class FlightReport:
 
     @property
     def is_profile_suspect(self) -> bool:
-        """True if a row that claims a wrong profile fired during the flight."""
-        return any(VehicleClaim.PROFILE_MAY_BE_WRONG in event.claims for event in self.history)
+        """True if a row whose diagnosis includes `PROFILE_MAY_BE_WRONG` fired during the flight."""
+        return any(
+            VehicleDiagnosis.PROFILE_MAY_BE_WRONG in event.diagnosis for event in self.history
+        )
 
     @classmethod
     def from_state(
@@ -198,13 +203,13 @@ class FlightReport:
         return cls(
             phase=state.phase,
             outcome=state.outcome or Outcome.SAFETY,
-            reason=_reason(state, history),
+            reason=_end_reason(state, history),
             # If a hanging vehicle is noticed after the last attempt, that attempt was counted as
             # failed.
             attempts=state.failed_attempts
             + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP)
             + int(state.outcome is Outcome.HOVERED),
-            duration_s=obs.t_s - state.started_s,
+            duration_s=obs.t_s - state.flight_started_at_s,
             # The available telemetry is older than an emergency stop, which always locks the
             # vehicle.
             is_locked_by_supervisor=obs.telemetry.has_bit(LOCKED)
@@ -242,7 +247,7 @@ def report_rest(
     """Return the rest state; None until telemetry has shown the motors off for
     `min_motors_off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
-    if c.held_s(MOTORS_STOPPED) < min_motors_off_s:
+    if c.true_for_s(MOTORS_STOPPED) < min_motors_off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
@@ -255,7 +260,7 @@ def find_touchdown(c: Context) -> Touchdown | None:
     The speed is from the state estimate if it is believed, otherwise from dead reckoning.
     """
     b = c.belief
-    tel, imu, reckoning = c.telemetry, b.imu, b.reckoning
+    tel, imu, dead_reckoning = c.telemetry, b.imu, b.dead_reckoning
     impact = imu.newest_impact
     if (
         c.state.phase is Phase.PERCHED
@@ -267,14 +272,17 @@ def find_touchdown(c: Context) -> Touchdown | None:
         return None
     reckoned = b.dead_reckoning_since_s is not None or b.is_position_diverged
     speed_mps = -(
-        reckoning.climb_before_impact_mps if reckoned else impact.estimated_climb_before_mps
+        dead_reckoning.climb_before_impact_mps
+        if reckoned
+        else impact.estimated_climb_before_impact_mps
     )
     return Touchdown(max(0.0, speed_mps), impact.peak_g)
 
 
-def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
+def _end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     told = why and (
-        state.phase is not Phase.ABORTED or VehicleClaim.LANDING_UNCONFIRMED in state.entry.claims
+        state.phase is not Phase.ABORTED
+        or VehicleDiagnosis.LANDING_UNCONFIRMED in state.entry.diagnosis
     )
     return f"{why}; {state.reason}" if told else state.reason

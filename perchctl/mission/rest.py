@@ -7,19 +7,19 @@ import math
 from enum import Enum
 
 from perchctl.mission.belief.contact import contact_height_tolerance_m
-from perchctl.mission.belief.target import MIN_FAR_ABOVE_M
+from perchctl.mission.belief.target import MIN_TARGET_FAR_ABOVE_GEAR_M
 from perchctl.mission.context import Context
-from perchctl.mission.phase import Phase, VehicleClaim
+from perchctl.mission.phase import Phase, VehicleDiagnosis
 
-MAX_HANGING_DRIFT_M = 0.3
+MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
 estimate."""
-MIN_HANGING_HEIGHT_M = 0.45
+MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M = 0.45
 """Height at the start of a descent above which the height distinguishes hanging from standing,
 m."""
-MAX_FLOOR_REST_HEIGHT_M = 0.3
+MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
 """Height below which the vehicle stands, m."""
-MAX_DESCENT_STILL_HANGING_M = 0.15
+MAX_DESCENT_IF_STILL_HANGING_M = 0.15
 """Descent below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
 table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
@@ -39,41 +39,41 @@ def find_rest_state(c: Context) -> RestState:
     """Return the rest state once the motors are off: from a position, from a picture of a target
     far above, or from the falls measured since the vehicle came within the magnet's reach."""
     b, state = c.belief, c.state
-    if _is_held_elsewhere(c):
+    if _is_held_by_other_object(c):
         return RestState.HELD
     if b.is_positioned_by_target or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _find_rest_state_from_falls(c)
-    high = state.entry.position_m[2] - b.ground_z_m > MIN_HANGING_HEIGHT_M
+    high = state.entry.position_m[2] - b.ground_z_m > MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
-    stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_STILL_HANGING_M
+    stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_IF_STILL_HANGING_M
     at_contact = b.vehicle_world_z_at_last_contact_m is not None and not b.target.is_far_above
-    if stayed or (b.height_m > MAX_FLOOR_REST_HEIGHT_M and at_contact):
+    if stayed or (b.height_m > MAX_HEIGHT_RESTING_ON_FLOOR_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
 
 
-def _is_held_elsewhere(c: Context) -> bool:
+def _is_held_by_other_object(c: Context) -> bool:
     b, state = c.belief, c.state
     if state.phase is not Phase.LANDING:
         return False
     if (
         b.is_position_valid
-        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_DESCENT_STILL_HANGING_M
+        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_DESCENT_IF_STILL_HANGING_M
     ):
         return False
-    if VehicleClaim.HELD_BY_OTHER in state.entry.claims:
+    if VehicleDiagnosis.HELD_BY_OTHER_OBJECT in state.entry.diagnosis:
         return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
-        contact_height_tolerance_m(b) < b.target.gear_to_target_z_m <= MIN_FAR_ABOVE_M
+        contact_height_tolerance_m(b) < b.target.gear_to_target_z_m <= MIN_TARGET_FAR_ABOVE_GEAR_M
         and b.last_contact_offset is None
     )
     by_position = (
         b.is_position_valid
         and not b.is_positioned_by_target
         and b.first_estimate_jump_at_s is None
-        and b.height_m > MIN_HANGING_HEIGHT_M
+        and b.height_m > MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
     )
     return below and (b.target.is_fresh or by_position)
 
@@ -82,16 +82,18 @@ def _find_rest_state_from_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured since the vehicle
     came within the magnet's reach. It is UNKNOWN after a silence that was long enough to hide a
     fall or a catch."""
-    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_magnet_reach_since_s
+    b, dead_reckoning, since_s = c.belief, c.belief.dead_reckoning, c.belief.in_magnet_reach_since_s
     floor_s = c.state.descent.floor_detected_at_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt
-    unsure = reckoning.last_gap_magnet_may_attach_ended_at_s > max(
-        down_s, reckoning.last_sighting_at_s
+    unsure = dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s > max(
+        down_s, dead_reckoning.last_sighting_at_s
     )
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
-    came_unheard = unsure and reckoning.last_gap_magnet_may_attach_ended_at_s <= since_s
+    came_unheard = (
+        unsure and dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s <= since_s
+    )
     return (
         RestState.UNKNOWN
         if came_unheard or b.imu.last_gap_that_may_hide_fall_ended_at_s > since_s
@@ -110,7 +112,8 @@ def is_still_hanging(c: Context) -> bool:
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if (
             not falls
-            and b.vehicle_world_z_at_last_contact_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M
+            and b.vehicle_world_z_at_last_contact_m - tel.position_m[2]
+            <= MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M
         ):
             return True
     return _find_rest_state_from_falls(c) is RestState.HANGS
@@ -118,14 +121,14 @@ def is_still_hanging(c: Context) -> bool:
 
 def is_hanging_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped while the vehicle hung, and it still hangs."""
-    motor_stop_ordered_at_s, landing = (
-        c.state.motor_stop_ordered_at_s,
+    motor_stop_commanded_at_s, landing = (
+        c.state.motor_stop_commanded_at_s,
         c.state.phase is Phase.LANDING,
     )
-    if motor_stop_ordered_at_s is None or (
+    if motor_stop_commanded_at_s is None or (
         landing
-        and motor_stop_ordered_at_s >= c.state.entry.t_s
-        and c.state.stop_or_land_order_count == 0
+        and motor_stop_commanded_at_s >= c.state.entry.t_s
+        and c.state.stop_or_land_command_count == 0
     ):
         return False
     return is_still_hanging(c)

@@ -12,38 +12,38 @@ import math
 from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
     HANGING,
-    HANGING_DWELL_S,
-    SATURATED_FRACTION_OF_FULL_THRUST,
-    SATURATED_THRUST,
+    HANGING_CONFIRMATION_DWELL_S,
+    MIN_SATURATED_TO_FULL_THRUST_RATIO,
+    THRUST_SATURATED_WITHOUT_CLIMB,
     Support,
     contact_height_tolerance_m,
     gear_offset_at_last_touch_or_now,
     max_press_thrust,
 )
-from perchctl.mission.belief.motion import MAX_PUSH_TO_ESTIMATE_DELAY_S
+from perchctl.mission.belief.motion import MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
 from perchctl.mission.belief.quality import (
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
     ESTIMATE_VARIANCE_TOO_LARGE,
-    TARGET_BELOW,
-    TILTED,
+    TARGET_BELOW_VEHICLE,
+    TILT_TOO_LARGE,
+    excessive_variance_text,
     no_picture_reason,
     position_loss_text,
-    variance_text,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.phase import (
     CAMERA_GUIDED_PHASES,
     FREE_AIR_PHASES,
-    MAGNET_ATTACH_PHASES,
+    PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
     PRE_CONTACT_PHASES,
     PRE_LANDING_PHASES,
     OperatorRequest,
     Outcome,
     Phase,
-    VehicleClaim,
+    VehicleDiagnosis,
 )
-from perchctl.mission.phases.ascend import NEAR_STANDOFF
+from perchctl.mission.phases.ascend import NEAR_STANDOFF_HEIGHT
 from perchctl.mission.rest import is_hanging_with_motors_off
 from perchctl.mission.transition import (
     Transition,
@@ -61,11 +61,11 @@ m."""
 MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
 """Largest lateral motion of the vehicle before it has lifted off, m. Larger: a wrong mounting tips
 it over."""
-LOW_HEIGHT_FOR_DIVERGENCE_M = 0.3
+MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
 MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
-`LOW_HEIGHT_FOR_DIVERGENCE_M` and in a vertical climb."""
+`MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
 MAX_SETPOINT_DEVIATION_IN_LANDING_M = 0.4
 """The same distance during a landing, m."""
 MAX_SETPOINT_DEVIATION_M = 0.8
@@ -75,28 +75,28 @@ SETPOINT_DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the limit on the lateral distance from the setpoint with the target as the position
 source, in m per second of the camera latency's standard deviation: pictures that are 0.1 s later
 than assumed cause up to 0.2 m. Larger: a rotated camera leads the vehicle further away."""
-MAX_LATERAL_OFFSET_IN_CLIMB_M = 0.1
+MAX_LATERAL_SETPOINT_OFFSET_IN_VERTICAL_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
-OSCILLATION_SINK_MPS = 0.5
+MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-OSCILLATION_CLIMB_ABOVE_ORDERED_MPS = 0.35
+MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS = 0.35
 """Climb rate beyond that of the setpoint in the ascent which only such an oscillation reaches, m/s;
 flights with prompt positions exceed it by 0.1. Larger: the vehicle strikes the target. Smaller: a
 gust ends the flight."""
-TARGET_BELOW_DWELL_S = 0.3
+TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
-SATURATED_THRUST_DWELL_S = 2.0
+THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S = 2.0
 """Time at full thrust after which no thrust remains for a press, s."""
-HELD_BY_OTHER_DWELL_S = 2.0
+HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 """Time after which the magnet has been distinguished from other supports, s."""
-MAX_BLIND_VELOCITY_VARIANCE_M2PS2 = 0.02
+MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
-MIN_CONTRADICTING_SIGHTING_OFFSET_M = 0.3
+MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M = 0.3
 """Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
 position control moves the vehicle further off. Smaller: an oscillation ends the flight."""
-MIN_CONTRADICTED_POSITION_AGE_S = 0.35
+MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings are not a
 single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection ends
 the flight."""
@@ -105,21 +105,23 @@ the flight."""
 # --- Reliability of position, pictures and mounting ---
 
 
-def is_led_away_from_setpoint(c: Context) -> bool:
+def is_position_control_diverging(c: Context) -> bool:
     """True if position control leads the vehicle away from its setpoint, as with external positions
     in wrong axes: it is further away than any draught could move it, it oscillates, or its
     estimated velocity contradicts the accelerometer."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
-    if c.held_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S or _is_oscillating(c):
+    if c.true_for_s(
+        ESTIMATE_CONTRADICTS_IMU
+    ) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S or _is_oscillating(c):
         return True
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
         touched = (
             b.vehicle_world_z_at_last_contact_m is not None
-            or c.state.motor_stop_ordered_at_s is not None
+            or c.state.motor_stop_commanded_at_s is not None
         )
         return not touched and _setpoint_deviation_m(c) > MAX_SETPOINT_DEVIATION_IN_LANDING_M
     spare_m = (
@@ -132,11 +134,13 @@ def is_led_away_from_setpoint(c: Context) -> bool:
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
-        < MAX_LATERAL_OFFSET_IN_CLIMB_M
+        < MAX_LATERAL_SETPOINT_OFFSET_IN_VERTICAL_CLIMB_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
-    is_pushed = b.imu.t_s - b.imu.last_push_at_s <= MAX_PUSH_TO_ESTIMATE_DELAY_S  # by moving air
-    stays = b.height_m < LOW_HEIGHT_FOR_DIVERGENCE_M or (only_climbs and not is_pushed)
+    is_pushed = (
+        b.imu.t_s - b.imu.last_lateral_push_at_s <= MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
+    )  # by moving air
+    stays = b.height_m < MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M or (only_climbs and not is_pushed)
     return _setpoint_deviation_m(c) > (
         MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M + spare_m if stays else MAX_SETPOINT_DEVIATION_M
     )
@@ -145,8 +149,12 @@ def is_led_away_from_setpoint(c: Context) -> bool:
 def _is_oscillating(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
-    most_mps = c.planner.ascend.speed_mps + OSCILLATION_CLIMB_ABOVE_ORDERED_MPS
-    return moves and by_capture and not -OSCILLATION_SINK_MPS <= c.belief.climb_mps <= most_mps
+    most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS
+    return (
+        moves
+        and by_capture
+        and not -MIN_SINK_RATE_IN_OSCILLATION_MPS <= c.belief.climb_mps <= most_mps
+    )
 
 
 def _setpoint_deviation_m(c: Context) -> float:
@@ -172,7 +180,7 @@ def divergence_reason(c: Context) -> str:
             "`perchctl calibrate mount`"
         )
     found = f"the vehicle drifted {_setpoint_deviation_m(c):.2f} m from its setpoint"
-    if c.held_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S:
+    if c.true_for_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S:
         found = "the estimated velocity contradicts the accelerometer"
     return f"{found} at a height of {b.height_m:.2f} m: {cause}"
 
@@ -185,11 +193,12 @@ def is_position_lost(c: Context) -> bool:
     if b.position_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
         return True
     if (
-        b.position_age_s > MIN_CONTRADICTED_POSITION_AGE_S
-        and c.obs.rejected_sighting_to_estimate_m > MIN_CONTRADICTING_SIGHTING_OFFSET_M
+        b.position_age_s > MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S
+        and c.obs.rejected_sighting_to_estimate_m
+        > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M
     ):
         return True
-    unsure = b.worst_axis_velocity_variance_m2ps2 > MAX_BLIND_VELOCITY_VARIANCE_M2PS2
+    unsure = b.worst_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
     return b.is_positioned_by_target and b.is_position_stale and unsure
 
 
@@ -210,7 +219,7 @@ def is_outside_fleet_corridor(c: Context) -> bool:
     return corridor is not None and not corridor.contains(x_m, y_m, c.belief.height_m)
 
 
-def wrong_latency_reason(c: Context) -> str:
+def wrong_camera_latency_reason(c: Context) -> str:
     """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
@@ -232,10 +241,10 @@ def wrong_latency_reason(c: Context) -> str:
     )
 
 
-def is_mounting_wrong(c: Context) -> bool:
+def is_camera_mounting_contradicted(c: Context) -> bool:
     """True if the target moves along with the vehicle, or appears below it."""
     b = c.belief
-    below = c.held_s(TARGET_BELOW) >= TARGET_BELOW_DWELL_S
+    below = c.true_for_s(TARGET_BELOW_VEHICLE) >= TARGET_BELOW_VEHICLE_DWELL_S
     return (
         b.mounting.is_camera_mounting_wrong
         or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0
@@ -243,7 +252,7 @@ def is_mounting_wrong(c: Context) -> bool:
     )
 
 
-def wrong_mounting_reason(c: Context) -> str:
+def wrong_camera_mounting_reason(c: Context) -> str:
     """Return how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
@@ -268,54 +277,58 @@ def wrong_mounting_reason(c: Context) -> str:
 
 def is_held_by_target(c: Context) -> bool:
     """True if the target's magnet holds the vehicle although no press has proven a contact."""
-    hangs = c.held_s(HANGING) >= HANGING_DWELL_S
+    hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
     return hangs and c.support is Support.MAGNET
 
 
-def is_held_elsewhere(c: Context) -> bool:
+def is_held_by_other_object(c: Context) -> bool:
     """True if something holds the vehicle away from the target's height or from its axis."""
-    hangs = c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S
-    return hangs and c.support is Support.HELD_BY_OTHER
+    hangs = c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S
+    return hangs and c.support is Support.HELD_BY_OTHER_OBJECT
 
 
-def is_blocked(c: Context) -> bool:
+def is_climb_blocked(c: Context) -> bool:
     """True if the vehicle has pressed against an obstacle for `safety.blocked_s`."""
-    return c.held_s(CLIMB_BLOCKED) >= c.safety.blocked_s
+    return c.true_for_s(CLIMB_BLOCKED) >= c.safety.blocked_s
 
 
-def is_blocked_off_target(c: Context) -> bool:
+def is_climb_blocked_off_target(c: Context) -> bool:
     """True if the vehicle is blocked at a position where a press would not prove the contact."""
     pressing = c.state.phase is Phase.PERCH
-    return is_blocked(c) and not (
+    return is_climb_blocked(c) and not (
         pressing and abs(c.belief.target.gear_to_target_z_m) <= contact_height_tolerance_m(c.belief)
     )
 
 
-def is_press_thrust_insufficient(c: Context) -> bool:
+def is_thrust_insufficient_for_press(c: Context) -> bool:
     """True if no thrust remains for a press: measured at full thrust, or predicted before the
     press. A mission that hovers does not press, so nothing is predicted for it."""
     if c.state.must_end_press:
         return False
-    if c.held_s(SATURATED_THRUST) >= SATURATED_THRUST_DWELL_S:
+    if c.true_for_s(THRUST_SATURATED_WITHOUT_CLIMB) >= THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S:
         return True
-    near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
+    near = c.state.phase is Phase.ASCEND and c.true_for_s(NEAR_STANDOFF_HEIGHT) >= 0.0
     near = near and c.planner.hover is None
-    return near and c.belief.hover_thrust > SATURATED_FRACTION_OF_FULL_THRUST * max_press_thrust(
+    return near and c.belief.hover_thrust > MIN_SATURATED_TO_FULL_THRUST_RATIO * max_press_thrust(
         c.profile
     )
 
 
-def _outcome_after_supervisor_lock(before: Outcome | None) -> Outcome:
+def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
     """Return the outcome if the supervisor has locked a vehicle that hangs. HOVERED becomes SAFETY,
     since a hover must end on the floor; any other outcome stays; without one, it is PERCHED."""
-    return Outcome.SAFETY if before is Outcome.HOVERED else before or Outcome.PERCHED
+    return (
+        Outcome.SAFETY
+        if previous_outcome is Outcome.HOVERED
+        else previous_outcome or Outcome.PERCHED
+    )
 
 
-def is_time_for_all_attempts_over(c: Context) -> bool:
+def has_time_for_all_attempts_run_out(c: Context) -> bool:
     """True if the time for all attempts has run out; a hover has its own duration in addition."""
     hover = c.planner.hover
     allowed_s = c.planner.perching_time_s + (0.0 if hover is None else hover.duration_s)
-    return c.t_s - c.state.started_s > allowed_s
+    return c.t_s - c.state.flight_started_at_s > allowed_s
 
 
 SAFETY_ROWS: tuple[Transition, ...] = (
@@ -343,7 +356,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     motor_cut_row(
         "tilted",
         lambda c: (
-            c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.motor_stop_ordered_at_s is None
+            c.true_for_s(TILT_TOO_LARGE) >= c.safety.tilt_debounce_s
+            and c.state.motor_stop_commanded_at_s is None
         ),
         "tilted beyond the limit: motors cut",
     ),
@@ -369,15 +383,15 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "heading-lost",
         PRE_CONTACT_PHASES,
-        lambda c: c.belief.heading_lost,
+        lambda c: c.belief.is_heading_lost,
         "the estimated heading jumped: descending level by thrust alone",
     ),
     land_row(
         "position-astray",
         FREE_AIR_PHASES | {Phase.LANDING},
-        is_led_away_from_setpoint,
+        is_position_control_diverging,
         divergence_reason,
-        claims=VehicleClaim.EXTERNAL_POSITIONS_WRONG | VehicleClaim.PROFILE_MAY_BE_WRONG,
+        diagnosis=VehicleDiagnosis.EXTERNAL_POSITIONS_WRONG | VehicleDiagnosis.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "position-lost",
@@ -397,13 +411,13 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "estimate-unsure",
         FREE_AIR_PHASES,
-        lambda c: c.held_s(ESTIMATE_VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
-        lambda c: f"{variance_text(c.belief)}: the positioning system may have failed",
+        lambda c: c.true_for_s(ESTIMATE_VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
+        lambda c: f"{excessive_variance_text(c.belief)}: the positioning system may have failed",
     ),
     land_row(
         "battery-low",
         PRE_CONTACT_PHASES,
-        lambda c: c.held_s(BATTERY_LOW) >= c.safety.battery_debounce_s,
+        lambda c: c.true_for_s(BATTERY_LOW) >= c.safety.battery_debounce_s,
         lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
     ),
     land_row(
@@ -416,15 +430,15 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "latency",
         FREE_AIR_PHASES,
         lambda c: c.belief.camera_imu_mismatch.camera_latency_error_s != 0.0,
-        wrong_latency_reason,
-        claims=VehicleClaim.PROFILE_MAY_BE_WRONG,
+        wrong_camera_latency_reason,
+        diagnosis=VehicleDiagnosis.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "mounting",
         FREE_AIR_PHASES,
-        is_mounting_wrong,
-        wrong_mounting_reason,
-        claims=VehicleClaim.MOUNTING_WRONG | VehicleClaim.PROFILE_MAY_BE_WRONG,
+        is_camera_mounting_contradicted,
+        wrong_camera_mounting_reason,
+        diagnosis=VehicleDiagnosis.CAMERA_MOUNTING_WRONG | VehicleDiagnosis.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
         "height-limit",
@@ -443,8 +457,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "loop-late",
         PRE_LANDING_PHASES,
-        lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
-        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
+        lambda c: c.obs.tick_start_delay_s > c.safety.loop_late_land_s,
+        lambda c: f"the control loop was {c.obs.tick_start_delay_s:.1f} s late",
     ),
     land_row(
         "markers-disagree",
@@ -461,7 +475,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "time-over",
         PRE_CONTACT_PHASES,
-        is_time_for_all_attempts_over,
+        has_time_for_all_attempts_run_out,
         lambda c: (
             "the perching time has run out"
             if c.planner.hover is None
@@ -472,33 +486,33 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     # --- the magnet may catch early ---
     Transition(
         "caught",
-        MAGNET_ATTACH_PHASES,
+        PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
         is_held_by_target,
         Phase.COMPLETE,
         "already hanging on the magnet",
     ),
     land_row(
         "held",
-        MAGNET_ATTACH_PHASES,
-        is_held_elsewhere,
+        PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
+        is_held_by_other_object,
         "something holds the vehicle away from the target",
-        claims=VehicleClaim.HELD_BY_OTHER,
+        diagnosis=VehicleDiagnosis.HELD_BY_OTHER_OBJECT,
     ),
     land_row(
         "hangs-at-contact",
-        MAGNET_ATTACH_PHASES,
-        lambda c: c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S,
+        PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
+        lambda c: c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S,
         lambda c: (
             f"the vehicle hangs at the target's height, "
             f"{gear_offset_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
         ),
-        claims=VehicleClaim.HANGS,
+        diagnosis=VehicleDiagnosis.HANGING_AT_LAST_TOUCH,
     ),
     # --- obstacles ---
     land_row(
         "cannot-rise",
         {Phase.APPROACH},
-        lambda c: is_blocked(c) or is_press_thrust_insufficient(c),
+        lambda c: is_climb_blocked(c) or is_thrust_insufficient_for_press(c),
         lambda c: (
             f"cannot climb above {c.belief.height_m:.2f} m: an obstacle is above, or the thrust is "
             f"too low"
@@ -506,18 +520,18 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     back_off_row(
         "blocked",
-        MAGNET_ATTACH_PHASES,
-        is_blocked_off_target,
+        PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
+        is_climb_blocked_off_target,
         lambda c: (
             f"pressing against an obstacle at {c.belief.height_m:.2f} m"
             + ("" if c.belief.hover_thrust else ", or the thrust is too low")
         ),
-        claims=VehicleClaim.BLOCKED,
+        diagnosis=VehicleDiagnosis.BLOCKED_BY_OBSTACLE,
     ),
     land_row(
         "too-weak",
         CAMERA_GUIDED_PHASES,
-        is_press_thrust_insufficient,
+        is_thrust_insufficient_for_press,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or an "
         "obstacle is above",
     ),

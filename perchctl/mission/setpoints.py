@@ -47,37 +47,37 @@ velocity moves the vehicle. Smaller: it oscillates."""
 LEAN_ACCELERATION_DAMPING_S2 = 0.13
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
-MAX_FULL_FEEDBACK_AGE_S = 0.06
+MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
 """Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: late
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
-MAX_FEEDBACK_AGE_S = 0.16
+MAX_TELEMETRY_AGE_FOR_FEEDBACK_S = 0.16
 """Age of the telemetry from which the onboard controllers are left alone, s."""
 LATERAL_FEEDBACK_START_BELOW_TARGET_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
-LATERAL_FEEDBACK_FADE_IN_M = 0.4
+LATERAL_FEEDBACK_FADE_IN_DISTANCE_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
 MAX_LATERAL_CORRECTION_M = 0.1
 """Largest correction of a setpoint by the lateral feedback, m."""
-GROUND_CLEARANCE_M = 0.05
+MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
-MAX_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
+MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
 """Largest lateral position error that the integral still accumulates while the vehicle moves, m."""
 MAX_LATERAL_INTEGRAL_M = 0.4
 """Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
 further. Smaller: a wind keeps the vehicle off its target permanently."""
-MAX_IN_PLACE_SPEED_MPS = 0.1
+MAX_SPEED_HOVERING_IN_PLACE_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
-UNCONFIRMED_MOUNTING_SPEED_MPS = 0.25
+MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS = 0.25
 """Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
 vehicle further off."""
-ORDERED_SINK_WITH_TARGET_UNSEEN_MPS = 0.2
+HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
 """Sink rate ordered during a hold while the camera does not see the target, m/s."""
-MIN_HOLD_HEIGHT_M = 0.3
+MIN_HELD_SETPOINT_HEIGHT_M = 0.3
 """Height above the ground at which that sink ends, m."""
 
 
-def hold_here(c: Context) -> PositionSetpoint:
+def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
     """Return the setpoint at the vehicle's estimated position and heading."""
     x, y, z = c.telemetry.position_m
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
@@ -91,7 +91,7 @@ def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float
     return float(target[0] - gear[0]), float(target[1] - gear[1])
 
 
-def setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
+def make_setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
     """Return the setpoint with the gear below the target, the target's heading and the body at
     `z_m`."""
     yaw = c.belief.target.world_yaw_rad
@@ -105,24 +105,28 @@ def step_towards(
     old: PositionSetpoint,
     goal: PositionSetpoint,
     *,
-    up_mps: float = 0.0,
-    down_mps: float = 0.4,
+    max_up_mps: float = 0.0,
+    max_down_mps: float = 0.4,
     is_slow_until_mounting_confirmed: bool = False,
     changes_heading: bool = True,
 ) -> PositionSetpoint:
-    """Return the setpoint one tick after `old`: towards `goal`, with at most `up_mps` upwards and
-    `down_mps` downwards. `is_slow_until_mounting_confirmed` limits the lateral speed while the
-    camera's mounting is unconfirmed; without `changes_heading`, the heading stays."""
+    """Return the setpoint one tick after `old`: towards `goal`, with at most `max_up_mps` upwards
+    and `max_down_mps` downwards. `is_slow_until_mounting_confirmed` limits the lateral speed while
+    the camera's mounting is unconfirmed; without `changes_heading`, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
         yaw_radps = 0.0
-    if is_slow_until_mounting_confirmed and c.belief.mounting.is_awaiting_evidence:
-        xy_mps = min(xy_mps, UNCONFIRMED_MOUNTING_SPEED_MPS) if c.belief.target.is_fresh else 0.0
+    if is_slow_until_mounting_confirmed and c.belief.mounting.is_target_motion_undetermined:
+        xy_mps = (
+            min(xy_mps, MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS)
+            if c.belief.target.is_fresh
+            else 0.0
+        )
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
     part = 1.0 if distance <= xy_mps * dt_s else xy_mps * dt_s / distance
-    dz = max(-down_mps * dt_s, min(up_mps * dt_s, goal.z_m - old.z_m))
+    dz = max(-max_down_mps * dt_s, min(max_up_mps * dt_s, goal.z_m - old.z_m))
     dyaw = wrap_rad(goal.yaw_rad - old.yaw_rad)
     dyaw = max(-yaw_radps * dt_s, min(yaw_radps * dt_s, dyaw))
     return PositionSetpoint(
@@ -139,18 +143,20 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
     )
 
 
-def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
+def fly_under_target(c: Context, z_m: float, *, max_up_mps: float = 0.0) -> Action:
     """Move under the target at height `z_m`, and learn the integral that keeps the gear there."""
-    goal = setpoint_under_target(c, z_m)
-    lateral_integral_m = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
+    goal = make_setpoint_under_target(c, z_m)
+    lateral_integral_m = update_lateral_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = Context(replace(c.state, lateral_integral_m=lateral_integral_m))
-    old = c.state.setpoint or hold_here(c)
+    old = c.state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(
-        c, step_towards(c, old, goal, up_mps=up_mps, is_slow_until_mounting_confirmed=True)
+        c, step_towards(c, old, goal, max_up_mps=max_up_mps, is_slow_until_mounting_confirmed=True)
     )
 
 
-def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> tuple[float, float]:
+def update_lateral_integral(
+    c: Context, goal_xy_m: tuple[float, float], dt_s: float
+) -> tuple[float, float]:
     """Return the integral (x, y) over time of the lateral position error to `goal_xy_m`, times the
     gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset which a
     steady wind leaves.
@@ -162,9 +168,9 @@ def update_integral(c: Context, goal_xy_m: tuple[float, float], dt_s: float) -> 
     ex = goal_xy_m[0] - c.telemetry.position_m[0]
     ey = goal_xy_m[1] - c.telemetry.position_m[1]
     tx, ty = c.state.lateral_integral_m
-    stands = c.belief.speed_mps < MAX_IN_PLACE_SPEED_MPS
+    stands = c.belief.speed_mps < MAX_SPEED_HOVERING_IN_PLACE_MPS
     most_m = MAX_LATERAL_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
-    if stands or math.hypot(ex, ey) < MAX_ERROR_TO_INTEGRATE_IN_MOTION_M:
+    if stands or math.hypot(ex, ey) < MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
     return limit_vector(tx, ty, most_m)
@@ -180,7 +186,7 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
         return replace(c.state, lateral_integral_m=(0.0, 0.0))
-    if not c.belief.is_position_valid or c.belief.speed_mps > MAX_IN_PLACE_SPEED_MPS:
+    if not c.belief.is_position_valid or c.belief.speed_mps > MAX_SPEED_HOVERING_IN_PLACE_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
@@ -211,7 +217,7 @@ def correct_setpoint(
         if corrects_height
         else 0.0
     )
-    dx, dy = _lateral_feedback(c, reference)
+    dx, dy = _lateral_feedback_shift(c, reference)
     return replace(
         reference,
         x_m=reference.x_m + c.state.lateral_integral_m[0] + dx,
@@ -220,20 +226,20 @@ def correct_setpoint(
     )
 
 
-def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
+def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Return the shift (x, y) of the setpoint, m, world axes, that adds feedback of lateral
     position, velocity and lean to that of the onboard controllers; zero far from the target or with
     old telemetry."""
     near = (
         LATERAL_FEEDBACK_START_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
-    ) / LATERAL_FEEDBACK_FADE_IN_M
-    prompt = (MAX_FEEDBACK_AGE_S - c.belief.attitude_age_s) / (
-        MAX_FEEDBACK_AGE_S - MAX_FULL_FEEDBACK_AGE_S
+    ) / LATERAL_FEEDBACK_FADE_IN_DISTANCE_M
+    prompt = (MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - c.belief.attitude_age_s) / (
+        MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S
     )
     gain = max(0.0, min(1.0, near, prompt))
     if gain == 0.0:
         return 0.0, 0.0
-    (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error(c, reference)
+    (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error_and_velocity(c, reference)
     ax_mps2, ay_mps2 = c.belief.lean_acceleration_world_xy_mps2
     dx = (
         LATERAL_ERROR_GAIN * error_x_m
@@ -251,15 +257,15 @@ def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, f
     return part * dx, part * dy
 
 
-def _lateral_error(
+def _lateral_error_and_velocity(
     c: Context, reference: PositionSetpoint
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
     (x, y) in world axes: from pictures and lean while recent pictures show the target, otherwise
     from the state estimate. A take-off and a landing go by the state estimate, too: they do not
     follow the target."""
-    offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.sent.maneuver
-    follows_target = maneuver.is_camera_guided or maneuver.presses
+    offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.command_history.maneuver
+    follows_target = maneuver.is_camera_guided or maneuver.presses_against_target
     if offset is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
@@ -278,20 +284,24 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
     b = c.belief
     if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
-    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HOLD_HEIGHT_M)
-    z_m = setpoint.z_m - ORDERED_SINK_WITH_TARGET_UNSEEN_MPS * max(0.0, c.t_s - c.state.t_s)
+    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HELD_SETPOINT_HEIGHT_M)
+    z_m = setpoint.z_m - HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS * max(
+        0.0, c.t_s - c.state.t_s
+    )
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the setpoint moved inside the fence, below the height limit, and at least
-    `GROUND_CLEARANCE_M` above the ground; in a take-off, at least at the ground."""
+    `MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground; in a take-off, at least at the ground."""
     ground, safety = c.belief.takeoff_position_m, c.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
     distance = math.hypot(dx, dy)
-    floor_m = ground[2] + (0.0 if c.state.phase is Phase.APPROACH else GROUND_CLEARANCE_M)
+    floor_m = ground[2] + (
+        0.0 if c.state.phase is Phase.APPROACH else MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M
+    )
     if distance > safety.fence_radius_m:
         dx, dy = dx * safety.fence_radius_m / distance, dy * safety.fence_radius_m / distance
     return replace(

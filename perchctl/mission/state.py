@@ -8,9 +8,9 @@ from typing import Any
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.maneuver import Maneuver, SentOrders
+from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.observation import Observation
-from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
 from perchctl.profile import Profile
 from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
@@ -22,12 +22,12 @@ class BatteryOutlook:
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # including the landing after the last one; None before the first sighting
     affordable_attempts: int | None = None
-    used_mah: float = 0.0  # charge consumed by the assumed current
+    consumed_charge_mah: float = 0.0  # charge consumed by the assumed current
     rest_v: float | None = None  # estimated resting voltage
 
 
 @dataclass(frozen=True)
-class LevelDescent:
+class LevelDescentState:
     """Memory of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
     thrust: float = 0.0  # last ordered thrust
@@ -47,31 +47,34 @@ class HoverErrors:
     measurement alike, is not in them.
     """
 
-    began_s: float = 0.0  # start of the hover
-    newest_s: float = 0.0  # time of the newest of these frames
-    frames: int = 0
+    hover_began_at_s: float = 0.0  # start of the hover
+    newest_frame_at_s: float = 0.0  # time of the newest of these frames
+    frame_count: int = 0
     squared_error_sums: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Sums of the squares of x, y, z and yaw."""
 
     def with_error(
-        self, t_s: float, e_m: tuple[float, float, float], vehicle_to_target_yaw_rad: float
+        self,
+        t_s: float,
+        gear_to_hover_position_m: tuple[float, float, float],
+        vehicle_to_target_yaw_rad: float,
     ) -> HoverErrors:
         """Return the errors with those of one more frame at `t_s`."""
-        errors = (*e_m, vehicle_to_target_yaw_rad)
+        errors = (*gear_to_hover_position_m, vehicle_to_target_yaw_rad)
         x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squared_error_sums, errors, strict=True))
-        return HoverErrors(self.began_s, t_s, self.frames + 1, (x2, y2, z2, yaw2))
+        return HoverErrors(self.hover_began_at_s, t_s, self.frame_count + 1, (x2, y2, z2, yaw2))
 
     @property
     def duration_s(self) -> float:
         """Time from the start of the hover to the newest frame, s."""
-        return self.newest_s - self.began_s
+        return self.newest_frame_at_s - self.hover_began_at_s
 
     @property
     def rms_xyz_yaw(self) -> tuple[float, float, float, float]:
         """Root mean squares of the errors in x, y, z, m, and heading, rad; NaN without a frame."""
-        if not self.frames:
+        if not self.frame_count:
             return math.nan, math.nan, math.nan, math.nan
-        x, y, z, yaw = (math.sqrt(each / self.frames) for each in self.squared_error_sums)
+        x, y, z, yaw = (math.sqrt(each / self.frame_count) for each in self.squared_error_sums)
         return x, y, z, yaw
 
 
@@ -84,7 +87,7 @@ class PhaseEntry:
     yaw_rad: float = 0.0
     row_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
-    claims: VehicleClaim = VehicleClaim.NONE  # claims of the transition
+    diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE  # diagnosis of the transition
     stop: EmergencyStop | StopMotors | None = None  # command that the transition sends at once
 
 
@@ -95,7 +98,7 @@ class PlannerState:
     belief: Belief
     phase: Phase = Phase.APPROACH
     entry: PhaseEntry = PhaseEntry()  #: time, position and reason of the start of the phase
-    started_s: float = 0.0  #: start of the flight
+    flight_started_at_s: float = 0.0  #: start of the flight
     t_s: float = 0.0  #: time of the last decision
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
@@ -104,24 +107,24 @@ class PlannerState:
     failed_attempts: int = 0  #: number of failed attempts
     #: number of successive frames in this phase that measured the target
     consecutive_target_frames: int = 0
-    searched_positions: int = 0
-    search_step_began_s: float = 0.0
+    searched_position_count: int = 0
+    search_step_began_at_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     lateral_integral_m: tuple[float, float] = (0.0, 0.0)
     #: the phase began with the vehicle pressed at high thrust, and the press has not been ended
     must_end_press: bool = False
     catch_setpoint_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
-    blocked_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
-    release_began_s: float | None = None  #: start of the release by raw thrust
-    motor_stop_ordered_at_s: float | None = None  #: first order to stop the motors
-    last_stop_or_land_order_at_s: float | None = None  #: last order to land or to stop the motors
-    stop_or_land_order_count: int = 0
-    raw_thrust_order: int | None = None  #: last ordered raw thrust; None in position mode
-    descent: LevelDescent = LevelDescent()
+    obstacle_blocked_at_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
+    release_began_at_s: float | None = None  #: start of the release by raw thrust
+    motor_stop_commanded_at_s: float | None = None  #: first order to stop the motors
+    last_stop_or_land_command_at_s: float | None = None  #: last order to land or to stop the motors
+    stop_or_land_command_count: int = 0
+    commanded_raw_thrust: int | None = None  #: last ordered raw thrust; None in position mode
+    descent: LevelDescentState = LevelDescentState()
     hold_reason: str = ""  #: why the vehicle holds its position; empty without a hold
     waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
-    waited_in_phase_s: float = 0.0  #: total waiting time in this phase
+    total_wait_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
     hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
 
@@ -142,19 +145,19 @@ class PlannerState:
         return self.hold_reason or self.waiting_reason
 
     @property
-    def is_under_power(self) -> bool:
+    def is_before_release_and_motor_stop(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.release_began_s is None and self.motor_stop_ordered_at_s is None
+        return self.release_began_at_s is None and self.motor_stop_commanded_at_s is None
 
-    def sent(self, maneuver: Maneuver) -> SentOrders:
+    def command_history(self, maneuver: Maneuver) -> CommandHistory:
         """Return the orders so far, in the form that the belief uses."""
-        return SentOrders(
+        return CommandHistory(
             maneuver=maneuver,
-            maneuver_start_m=self.entry.position_m,
+            maneuver_start_position_m=self.entry.position_m,
             setpoint=self.setpoint,
-            raw_thrust=self.raw_thrust_order,
-            release_began_s=self.release_began_s,
-            motor_stop_ordered_at_s=self.motor_stop_ordered_at_s,
+            raw_thrust=self.commanded_raw_thrust,
+            release_began_at_s=self.release_began_at_s,
+            motor_stop_commanded_at_s=self.motor_stop_commanded_at_s,
             floor_detected_at_s=self.descent.floor_detected_at_s,
         )
 
@@ -165,7 +168,7 @@ class PlannerState:
         return cls(
             belief=Belief.initial_on_ground(obs, profile),
             entry=PhaseEntry(t_s=t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
-            started_s=t_s,
+            flight_started_at_s=t_s,
             t_s=t_s,
-            search_step_began_s=t_s,
+            search_step_began_at_s=t_s,
         )

@@ -29,7 +29,7 @@ from perchctl.mission.phases.search import SEARCH
 from perchctl.mission.safety import SAFETY_ROWS
 from perchctl.mission.transition import Transition
 
-T = TypeVar("T")
+Returned = TypeVar("Returned")
 
 PHASES: dict[Phase, PhaseDefinition] = {
     each.phase: each
@@ -119,8 +119,8 @@ def add_rows(
                     f"row {row.name!r} leads from {phase.name} to {row.to.name} "
                     f"({row.severity.name}); allowed from {phase.name}: {', '.join(may) or 'none'}"
                 )
-        if row.stop is not None or row.outcome is not None or row.claims:
-            raise InvalidValue(f"row {row.name!r} must not set stop, outcome or claims")
+        if row.stop is not None or row.outcome is not None or row.diagnosis:
+            raise InvalidValue(f"row {row.name!r} must not set stop, outcome or diagnosis")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = (
             _wrap_row_function(row.name, row.when),
@@ -149,11 +149,13 @@ def _check_types(row: object) -> None:
         )
 
 
-def _wrap_row_function(name: str, function: Callable[[Context], T]) -> Callable[[Context], T]:
+def _wrap_row_function(
+    name: str, function: Callable[[Context], Returned]
+) -> Callable[[Context], Returned]:
     """Wrap a function of your own row so that its exceptions become InvalidValue with the row's
     name."""
 
-    def call(c: Context) -> T:
+    def call(c: Context) -> Returned:
         try:
             return function(c)
         except Exception as error:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from perchctl.mission.context import Context
-from perchctl.mission.phase import AIRBORNE_PHASES, Outcome, Phase, Severity, VehicleClaim
+from perchctl.mission.phase import AIRBORNE_PHASES, Outcome, Phase, Severity, VehicleDiagnosis
 from perchctl.vehicle import EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
@@ -20,8 +20,8 @@ class Transition:
 
     `when` is called with a `Context`. `reason`, a text or a function of the context, is shown to
     the user. `outcome`, a value or a function of the previous outcome, is the reason why the flight
-    ends. `stop` is the command that a transition into ABORTED sends at once. `claims` are the row's
-    claims about the vehicle.
+    ends. `stop` is the command that a transition into ABORTED sends at once. `diagnosis` is what
+    the row asserts about the vehicle.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Transition:
     severity: Severity = Severity.CONTINUE
     outcome: NewOutcome | None = None
     stop: EmergencyStop | StopMotors | None = None
-    claims: VehicleClaim = VehicleClaim.NONE
+    diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 
     def keeps_mission_in(self, phase: Phase) -> bool:
         """True if the row keeps the mission in this phase instead of leaving it."""
@@ -42,11 +42,11 @@ class Transition:
         """Return the reason in words."""
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
-    def outcome_after(self, before: Outcome | None) -> Outcome | None:
+    def outcome_after(self, previous_outcome: Outcome | None) -> Outcome | None:
         """Return the flight's outcome after this transition."""
         if self.outcome is None or isinstance(self.outcome, Outcome):
-            return self.outcome or before
-        return self.outcome(before)
+            return self.outcome or previous_outcome
+        return self.outcome(previous_outcome)
 
 
 def motor_cut_row(
@@ -57,11 +57,12 @@ def motor_cut_row(
     return _abort_row(name, when, reason, outcome, EmergencyStop())
 
 
-def supervisor_row(name: str, bit: int, reason: str) -> Transition:
-    """Return a row that stops the motors and aborts once the supervisor has set `bit`."""
+def supervisor_row(name: str, supervisor_bit: int, reason: str) -> Transition:
+    """Return a row that stops the motors and aborts once the supervisor has set
+    `supervisor_bit`."""
 
     def when(c: Context) -> bool:
-        return c.telemetry.has_bit(bit)
+        return c.telemetry.has_bit(supervisor_bit)
 
     return _abort_row(name, when, reason, Outcome.SAFETY, StopMotors())
 
@@ -87,11 +88,11 @@ def land_row(
     when: Predicate,
     reason: Reason,
     outcome: Outcome = Outcome.SAFETY,
-    claims: VehicleClaim = VehicleClaim.NONE,
+    diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE,
 ) -> Transition:
     """Return a row that ends the mission and starts the landing."""
     return Transition(
-        name, phases, when, Phase.LANDING, reason, Severity.LAND, outcome, claims=claims
+        name, phases, when, Phase.LANDING, reason, Severity.LAND, outcome, diagnosis=diagnosis
     )
 
 
@@ -100,14 +101,16 @@ def back_off_row(
     phases: Set[Phase],
     when: Predicate,
     reason: Reason,
-    claims: VehicleClaim = VehicleClaim.NONE,
+    diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE,
 ) -> Transition:
     """Return a row that ends the attempt: descend a little and try again."""
-    return Transition(name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, claims=claims)
+    return Transition(
+        name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, diagnosis=diagnosis
+    )
 
 
 def abort_during_landing_row(
-    name: str, when: Predicate, reason: Reason, claims: VehicleClaim = VehicleClaim.NONE
+    name: str, when: Predicate, reason: Reason, diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 ) -> Transition:
     """Return a row from LANDING to ABORTED, where the motors are stopped, for a landing that could
     not be completed normally."""
@@ -119,5 +122,5 @@ def abort_during_landing_row(
         reason,
         Severity.LAND,
         Outcome.SAFETY,
-        claims=claims,
+        diagnosis=diagnosis,
     )

@@ -97,7 +97,13 @@ class FeltSamples:
         if self.offset_g != offset_g or self.samples[begin:] != samples[:known]:
             known = 0
         new = [
-            (s.t_s, s.roll_rad, s.pitch_rad, s.yaw_rad, *ImuMotion.acceleration_mps2(s, offset_g))
+            (
+                s.t_s,
+                s.roll_rad,
+                s.pitch_rad,
+                s.yaw_rad,
+                *ImuMotion.compute_acceleration_world_mps2(s, offset_g),
+            )
             for s in samples[known:]
         ]
         rows = np.concatenate([self.rows[len(self.rows) - known :], np.reshape(new, (-1, 7))])

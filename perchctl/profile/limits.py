@@ -21,7 +21,7 @@ from perchctl.profile.mission import (
 
 REACHED_SHARE = 0.8
 """Distance from the take-off height at which it counts as reached, m
-(`Condition.AT_TAKEOFF_HEIGHT`)."""
+(`Condition.TAKEOFF_HEIGHT_REACHED`)."""
 _KEY = re.compile(r"[a-z_]+(?:\.[a-z0-9_]+)+")
 
 

@@ -135,7 +135,7 @@ def event_record(event: Event) -> dict[str, Any]:
         "severity": event.severity.name.lower().replace("_", " "),
         "reason": event.reason,
         "simulated": event.simulated_fault or None,
-        "rest": None if event.rest is None else event.rest.name.lower(),
+        "rest": None if event.rest_state is None else event.rest_state.name.lower(),
     }
 
 
@@ -155,7 +155,7 @@ def tick_record(
         "attempts": tick.state.failed_attempts,
         "tel_age_s": tick.telemetry_age_s,
         "cam_age_s": tick.last_good_frame_age_s,
-        "late_s": tick.loop_late_s,
+        "late_s": tick.tick_start_delay_s,
         "delay_s": None if tick.camera_errors is None else tick.camera_errors.delay_s,
         "delay_used_s": tick.camera_latency_above_profile_s or None,
         "true_miss_m": true_miss_m,
@@ -174,7 +174,7 @@ def _battery_values(battery: Any) -> dict[str, Any]:
     return {
         "battery_left_s": battery.hover_time_left_s,
         "battery_attempts": battery.affordable_attempts,
-        "battery_used_mah": battery.used_mah,
+        "battery_used_mah": battery.consumed_charge_mah,
         "battery_rest_v": battery.rest_v,
     }
 

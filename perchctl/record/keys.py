@@ -26,6 +26,7 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "sent_count": "sent",
     },
     "FrameRecord": {
+        "is_repeated": "repeated",
         "picture_kind": "fields",
     },
     "FusionAge": {
@@ -33,8 +34,8 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "no_fusion_since_s": "none_since_s",
     },
     "Impact": {
-        "estimated_climb_before_mps": "estimated_mps",
-        "imu_climb_before_mps": "felt_mps",
+        "estimated_climb_before_impact_mps": "estimated_mps",
+        "imu_climb_before_impact_mps": "felt_mps",
     },
     "ImuMotion": {
         "attitude_frozen_for_s": "attitude_frozen_s",
@@ -42,7 +43,8 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "position_frozen_for_s": "place_frozen_s",
         "last_fall_at_s": "fell_s",
         "low_g_since_s": "light_since_s",
-        "vertical_offset_mps2": "offset_mps2",
+        "climb_rate_gained_mps": "sink_mps",
+        "vertical_acceleration_offset_mps2": "offset_mps2",
         "newest_impact": "blow",
         "speed_gained_in_impact_mps": "blow_mps",
         "last_impact_at_s": "blow_s",
@@ -50,14 +52,14 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "climb_steady_since_s": "steady_s",
         "steady_climb_mps": "steady_mps",
         "lateral_steady_since_s": "steady_aside_s",
-        "mean_lateral_mps": "steady_aside_mps",
-        "mean_lateral_g": "aside_g",
-        "last_push_at_s": "pushed_s",
+        "mean_lateral_velocity_mps": "steady_aside_mps",
+        "mean_lateral_specific_force_g": "aside_g",
+        "last_lateral_push_at_s": "pushed_s",
         "accelerometer_offset_g": "offset_g",
         "last_telemetry_gap_ended_at_s": "silent_s",
         "last_gap_that_may_hide_fall_ended_at_s": "gap_s",
-        "restarted_at_s": "started_s",
-        "sunk_while_frozen_m": "sunk_m",
+        "integration_restarted_at_s": "started_s",
+        "descent_while_frozen_m": "sunk_m",
         "mean_hover_thrust": "hover_thrust",
         "roll_pitch_error_rad": "misled_rad",
         "body_roll_pitch_rate_radps": "turning_radps",
@@ -78,6 +80,7 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "operator_request": "operator",
         "rejected_sighting_to_estimate_m": "position_beside_m",
         "target_refusal_reason": "target_refused",
+        "tick_start_delay_s": "loop_late_s",
         "heading_jump_rad": "turned_rad",
     },
     "SentCommand": {
@@ -101,7 +104,12 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "external_positions": "outside",
     },
     "UnfilteredPose": {
+        "gear_to_target_m": "e_m",
         "vehicle_to_target_yaw_rad": "e_yaw_rad",
+    },
+    "VisualInertialMotion": {
+        "lateral_velocity_mps": "velocity_mps",
+        "acceleration_bias_mps2": "bias_mps2",
     },
 }
 """The key of a field in the log, by the names of its dataclass and of itself in the program."""

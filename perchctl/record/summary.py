@@ -17,8 +17,8 @@ from perchctl.mission import (
     HoverReport,
     Outcome,
     Touchdown,
-    VehicleClaim,
-    find_row_claims,
+    VehicleDiagnosis,
+    find_row_diagnosis,
 )
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -121,7 +121,7 @@ class FlightSummary:
             log_problem=end.get("problem"),
             simulated=simulated,
             is_profile_suspect=any(
-                VehicleClaim.PROFILE_MAY_BE_WRONG in find_row_claims(str(event.get("row")))
+                VehicleDiagnosis.PROFILE_MAY_BE_WRONG in find_row_diagnosis(str(event.get("row")))
                 for event in log.events
             ),
         )
@@ -219,9 +219,9 @@ _CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {
     "hover_s": "duration_s",
-    "hover_below_m": "below_target_m",
+    "hover_below_m": "hover_distance_below_target_m",
     "hover_rms_m": "gear_to_hover_position_rms_xyz_m",
-    "hover_yaw_rms_rad": "rms_yaw_rad",
+    "hover_yaw_rms_rad": "yaw_error_rms_rad",
 }
 _FINDINGS = {
     "latency_s": "measured_latency_s",

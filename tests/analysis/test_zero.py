@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.analysis import FlightAnalysis, replay, show_record
 from perchctl.mission import planner
-from perchctl.mission.phases.ascend import SETTLED
+from perchctl.mission.phases.ascend import SETTLED_AT_STANDOFF
 from perchctl.record import FlightLog
 from perchctl.record.fields import FIELDS
 from tests.replay.test_corpus import corpus
@@ -40,7 +40,7 @@ def test_all_outputs_of_a_log_have_one_zero(monkeypatch: pytest.MonkeyPatch) -> 
     assert log.start_s == corpus("perched").start_s  # without ticks by the first flown turn
     rows = csv.DictReader(StringIO(log.csv()))
     shown = show_record(FlightAnalysis(log))["phases"]
-    others = tuple(each for each in planner.PHASE_CONDITIONS if each is not SETTLED)
+    others = tuple(each for each in planner.PHASE_CONDITIONS if each is not SETTLED_AT_STANDOFF)
     monkeypatch.setattr(planner, "PHASE_CONDITIONS", others)
     decided_otherwise = replay(log).differences[0]
     said = {

@@ -189,7 +189,7 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
     found = RestReport(RestState.UNKNOWN)
-    flight.event(Event.note_from_rescue(START_S, RuntimeError(), found.state, found.text))
+    flight.event(Event.make_rescue_note(START_S, RuntimeError(), found.state, found.text))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
     flight.fail(RuntimeError("boom"), tmp_path)
     rows = state_of(page)["card"]["rows"]

@@ -90,7 +90,7 @@ def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
 def test_what_a_rescue_says_counts_too(found: RestState) -> None:
     """By what it found: that it hangs is another claim than that it stands."""
     claims = rescue_claims(
-        Event.note_from_rescue(9.0, ValueError(), found, "whatever it is called")
+        Event.make_rescue_note(9.0, ValueError(), found, "whatever it is called")
     )
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",

@@ -43,7 +43,7 @@ def stops_after_contact(patch: Patch) -> None:
     complete = PHASES[Phase.COMPLETE]
 
     def stopping(c: Context) -> Action:
-        return stop_motors(c) if c.in_phase_s >= 0.3 else complete.act(c)
+        return stop_motors(c) if c.time_in_phase_s >= 0.3 else complete.act(c)
 
     patch.setitem(PHASES, Phase.COMPLETE, replace(complete, act=stopping))
 
@@ -55,7 +55,7 @@ def ignores_the_second_press(patch: Patch) -> None:
 
 def lands_fast(patch: Patch) -> None:
     """At 1.5 m/s, by itself and by thrust."""
-    order, by_setpoints = descent.make_onboard_landing, descent._descend_by_setpoints
+    order, by_setpoints = descent.make_onboard_landing_command, descent._descend_by_setpoints
 
     def fast(*known: Any) -> Land:
         land = order(*known)
@@ -63,11 +63,11 @@ def lands_fast(patch: Patch) -> None:
 
     def by_itself(c: Context) -> Action:
         slow = c.belief.is_positioned_by_target or c.belief.is_in_magnet_reach
-        return by_setpoints(c) if slow else descent._order_onboard_landing(c)
+        return by_setpoints(c) if slow else descent._command_onboard_landing(c)
 
-    patch.setattr(descent, "make_onboard_landing", fast)
+    patch.setattr(descent, "make_onboard_landing_command", fast)
     patch.setattr(descent, "_descend_by_setpoints", by_itself)
-    for name in ("SINK_SETPOINT_MPS", "NEAR_FLOOR_SINK_SETPOINT_MPS"):
+    for name in ("SINK_RATE_SETPOINT_MPS", "NEAR_FLOOR_SINK_RATE_SETPOINT_MPS"):
         patch.setattr(level_descent, name, 1.5)
 
 

@@ -133,7 +133,7 @@ def test_a_vehicle_that_was_rescued_before_its_first_tick_has_flown(
 ) -> None:
     error = RuntimeError("nobody foresaw this")
     assert not reporter.result_of_error(error).has_flown
-    reporter.event(Event.note_from_rescue(1.0, error, RestState.UNKNOWN, "it may fly"))
+    reporter.event(Event.make_rescue_note(1.0, error, RestState.UNKNOWN, "it may fly"))
     result = reporter.result_of_error(error)
     assert (result.has_flown, result.place_m) == (True, None)
 

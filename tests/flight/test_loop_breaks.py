@@ -13,7 +13,7 @@ import pytest
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
 from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, RestState, Tick
-from perchctl.mission.descent import MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
+from perchctl.mission.descent import MAX_LANDING_COMMANDS, MIN_LANDING_COMMANDS
 from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
@@ -54,7 +54,7 @@ def landed_after_a_break(rig: Rig, error: type[BaseException] = Broken) -> None:
         rig.fly()
     assert rig.link.said(PositionSetpoint)
     orders_s = rig.link.said(Land)
-    assert 1 <= len(orders_s) <= MAX_LANDING_ORDERS
+    assert 1 <= len(orders_s) <= MAX_LANDING_COMMANDS
     assert orders_s[0] >= rig.link.said(PositionSetpoint)[0]
     land = orders(rig)[0]
     assert land.height_m < 0.0
@@ -135,7 +135,7 @@ def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> 
     assert link.own == []  # no setpoint that would take the landing back
     said = rig.watcher.events[-1]
     assert said.kind is EventKind.NOTE
-    assert (said.rest is RestState.END_UNCONFIRMED) is not heard
+    assert (said.rest_state is RestState.END_UNCONFIRMED) is not heard
     assert "Broken in flight" in said.reason
     assert ("motors off" in said.reason) is heard
     assert ("could not be confirmed" in said.reason) is not heard
@@ -166,7 +166,7 @@ def test_it_is_bounded() -> None:
     rig.link.motors = False
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
-    assert len(rig.link.said(Land)) == MIN_LANDING_ORDERS
+    assert len(rig.link.said(Land)) == MIN_LANDING_COMMANDS
 
 
 def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:
@@ -183,7 +183,7 @@ def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() ->
 def test_without_positions_from_outside_it_comes_down_level() -> None:
     rig = rescuing(supervisor=AIRBORNE, thrust=HOVER_THRUST)
     rig.profile = Profile.model_validate({"positioning": "mocap"})
-    rig.rescue(telemetry(0.0, 1.5), 2.0, started_s=0.0)
+    rig.rescue(telemetry(0.0, 1.5), 2.0, flight_started_at_s=0.0)
     assert rig.link.said(RawThrust)
     assert not orders(rig)
 
@@ -232,7 +232,7 @@ def test_a_loop_that_hangs_in_the_camera_is_landed_and_goes_on_landing() -> None
     assert landed_s(link) == pytest.approx(HANG_AT_S + 1.0, abs=0.08)
     first = after_the_hang(rig)
     assert first.state.phase is Phase.LANDING
-    assert first.loop_late_s > 4.9
+    assert first.tick_start_delay_s > 4.9
     assert report.outcome is Outcome.SAFETY
     assert "the control loop was 5.0 s late" in report.reason
 
@@ -276,8 +276,8 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
     real, slow = loop.step_mission, []
 
     def step(state: Any, obs: Any, *more: Any) -> Any:
-        if not slow and obs.loop_late_s > 0.5:
-            slow.append(obs.loop_late_s)
+        if not slow and obs.tick_start_delay_s > 0.5:
+            slow.append(obs.tick_start_delay_s)
             link.advance_to(link.now_s + 0.1)
         return real(state, obs, *more)
 

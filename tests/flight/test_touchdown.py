@@ -10,8 +10,8 @@ import pytest
 
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, Touchdown
 from perchctl.mission.belief.motion import Impact
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
-from perchctl.mission.report import HARD_TOUCHDOWN_MPS, find_touchdown
+from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
+from perchctl.mission.report import MIN_HARD_TOUCHDOWN_SPEED_MPS, find_touchdown
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers.hangs import hang_in_the_camera
@@ -55,14 +55,14 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
             motion = motion.with_sample(last, sample)
             believed = not blind or t_s < dropped_s
             carried, last = (
-                advance_reckoning(carried, motion, sample, is_estimate_believed=believed),
+                advance_dead_reckoning(carried, motion, sample, is_estimate_trusted=believed),
                 sample,
             )
     assert last is not None
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
     state = remembering(
-        state_in(Phase.LANDED, z_m=0.0), reckoning=carried, dead_reckoning_since_s=blind_s
+        state_in(Phase.LANDED, z_m=0.0), dead_reckoning=carried, dead_reckoning_since_s=blind_s
     )
     return speed_mps, find_touchdown(context_at(state, obs, profile))
 
@@ -82,7 +82,7 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
     assert truth_mps > 0.4
     assert felt is not None
     assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
-    assert felt.is_hard is (truth_mps > HARD_TOUCHDOWN_MPS)
+    assert felt.is_hard is (truth_mps > MIN_HARD_TOUCHDOWN_SPEED_MPS)
     assert felt.peak_g > 2.0
 
 

@@ -11,9 +11,13 @@ import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.update import KEEPALIVE_THRUST
-from perchctl.mission.descent import LANDING_ORDER_PERIOD_S, MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
-from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, STOP_ORDER_COUNT
+from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
+from perchctl.mission.descent import (
+    LANDING_COMMAND_PERIOD_S,
+    MAX_LANDING_COMMANDS,
+    MIN_LANDING_COMMANDS,
+)
+from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, STOP_COMMAND_COUNT
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -38,14 +42,14 @@ LAND_S = PROFILE.safety.loop_late_land_s
 PERIOD_S = 0.02
 T_S = 100.0
 HOVER = PositionSetpoint(0.1, 0.2, 0.9, 0.5)
-RELEASED = RawThrust(KEEPALIVE_THRUST)
+RELEASED = RawThrust(KEEPALIVE_RAW_THRUST)
 CEILING_M = 2.0
 AT_CEILING = state_with(
     phase=Phase.COMPLETE,
     t_s=T_S,
     takeoff_position_m=(0.0, 0.0, 0.0),
     vehicle_world_z_at_last_contact_m=CEILING_M,
-    release_began_s=T_S - 1.0,
+    release_began_at_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
 IN_AIR = state_with(
@@ -127,7 +131,7 @@ HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
 PRESSING = remembering(
-    AT_CEILING, phase=Phase.PERCH, vehicle_world_z_at_last_contact_m=None, release_began_s=None
+    AT_CEILING, phase=Phase.PERCH, vehicle_world_z_at_last_contact_m=None, release_began_at_s=None
 )
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
@@ -199,16 +203,16 @@ def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
     assert rig.dog.overruled_s > LAND_S
     assert rig.after(late_s + 0.05) is None
     active = READY | HL_ACTIVE  # also shown where the notify was lost, and nothing lands
-    again_s = LANDING_ORDER_PERIOD_S + 0.01
-    for i in range(1, MIN_LANDING_ORDERS):
+    again_s = LANDING_COMMAND_PERIOD_S + 0.01
+    for i in range(1, MIN_LANDING_COMMANDS):
         assert isinstance(rig.after(late_s + i * again_s, supervisor=active), Land)
-    assert rig.after(late_s + MIN_LANDING_ORDERS * again_s, supervisor=active) is None
+    assert rig.after(late_s + MIN_LANDING_COMMANDS * again_s, supervisor=active) is None
 
 
 def test_a_landing_is_ordered_a_limited_number_of_times() -> None:
     rig = Rig()
     orders = [rig.poll(1.05 + 0.05 * i, None) for i in range(200)]
-    assert sum(isinstance(c, Land) for c in orders) == MAX_LANDING_ORDERS
+    assert sum(isinstance(c, Land) for c in orders) == MAX_LANDING_COMMANDS
     assert not [c for c in orders if c is not None and not isinstance(c, Land)]
 
 
@@ -242,8 +246,8 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
     landing = remembering(
         IN_AIR,
         phase=Phase.LANDING,
-        stop_or_land_order_count=MIN_LANDING_ORDERS,
-        last_stop_or_land_order_at_s=T_S,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS,
+        last_stop_or_land_command_at_s=T_S,
     )
     rig = Rig(Idle(), landing)
     assert rig.after(0.5, supervisor=READY | HL_ACTIVE) is None
@@ -251,7 +255,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
 
 
 def test_only_stops_after_the_motors_were_stopped_for_good() -> None:
-    rig = Rig(StopMotors(), remembering(AT_CEILING, motor_stop_ordered_at_s=T_S), CEILING_M)
+    rig = Rig(StopMotors(), remembering(AT_CEILING, motor_stop_commanded_at_s=T_S), CEILING_M)
     sent = [rig.after(s, thrust=0.0) for s in (0.5, 1.1, 9.0)]
     assert all(command in (None, StopMotors()) for command in sent)
 
@@ -287,7 +291,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     """A loop that fell silent as it peeled off in vain, and hangs for ever, would else leave it
     there with turning motors. It stays where it is, and its thrust follows the orders."""
     below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, remembering(AT_CEILING, release_began_s=None), CEILING_M)
+    rig = Rig(below, remembering(AT_CEILING, release_began_at_s=None), CEILING_M)
     sent: list[Command] = []
     thrust = 20000.0
     for i in range(395):
@@ -296,10 +300,10 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
         sent += [command] if command is not None else []
     raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
     assert raw == sorted(raw, reverse=True)
-    assert raw[-1] == KEEPALIVE_THRUST
+    assert raw[-1] == KEEPALIVE_RAW_THRUST
     complete = PROFILE.planner.complete
     assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.2)
-    assert sent[-STOP_ORDER_COUNT:] == [StopMotors()] * STOP_ORDER_COUNT
+    assert sent[-STOP_COMMAND_COUNT:] == [StopMotors()] * STOP_COMMAND_COUNT
     assert rig.poll(9.5, None) in (None, StopMotors())  # no order spins its motors up again
 
 

@@ -275,4 +275,4 @@ def test_what_was_left_out_hears_nothing_of_a_rescue_and_the_others_do(
     assert breaks.calls == 1
     (said,) = failed.value.__notes__
     assert said.startswith("the display raised Broken: by the test")
-    assert works.events[-1].rest is not None
+    assert works.events[-1].rest_state is not None

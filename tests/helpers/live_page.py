@@ -39,7 +39,9 @@ def tick(
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
-    obs = Observation(t_s, sample, seen, last_good_frame_age_s=camera_age_s, loop_late_s=0.001)
+    obs = Observation(
+        t_s, sample, seen, last_good_frame_age_s=camera_age_s, tick_start_delay_s=0.001
+    )
     turn = synthetic.flown_turn(obs, command)
     return Tick(record=turn, state=state, output=output)
 

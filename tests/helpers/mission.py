@@ -15,7 +15,7 @@ from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity
-from perchctl.mission.state import HoverErrors, LevelDescent
+from perchctl.mission.state import HoverErrors, LevelDescentState
 from perchctl.mission.table import PHASE_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
@@ -172,14 +172,14 @@ def note(t_s: float, text: str) -> Event:
 LEARNED_SIGMA = 0.005
 """Spread, as a share, of a hover thrust that quiet flight has taught."""
 _BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
-_DESCENT = {each.name for each in fields(LevelDescent)}
+_DESCENT = {each.name for each in fields(LevelDescentState)}
 _ENTRY = {
     "entered_s": "t_s",
     "entry_m": "position_m",
     "entry_yaw_rad": "yaw_rad",
     "row": "row_name",
     "reason": "reason",
-    "claims": "claims",
+    "diagnosis": "diagnosis",
 }
 """What a test calls it, and the field of the `PhaseEntry`."""
 
@@ -231,9 +231,12 @@ def state_with(**changes: Any) -> PlannerState:
 
 def context_at(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> Context:
     """The tick in which this state meets this observation, before it has taken it in."""
-    sent = state.sent(PHASES[state.phase].maneuver)
+    history = state.command_history(PHASES[state.phase].maneuver)
     return Context(
-        replace(state, belief=replace(state.belief.with_observation(obs, profile), sent=sent))
+        replace(
+            state,
+            belief=replace(state.belief.with_observation(obs, profile), command_history=history),
+        )
     )
 
 
@@ -248,7 +251,7 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         phase=phase,
         entered_s=t_s,
         t_s=t_s,
-        search_step_began_s=t_s,
+        search_step_began_at_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
         last_target_world_m=np.array([0.0, 0.0, CEILING_M]),

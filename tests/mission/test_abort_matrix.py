@@ -108,7 +108,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _obs(last_good_frame_age_s=4.0, has_new_frame=False, camera_problem="camera unplugged"),
         0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
-    "loop-late": (_obs(loop_late_s=1.2), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
+    "loop-late": (_obs(tick_start_delay_s=1.2), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
     "markers-disagree": (
         _obs(successive_marker_conflicts=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
@@ -151,7 +151,7 @@ def _profile(phase: Phase, event: str = "") -> Profile:
 def _begin(phase: Phase, event: str) -> PlannerState:
     z = CEILING_M - 0.03 if phase is Phase.COMPLETE else 1.0
     state = state_in(phase, z_m=z)
-    return remembering(state, started_s=-1000.0) if event == "time-over" else state
+    return remembering(state, flight_started_at_s=-1000.0) if event == "time-over" else state
 
 
 def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
@@ -217,7 +217,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
     "event",
     [
         _obs(last_good_frame_age_s=1.0, has_new_frame=False, target=None),
-        _obs(loop_late_s=0.4),
+        _obs(tick_start_delay_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
         _tel(velocity_variance_m2ps2=0.08),
         _obs(position_age_s=0.3),
@@ -271,7 +271,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
-    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 10.0, **changes}
+    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 10.0, **changes}
     return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 
@@ -344,7 +344,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
     falls = dict(falls)
     z_m, velocity = HANG_Z_M + falls.pop("z_m"), (0.0, 0.0, falls.pop("vz_mps"))
     look = at(z_m, velocity_mps=velocity, **falls)
-    flight = fly(hanging(release_began_s=released_s), look, ticks * TICK_S)
+    flight = fly(hanging(release_began_at_s=released_s), look, ticks * TICK_S)
     assert flight.state.phase is Phase.RECOVER
     assert is_setpoint(flight.command, HANG_Z_M + above_m[0], HANG_Z_M + above_m[1])
     if above_m[0] >= 0.0:
@@ -355,13 +355,13 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
 
 @pytest.mark.parametrize(
     "stopped",
-    [{}, {"motor_stop_ordered_at_s": 9.5, "stop_or_land_order_count": 5}],
+    [{}, {"motor_stop_commanded_at_s": 9.5, "stop_or_land_command_count": 5}],
     ids=["turns", "stopped"],
 )
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str, Any]) -> None:
     """Released, or with the motors stopped already: they spin again, and then it goes down."""
     falls = at(HANG_Z_M - 0.01, velocity_mps=(0.0, 0.0, -0.3), acc_z_g=0.2, thrust=0.0)
-    flight = fly(hanging(Phase.LANDING, release_began_s=9.0, **stopped), falls, 0.06)
+    flight = fly(hanging(Phase.LANDING, release_began_at_s=9.0, **stopped), falls, 0.06)
     state = flight.state
     assert state.phase is Phase.LANDING
     assert is_setpoint(flight.command, above_m=HANG_Z_M + 0.5)
@@ -369,7 +369,7 @@ def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str
         held = at(HANG_Z_M - 0.2)(10.2 + TICK_S * i)
         state, command = planner.step_mission(state, held, PROFILE)
         assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.2 + 1e-9)
-    assert state.motor_stop_ordered_at_s is None
+    assert state.motor_stop_commanded_at_s is None
 
 
 def _heard_last(z_m: float, **tel: Any) -> Look:

@@ -10,8 +10,8 @@ from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
     CONTACT,
+    IMU_SHOWS_SUPPORT,
     MIN_PRESS_TO_HOVER_THRUST_RATIO,
-    SUPPORT_SHOWN_BY_IMU,
     is_pressing,
 )
 from perchctl.profile import Profile
@@ -107,8 +107,8 @@ def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     """No hover thrust was learned, or the thrust that is read is not the one that was ordered."""
     assert not is_contact(touching(), hover_thrust=0.0)
     unanswered = {
-        "raw_thrust_order": 20000,
-        "thrust_differs_from_order_since_s": BEGIN_S - 1.0,
+        "commanded_raw_thrust": 20000,
+        "thrust_differs_from_command_since_s": BEGIN_S - 1.0,
         "setpoint": None,
     }
     assert not is_contact(touching(), **unanswered)
@@ -124,15 +124,15 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     found = [
         CONTACT in b.condition_start_times_s,
         CLIMB_BLOCKED in b.condition_start_times_s,
-        SUPPORT_SHOWN_BY_IMU in b.condition_start_times_s,
+        IMU_SHOWS_SUPPORT in b.condition_start_times_s,
         is_pressing(b),
     ]
     assert found == [thrust >= MIN_PRESS_TO_HOVER_THRUST_RATIO] * 4
 
 
-@pytest.mark.parametrize(("raw_thrust_order", "presses"), [(60_000, True), (None, False)])
+@pytest.mark.parametrize(("commanded_raw_thrust", "presses"), [(60_000, True), (None, False)])
 def test_the_end_of_a_raw_press_counts_only_while_one_is_flown(
-    raw_thrust_order: int | None, presses: bool
+    commanded_raw_thrust: int | None, presses: bool
 ) -> None:
     """At 59400 of a raw press's 60000 no more can be shown; in position mode, hover thrust of a
     heavy vehicle is as much, and presses nothing."""
@@ -140,7 +140,7 @@ def test_the_end_of_a_raw_press_counts_only_while_one_is_flown(
     pressing = remembering(
         state_in(Phase.PERCH, z_m=HANG_Z_M),
         hover_thrust=58_500.0,
-        raw_thrust_order=raw_thrust_order,
+        commanded_raw_thrust=commanded_raw_thrust,
     )
     b = observing(pressing, touching(thrust=59_500.0), raw).belief
     assert is_pressing(b) is presses

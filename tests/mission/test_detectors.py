@@ -13,19 +13,19 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
     LATERAL_VELOCITY_TIME_CONSTANT_S,
-    MAX_CLIMB_GAINED_IN_FALL_MPS,
-    MAX_RISE_BEFORE_FALL_MPS,
+    MAX_CLIMB_RATE_GAINED_IN_FALL_MPS,
+    MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
     MAX_STEADY_CLIMB_DEVIATION_MPS,
     MAX_STEADY_LATERAL_DEVIATION_MPS,
     MIN_FREE_FALL_DURATION_S,
-    MIN_PUSH_G,
+    MIN_LATERAL_PUSH_G,
     UP_ACCELERATION_OFFSET_TIME_CONSTANT_S,
     FallDetector,
     FreezeDetector,
     Impact,
     ImpactDetector,
-    PushDetector,
-    SteadySpeed,
+    LateralPushDetector,
+    SteadySpeedDetector,
 )
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import telemetry
@@ -40,11 +40,11 @@ BIAS_MPS2 = st.floats(-0.3, 0.3)
 
 
 def watched(
-    up_mps2: list[tuple[float, float]], rate_hz: float, bias_mps2: float = 0.0
+    up_acceleration_mps2: list[tuple[float, float]], rate_hz: float, bias_mps2: float = 0.0
 ) -> FallDetector:
     """After accelerations for so long each: (m/s2, s). It reads what it feels."""
     fall, t_s, dt_s = FallDetector(), 0.0, 1.0 / rate_hz
-    for mps2, lasts_s in up_mps2:
+    for mps2, lasts_s in up_acceleration_mps2:
         for _ in range(round(lasts_s * rate_hz)):
             t_s += dt_s
             reads_g = 1.0 + (mps2 + bias_mps2) / GRAVITY_MPS2
@@ -112,20 +112,22 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
 ) -> None:
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
-    late_s = (MAX_RISE_BEFORE_FALL_MPS - MAX_CLIMB_GAINED_IN_FALL_MPS) / (0.8 * falls_mps2)
+    late_s = (MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS - MAX_CLIMB_RATE_GAINED_IN_FALL_MPS) / (
+        0.8 * falls_mps2
+    )
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
     assert watched(flight, rate_hz).last_fall_at_s > 1.0
 
 
 @given(RATES_HZ, st.floats(-1.0, 0.55), st.floats(0.0, 5.0))
 def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_says(
-    rate_hz: float, reads_g: float, up_mps2: float
+    rate_hz: float, reads_g: float, up_acceleration_mps2: float
 ) -> None:
     """With a wrong attitude the vertical acceleration may show none of it."""
     fall, t_s, dt_s = FallDetector(), 1.0, 1.0 / rate_hz
     for _ in range(round(rate_hz)):
         t_s += dt_s
-        fall = fall.update_fall(t_s, up_mps2, reads_g, dt_s)
+        fall = fall.update_fall(t_s, up_acceleration_mps2, reads_g, dt_s)
         if fall.last_fall_at_s > 0.0:
             break
     assert MIN_FREE_FALL_DURATION_S <= t_s - 1.0 <= MIN_FREE_FALL_DURATION_S + 2.1 * dt_s
@@ -139,10 +141,12 @@ def struck(gained_mps: float, rate_hz: float, sinks_mps: float = -0.7) -> Impact
     impact, t_s, dt_s, v_mps = ImpactDetector(), 0.0, 1.0 / rate_hz, sinks_mps
     blows = max(1, round(0.02 * rate_hz))
     for k in range(round(rate_hz)):
-        up_mps2 = gained_mps / (blows * dt_s) if 0 <= k - round(0.5 * rate_hz) < blows else 0.0
-        t_s, v_mps = t_s + dt_s, v_mps + up_mps2 * dt_s
-        now = Impact(t_s, v_mps, v_mps, 1.0 + up_mps2 / GRAVITY_MPS2, 0.0)
-        impact = impact.update_impact(now, 0.0, up_mps2, dt_s)
+        up_acceleration_mps2 = (
+            gained_mps / (blows * dt_s) if 0 <= k - round(0.5 * rate_hz) < blows else 0.0
+        )
+        t_s, v_mps = t_s + dt_s, v_mps + up_acceleration_mps2 * dt_s
+        now = Impact(t_s, v_mps, v_mps, 1.0 + up_acceleration_mps2 / GRAVITY_MPS2, 0.0)
+        impact = impact.update_impact(now, 0.0, up_acceleration_mps2, dt_s)
     return impact
 
 
@@ -161,7 +165,7 @@ def test_the_speed_of_a_touchdown_is_the_one_before_it(
     rate_hz: float, sinks_mps: float, gained_mps: float
 ) -> None:
     blow = struck(gained_mps, rate_hz, sinks_mps).newest_impact
-    assert blow.estimated_climb_before_mps == pytest.approx(sinks_mps, abs=1e-9)
+    assert blow.estimated_climb_before_impact_mps == pytest.approx(sinks_mps, abs=1e-9)
 
 
 @given(RATES_HZ)
@@ -205,7 +209,7 @@ def test_a_constant_speed_is_steady_whatever_it_is(
     rate_hz: float, climb_mps: float, aside_mps: float, heading_rad: float
 ) -> None:
     """A bias of the integrated speed changes nothing, nor does the heading."""
-    speed, t_s, dt_s = SteadySpeed(), 0.0, 1.0 / rate_hz
+    speed, t_s, dt_s = SteadySpeedDetector(), 0.0, 1.0 / rate_hz
     velocity = (aside_mps * math.cos(heading_rad), aside_mps * math.sin(heading_rad), climb_mps)
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
@@ -231,8 +235,8 @@ def test_a_constant_speed_is_steady_whatever_it_is(
 
 def pushed(
     force_g: float, heading_rad: float, rate_hz: float, offset_g: tuple[float, float] = (0.0, 0.0)
-) -> PushDetector:
-    push, t_s, dt_s = PushDetector(), 0.0, 1.0 / rate_hz
+) -> LateralPushDetector:
+    push, t_s, dt_s = LateralPushDetector(), 0.0, 1.0 / rate_hz
     for _ in range(round(0.5 * rate_hz)):
         t_s += dt_s
         sample: Telemetry = replace(
@@ -240,7 +244,7 @@ def pushed(
             acc_x_g=force_g * math.cos(heading_rad) + offset_g[0],
             acc_y_g=force_g * math.sin(heading_rad) + offset_g[1],
         )
-        push = push.update_push(sample, (*offset_g, 0.0), dt_s)
+        push = push.update_lateral_push(sample, (*offset_g, 0.0), dt_s)
     return push
 
 
@@ -248,9 +252,9 @@ def pushed(
 def test_a_push_is_one_from_each_side_and_with_each_offset_at_rest(
     rate_hz: float, heading_rad: float, force_g: float, offset_g: float
 ) -> None:
-    assume(abs(force_g - MIN_PUSH_G) > 1e-3)
+    assume(abs(force_g - MIN_LATERAL_PUSH_G) > 1e-3)
     found = pushed(force_g, heading_rad, rate_hz, (offset_g, -offset_g))
-    assert (found.last_push_at_s > 0.0) is (force_g > MIN_PUSH_G)
+    assert (found.last_lateral_push_at_s > 0.0) is (force_g > MIN_LATERAL_PUSH_G)
 
 
 # --- All of it -----------------------------------------------------------------------------------

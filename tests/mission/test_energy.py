@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.belief.battery import (
-    BRUSHED,
-    BRUSHLESS,
+    BRUSHED_POWER_TRAIN,
+    BRUSHLESS_POWER_TRAIN,
     BatteryFit,
     PowerTrain,
     update_battery_fit,
@@ -58,7 +58,7 @@ def hovering(
     kind: dict[str, float],
     most_s: float = 120.0,
     hover: float = HOVER,
-    drive: PowerTrain = BRUSHED,
+    drive: PowerTrain = BRUSHED_POWER_TRAIN,
     mah: float = MAH,
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
@@ -103,7 +103,7 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
             continue
-        told_s = predict_hover_time_s(moment.energy, PROFILE, hover, BRUSHED)
+        told_s = predict_hover_time_s(moment.energy, PROFILE, hover, BRUSHED_POWER_TRAIN)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
             assert told_s < ATTEMPT_S + LANDING_END_DURATION_S + PROFILE.safety.energy_reserve_s
@@ -116,7 +116,7 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     """Its bits name its motors; the battery holds 350 mAh, and low power is reported sooner."""
     cell = {"ohm": 0.143 * MAH / BRUSHLESS_MAH, "charge": BRUSHLESS_MAH / MAH}
     profile, hover, low_v = changed({"vehicle.battery_mah": BRUSHLESS_MAH}), 0.55, 3.35
-    moments = list(hovering(rest_v, cell, 200.0, hover, BRUSHLESS, BRUSHLESS_MAH))
+    moments = list(hovering(rest_v, cell, 200.0, hover, BRUSHLESS_POWER_TRAIN, BRUSHLESS_MAH))
     end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
@@ -129,14 +129,14 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
 def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
-        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
+        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED_POWER_TRAIN)
     return energy
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
-    assert predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED) is None
+    assert predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN) is None
     assert energy.time_since_battery_reading_s == pytest.approx(10.0)
 
 
@@ -153,8 +153,8 @@ def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
 def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
-        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
-    seconds = predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED)
+        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED_POWER_TRAIN)
+    seconds = predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
 
@@ -233,8 +233,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
 )
 def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, Any]) -> None:
     energy = replace(FINE_BATTERY, rest_v=3.95)
-    usual_s = predict_hover_time_s(energy, PROFILE, 0.5, BRUSHED)
-    sooner_s = predict_hover_time_s(energy, changed(changes), 0.5, BRUSHED)
+    usual_s = predict_hover_time_s(energy, PROFILE, 0.5, BRUSHED_POWER_TRAIN)
+    sooner_s = predict_hover_time_s(energy, changed(changes), 0.5, BRUSHED_POWER_TRAIN)
     assert usual_s is not None
     assert sooner_s is not None
     assert 0.0 < sooner_s < usual_s

@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.mission import CameraFindings, FlightReport, ImuMotion, Observation, Phase
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.phase import VehicleClaim
+from perchctl.mission.phase import VehicleDiagnosis
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraErrors
@@ -69,17 +69,21 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
         if callable(row.reason)
         and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
     }
-    assert blames == {row.name for row in TABLE if VehicleClaim.PROFILE_MAY_BE_WRONG in row.claims}
+    assert blames == {
+        row.name for row in TABLE if VehicleDiagnosis.PROFILE_MAY_BE_WRONG in row.diagnosis
+    }
 
 
 @pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED])
 def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase) -> None:
     """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
     reckoning."""
-    reckoning = DeadReckoning(
-        imu=ImuMotion(t_s=BEGIN_S), lateral_offset_m=(0.03, 0.04), lateral_sigma_m=0.01
+    dead_reckoning = DeadReckoning(
+        imu=ImuMotion(t_s=BEGIN_S),
+        gear_to_target_world_xy_m=(0.03, 0.04),
+        gear_to_target_sigma_m=0.01,
     )
-    state = remembering(state_in(phase), reckoning=reckoning, last_contact_offset=None)
+    state = remembering(state_in(phase), dead_reckoning=dead_reckoning, last_contact_offset=None)
     report = FlightReport.from_state(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
         assert report.last_contact_offset is None
@@ -91,21 +95,21 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
 
 def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     """Its distance does not become unsure while it hangs there."""
-    reckoning = DeadReckoning(
-        lateral_offset_m=(0.02, 0.0),
-        lateral_sigma_m=0.01,
+    dead_reckoning = DeadReckoning(
+        gear_to_target_world_xy_m=(0.02, 0.0),
+        gear_to_target_sigma_m=0.01,
         gear_below_target_m=0.0,
         last_sighting_at_s=BEGIN_S - 0.5,
     )
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
-        reckoning=reckoning, vehicle_world_z_at_last_contact_m=1.9, in_magnet_reach_since_s=BEGIN_S,
-        motor_stop_ordered_at_s=BEGIN_S,
+        dead_reckoning=dead_reckoning, vehicle_world_z_at_last_contact_m=1.9,
+        in_magnet_reach_since_s=BEGIN_S, motor_stop_commanded_at_s=BEGIN_S,
         dead_reckoning_since_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
     rest = [
-        tick.state.belief.reckoning.lateral_sigma_m
+        tick.state.belief.dead_reckoning.gear_to_target_sigma_m
         for tick in flight.ticks
         if tick.t_s > BEGIN_S + 1.0
     ]

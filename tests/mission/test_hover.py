@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
-    HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S,
-    MAX_DESCENT_CORRECTION_SIGMAS,
-    MIN_HOVER_THRUST_SIGMA_IN_DESCENT,
+    HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT,
+    MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS,
+    MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT,
     estimate_hover_thrust,
-    learn_in_descent,
-    learn_in_quiet_flight,
+    learn_hover_thrust_in_descent,
+    learn_hover_thrust_in_quiet_flight,
 )
-from perchctl.mission.belief.maneuver import Maneuver, SentOrders
+from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_HOVER_THRUST_SIGMA,
-    HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S,
-    THRUST_MEASUREMENT_SIGMA_FRACTION,
+    ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION,
+    HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
+    HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION,
     HoverThrust,
 )
 from perchctl.mission.phase import Phase
@@ -39,9 +39,12 @@ from tests.helpers.mission import (
 
 thrusts = st.floats(30_000.0, 62_000.0)
 drifts = st.sampled_from(
-    [HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S, HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S]
+    [
+        HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
+        HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT,
+    ]
 )
-DESCENDS = SentOrders(maneuver=Maneuver(descends=True), raw_thrust=48_000)
+DESCENDS = CommandHistory(maneuver=Maneuver(descends_to_floor=True), raw_thrust=48_000)
 
 
 def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:
@@ -60,11 +63,11 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
     settled_s = (
-        12.0 * THRUST_MEASUREMENT_SIGMA_FRACTION / drift
+        12.0 * HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION / drift
     )  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
     found = measured(
-        HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA), [true] * steps, 0.02, drift
+        HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION), [true] * steps, 0.02, drift
     )
     assert found.thrust == pytest.approx(true, rel=1e-3)
 
@@ -74,14 +77,14 @@ def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: f
     """P = r d for a scalar Kalman filter, within the step of a tick."""
     found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
     assert found.sigma == pytest.approx(
-        math.sqrt(THRUST_MEASUREMENT_SIGMA_FRACTION * drift), rel=0.05
+        math.sqrt(HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION * drift), rel=0.05
     )
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
     """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
-    start = HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA)
+    start = HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
     assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
@@ -99,7 +102,7 @@ def test_more_measured_is_more_believed(old: float, one: float, other: float, si
 
 @pytest.mark.parametrize(("thrust", "learns"), [(52_000.0, True), (62_000.0, False)])
 def test_a_hand_that_holds_the_vehicle_teaches_nothing(thrust: float, learns: bool) -> None:
-    found = learn_in_quiet_flight(believing(Phase.ALIGN, thrust), 0.02)
+    found = learn_hover_thrust_in_quiet_flight(believing(Phase.ALIGN, thrust), 0.02)
     assert (found.thrust > 50_000.0) is learns
 
 
@@ -109,10 +112,12 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 ) -> None:
     b = believing(Phase.LANDING, thrust, acc_z_g)
     for _ in range(200):
-        b = replace(b, hover_thrust_estimate=learn_in_descent(b, 0.02))
+        b = replace(b, hover_thrust_estimate=learn_hover_thrust_in_descent(b, 0.02))
     assert (
         abs(b.hover_thrust / 50_000.0 - 1.0)
-        <= MAX_DESCENT_CORRECTION_SIGMAS * MIN_HOVER_THRUST_SIGMA_IN_DESCENT + 1e-9
+        <= MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS
+        * MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT
+        + 1e-9
     )
     assert (b.hover_thrust > 50_000.0) is (thrust / acc_z_g > 50_000.0)
 
@@ -120,7 +125,7 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 @pytest.mark.parametrize(
     "hides",
     [
-        {"sent": replace(DESCENDS, floor_detected_at_s=9.9)},
+        {"command_history": replace(DESCENDS, floor_detected_at_s=9.9)},
         {"vehicle_world_z_at_last_contact_m": 1.0},  # a magnet may hold it
         {"in_magnet_reach_since_s": 9.0},
     ],
@@ -128,22 +133,24 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 )
 def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> None:
     b = believing(Phase.LANDING, 30_000.0)
-    assert learn_in_descent(replace(b, sent=DESCENDS), 0.02).thrust < 50_000.0
-    assert learn_in_descent(replace(b, **hides), 0.02).thrust == 50_000.0
+    assert (
+        learn_hover_thrust_in_descent(replace(b, command_history=DESCENDS), 0.02).thrust < 50_000.0
+    )
+    assert learn_hover_thrust_in_descent(replace(b, **hides), 0.02).thrust == 50_000.0
 
 
 def test_what_was_never_learned_is_felt_and_rough() -> None:
     b = replace(believing(Phase.LANDING, 45_000.0), hover_thrust_estimate=HoverThrust())
     assert estimate_hover_thrust(b).thrust == pytest.approx(45_000.0)
     assert estimate_hover_thrust(b).is_imprecise
-    assert not learn_in_quiet_flight(b, 0.02).is_imprecise
+    assert not learn_hover_thrust_in_quiet_flight(b, 0.02).is_imprecise
 
 
 def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
     """One late packet teaches no more in a second than in a tick."""
     start = remembering(
         state_in(Phase.LANDING),
-        raw_thrust_order=45_000,
+        commanded_raw_thrust=45_000,
         hover_thrust_estimate=HoverThrust(50_000.0, 0.12),
     )
     sample = replace(telemetry(10.02, 1.0), thrust=45_000.0)
@@ -164,15 +171,15 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
         force_g += (1.0 - math.exp(-0.01 / 0.06)) * (read / 50_000.0 - force_g)
         sample = replace(telemetry(t_s, 1.0), thrust=read, acc_z_g=force_g)
         state = observing(
-            replace(state, raw_thrust_order=int(read)), observation(t_s, telemetry=sample)
+            replace(state, commanded_raw_thrust=int(read)), observation(t_s, telemetry=sample)
         )
         assert state.belief.hover_thrust == pytest.approx(50_000.0, rel=0.005)
 
 
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
-    later = HoverThrust(50_000.0, sigma).propagate_unmeasured(dt_s)
-    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)
+    later = HoverThrust(50_000.0, sigma).propagate_without_measurement(dt_s)
+    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:

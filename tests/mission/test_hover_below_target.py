@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from perchctl.mission import Outcome, Phase
-from perchctl.mission.phases.hover import MAX_CLIMB_BACK_S, MAX_HOVER_SINK_M
+from perchctl.mission.phases.hover import (
+    MAX_RETURN_TO_HOVER_HEIGHT_S,
+    MAX_SINK_BELOW_HOVER_HEIGHT_M,
+)
 from perchctl.mission.report import HoverReport
 from perchctl.mission.state import HoverErrors
 from perchctl.profile import Profile
@@ -52,11 +55,13 @@ def test_it_sinks_below_a_nearer_target_and_never_follows_one_that_is_farther(
 
 def sunk_for(low_s: float) -> Look:
     """The vehicle is 8 cm too low for that time, and then at its place."""
-    low, there = at(1.0 - MAX_HOVER_SINK_M - 0.02), at()
+    low, there = at(1.0 - MAX_SINK_BELOW_HOVER_HEIGHT_M - 0.02), at()
     return lambda t_s: (low if t_s < BEGIN_S + low_s else there)(t_s)
 
 
-@pytest.mark.parametrize(("low_s", "goes_on"), [(1.0, True), (MAX_CLIMB_BACK_S + 1.0, False)])
+@pytest.mark.parametrize(
+    ("low_s", "goes_on"), [(1.0, True), (MAX_RETURN_TO_HOVER_HEIGHT_S + 1.0, False)]
+)
 def test_the_time_of_a_hover_goes_on_while_it_climbs_back(low_s: float, goes_on: bool) -> None:
     """Unless that takes so long that it was no hover."""
     profile = changed({"planner.hover.duration_s": 20.0}, HOVERING)
@@ -65,9 +70,9 @@ def test_the_time_of_a_hover_goes_on_while_it_climbs_back(low_s: float, goes_on:
     assert way == [Phase.HOVER, Phase.ASCEND, Phase.HOVER]
     assert "sunk" in flight.rows
     errors = flight.state.hover_errors
-    assert (errors.began_s == BEGIN_S) is goes_on
+    assert (errors.hover_began_at_s == BEGIN_S) is goes_on
     if goes_on:  # the frames of the ascent count, too
-        assert errors.frames == len(flight.ticks)
+        assert errors.frame_count == len(flight.ticks)
 
 
 def test_the_time_starts_anew_once_the_vehicle_has_left_its_place() -> None:
@@ -78,7 +83,7 @@ def test_the_time_starts_anew_once_the_vehicle_has_left_its_place() -> None:
     )  # fmt: skip
     assert "left-place" in flight.rows
     assert flight.state.phase is Phase.HOVER
-    assert flight.state.hover_errors.began_s > BEGIN_S + 0.5
+    assert flight.state.hover_errors.hover_began_at_s > BEGIN_S + 0.5
 
 
 def test_a_hover_is_completed_only_while_the_target_is_seen() -> None:
@@ -93,7 +98,7 @@ def test_a_hover_that_ends_on_the_magnet_is_no_hover(seen: str) -> None:
     """Its exit code says that the vehicle has landed."""
     off = {"thrust": 0.0, "supervisor": READY | (LOCKED if seen == "locked" else 0)}
     state = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), motor_stop_ordered_at_s=BEGIN_S - 1.0,
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), motor_stop_commanded_at_s=BEGIN_S - 1.0,
         vehicle_world_z_at_last_contact_m=HANG_Z_M, outcome=Outcome.HOVERED,
     )  # fmt: skip
     end = fly(state, at(HANG_Z_M, **off), 0.3, HOVERING).state
@@ -124,7 +129,7 @@ def test_a_hover_needs_no_thrust_for_a_press() -> None:
 
 @pytest.mark.parametrize(("flown_s", "row"), [(124.0, ""), (126.0, "time-over")])
 def test_the_time_of_the_mission_includes_that_of_the_hover(flown_s: float, row: str) -> None:
-    state = remembering(state_in(Phase.ALIGN), started_s=BEGIN_S - flown_s)
+    state = remembering(state_in(Phase.ALIGN), flight_started_at_s=BEGIN_S - flown_s)
     assert fly(state, at(), TICK_S, HOVERING).state.row_name == row
 
 
@@ -148,11 +153,11 @@ def test_each_frame_counts_once_and_the_errors_are_those_of_the_place() -> None:
         seen = target_at(t_s, e_m=e_m, e_yaw_rad=0.1)
         obs = observation(t_s, target=seen, has_new_frame=number % 2 == 0)
         state = fly(state, lambda _t_s, obs=obs: obs, TICK_S, HOVERING).state
-    assert state.hover_errors.frames == 2
+    assert state.hover_errors.frame_count == 2
     report = HoverReport.from_state(state, HOVERING)
     assert report is not None
     assert report.gear_to_hover_position_rms_xyz_m == pytest.approx((0.03, 0.0, 0.04))
-    assert report.rms_yaw_rad == pytest.approx(0.1)
+    assert report.yaw_error_rms_rad == pytest.approx(0.1)
     assert report.duration_s == pytest.approx(4 * TICK_S)
     assert "RMS error x 30.0, y 0.0, z 40.0 mm, heading 5.7 deg" in report.text
     assert HoverReport.from_state(state, PROFILE) is None

@@ -14,15 +14,15 @@ from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
     MAX_FROZEN_READING_S,
     MAX_TELEMETRY_GAP_S,
-    MIN_PUSH_G,
+    MIN_LATERAL_PUSH_G,
     NO_FUSION_TIMEOUT_S,
 )
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
-    MAX_CLIMB_IN_TELEMETRY_GAP_MPS,
+    MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS,
     DeadReckoning,
     add_sighting,
-    advance_reckoning,
+    advance_dead_reckoning,
 )
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import telemetry
@@ -91,14 +91,14 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
         imu, velocity_mps=(0.0, 0.0, 0.05), estimated_velocity_mps=before.velocity_mps
     )
     heard = imu.with_sample(before, after)
-    new = advance_reckoning(old, heard, after, is_estimate_believed=False)
+    new = advance_dead_reckoning(old, heard, after, is_estimate_trusted=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
     assert (
-        advance_reckoning(old, heard, after, is_estimate_believed=True).velocity_mps
+        advance_dead_reckoning(old, heard, after, is_estimate_trusted=True).velocity_mps
         == after.velocity_mps
     )
-    assert advance_reckoning(
-        old, heard, after, is_estimate_believed=False, is_position_diverged=True
+    assert advance_dead_reckoning(
+        old, heard, after, is_estimate_trusted=False, is_position_diverged=True
     ).velocity_mps == (old.velocity_mps)
 
 
@@ -142,7 +142,7 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = gear_below_target_m - MAX_CLIMB_IN_TELEMETRY_GAP_MPS * silent_s < MAGNET_REACH_M
+    near = gear_below_target_m - MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * silent_s < MAGNET_REACH_M
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
         (
@@ -170,10 +170,10 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     ):
         imu = flown([before])
         old = add_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
-        new = advance_reckoning(
-            old, imu.with_sample(before, after), after, is_estimate_believed=False
+        new = advance_dead_reckoning(
+            old, imu.with_sample(before, after), after, is_estimate_trusted=False
         )
-        assert (new.last_gap_magnet_may_attach_ended_at_s == after.t_s) is unsure
+        assert (new.last_gap_in_which_magnet_may_attach_ended_at_s == after.t_s) is unsure
         assert new.gear_below_target_m == (z_m if kept else math.inf)
         assert (
             add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_gear_below_target_m
@@ -185,14 +185,16 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     """It fell by 5 cm, and the setpoint that catches it is a metre above."""
     falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
     motion = flown(falls[:1])
-    reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
+    dead_reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
-        assert new is not late or 0.02 < reckoning.min_gear_below_target_m < 0.1
+        assert new is not late or 0.02 < dead_reckoning.min_gear_below_target_m < 0.1
         motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=False)
+        dead_reckoning = advance_dead_reckoning(
+            dead_reckoning, motion, new, is_estimate_trusted=False
+        )
     assert motion.last_fall_at_s > 1.0
-    assert reckoning.last_gap_magnet_may_attach_ended_at_s == late.t_s
+    assert dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s == late.t_s
 
 
 def estimate_only_mps(
@@ -202,7 +204,7 @@ def estimate_only_mps(
     mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
     many samples show. `offset_g`: what the accelerometer reads too much."""
     lean_rad = 1.0 / 9.81
-    reckoning, motion, last = (
+    dead_reckoning, motion, last = (
         DeadReckoning(),
         ImuMotion(accelerometer_offset_g=(offset_g, 0.0, 0.0)),
         None,
@@ -214,17 +216,19 @@ def estimate_only_mps(
             acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
         )  # fmt: skip
         motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, is_estimate_believed=True)
+        dead_reckoning = advance_dead_reckoning(
+            dead_reckoning, motion, new, is_estimate_trusted=True
+        )
         last = new
-    return abs(reckoning.lateral_velocity_unseen_by_imu_mps[0])
+    return abs(dead_reckoning.lateral_velocity_unseen_by_imu_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
     assert estimate_only_mps(1) < 0.05
     assert estimate_only_mps(-1) > 0.3
-    assert estimate_only_mps(-1, pushed_g=2.0 * MIN_PUSH_G) == 0.0
+    assert estimate_only_mps(-1, pushed_g=2.0 * MIN_LATERAL_PUSH_G) == 0.0
     assert estimate_only_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
-    assert estimate_only_mps(-1, offset_g=1.2 * MIN_PUSH_G) > 0.3
+    assert estimate_only_mps(-1, offset_g=1.2 * MIN_LATERAL_PUSH_G) > 0.3
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------

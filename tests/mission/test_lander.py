@@ -24,14 +24,14 @@ from perchctl.mission import (
     planner,
     rest,
 )
-from perchctl.mission.belief.contact import MOTORS_STOPPED, SUPPORT_SHOWN_BY_IMU
+from perchctl.mission.belief.contact import IMU_SHOWS_SUPPORT, MOTORS_STOPPED
 from perchctl.mission.belief.motion import FusionAge
-from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
 from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
-from perchctl.mission.descent import PEEL_TIMEOUT_S
-from perchctl.mission.phase import PRE_LANDING_PHASES, VehicleClaim
+from perchctl.mission.descent import PEEL_OFF_MAGNET_TIMEOUT_S
+from perchctl.mission.phase import PRE_LANDING_PHASES, VehicleDiagnosis
 from perchctl.mission.table import PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -66,7 +66,7 @@ from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint
 
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
-MIN_HANGING_HEIGHT_M, LOW_M = 1.5, 0.2
+MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, LOW_M = 1.5, 0.2
 # --- By what is known ---------------------------------------------------------------------
 
 # Profile; what is observed, and what is remembered, beyond a hover that all is known of; what is
@@ -75,7 +75,7 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
     "position": (DECKS, {}, {}, PositionSetpoint),
     "sight": (BY_TARGET, {"position_age_s": 0.05}, {}, PositionSetpoint),
     "onboard": (DECKS, {"link_problem": "gone"}, {}, Land),
-    "height": (DECKS, {}, {"heading_lost": True}, RawThrust),
+    "height": (DECKS, {}, {"is_heading_lost": True}, RawThrust),
     "imu": (BY_TARGET, {"position_age_s": 3.0}, {"dead_reckoning_since_s": NOW_S - 1.0}, RawThrust),
     "nothing": (
         BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"dead_reckoning_since_s": NOW_S - 1.0},
@@ -84,13 +84,16 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
 BEGUN: dict[str, tuple[dict[str, Any], type[Any]]] = {
-    "ordered": ({"stop_or_land_order_count": 1, "last_stop_or_land_order_at_s": NOW_S - 1.0}, Land),
-    "released": ({"release_began_s": NOW_S - 0.5}, RawThrust),
+    "ordered": (
+        {"stop_or_land_command_count": 1, "last_stop_or_land_command_at_s": NOW_S - 1.0},
+        Land,
+    ),
+    "released": ({"release_began_at_s": NOW_S - 0.5}, RawThrust),
     "stopped": (
         {
-            "motor_stop_ordered_at_s": NOW_S - 0.2,
-            "stop_or_land_order_count": 1,
-            "last_stop_or_land_order_at_s": NOW_S - 0.2,
+            "motor_stop_commanded_at_s": NOW_S - 0.2,
+            "stop_or_land_command_count": 1,
+            "last_stop_or_land_command_at_s": NOW_S - 0.2,
         },
         StopMotors,
     ),
@@ -111,15 +114,21 @@ def context(
     if changes.get("last_order_s") and profile is BY_TARGET:
         # What once had positions from outside, and was found astray, knows as little.
         profile, remembered = MOCAP, {"is_position_diverged": True}
-    z_m = z_m if z_m is not None else HANG_Z_M if held else MIN_HANGING_HEIGHT_M
+    z_m = (
+        z_m
+        if z_m is not None
+        else HANG_Z_M
+        if held
+        else MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
+    )
     observed = dict(observed)
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
-        t_s=NOW_S - TICK_S, last_telemetry=sample, reckoned_height_m=z_m,
+        t_s=NOW_S - TICK_S, last_telemetry=sample, dead_reckoned_height_m=z_m,
         vehicle_world_z_at_last_contact_m=z_m if held else None,
         in_magnet_reach_since_s=NOW_S - 2.0 if held else None,
-        reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
+        dead_reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
     obs = observation(NOW_S, telemetry=replace(sample, **(tel or {})), target=None, **observed)
@@ -163,16 +172,18 @@ def test_below_the_hand_over_it_lands_by_itself_or_level(known: str) -> None:
 def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     """By no landing of its own, whose trajectory ends while the magnet still holds. Deaf, nobody
     can watch what the weight does: it goes on by setpoints."""
-    assert is_setpoint(descent.act(context(known, True, since_s=PEEL_TIMEOUT_S - 0.1))[1])
-    state, command = descent.act(context(known, True, since_s=PEEL_TIMEOUT_S + 0.1))
+    assert is_setpoint(
+        descent.act(context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S - 0.1))[1]
+    )
+    state, command = descent.act(context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S + 0.1))
     assert isinstance(command, RawThrust)
-    assert state.release_began_s == NOW_S
+    assert state.release_began_at_s == NOW_S
     if known == "onboard":
         deaf, command = descent.act(
-            context(known, True, since_s=PEEL_TIMEOUT_S + 0.1, tel={"t_s": 8.0})
+            context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S + 0.1, tel={"t_s": 8.0})
         )
         assert is_setpoint(command, distance_below_m=HANG_Z_M)
-        assert deaf.release_began_s is None
+        assert deaf.release_began_at_s is None
 
 
 # --- What each part of it takes --------------------------------------------------------------
@@ -182,10 +193,14 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     """The kind of command that a way down gives a vehicle high up: setpoints by a position, its own
     landing where telemetry, link or loop are doubtful, else raw thrust."""
     began = remembering(
-        state_in(Phase.LANDING, NOW_S - 1.0, MIN_HANGING_HEIGHT_M), t_s=NOW_S - TICK_S, **state
+        state_in(Phase.LANDING, NOW_S - 1.0, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
+        t_s=NOW_S - TICK_S,
+        **state,
     )
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
-    obs = at(MIN_HANGING_HEIGHT_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
+    obs = at(
+        MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, age_s=age_s, obs=observed, behind_s=behind_s
+    )(NOW_S)
     return type(descent.act(Context(observing(began, obs, profile)))[1])
 
 
@@ -200,7 +215,7 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
             RawThrust,
         ),
         ({"has_estimated_position_jumped": True}, Land, RawThrust),
-        ({"loop_late_s": 0.5}, Land, RawThrust),
+        ({"tick_start_delay_s": 0.5}, Land, RawThrust),
         ({"link_problem": "gone"}, Land, RawThrust),
         ({"behind_s": 0.5}, Land, RawThrust),
         ({"age_s": 0.6}, Land, RawThrust),
@@ -265,7 +280,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     """By such positions a landing would speed up until it tilts over."""
     begin = remembering(
         state_in(Phase.ALIGN, NOW_S),
-        mounting=MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS),
+        mounting=MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS),
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
@@ -297,7 +312,7 @@ def test_a_way_down_that_is_spent_ends_without_a_lock(
         known,
         known == "onboard",
         phase=Phase.ABORTED,
-        claims=VehicleClaim.LANDING_UNCONFIRMED,
+        diagnosis=VehicleDiagnosis.LANDING_UNCONFIRMED,
         **changes,
     )
     _, command = PHASES[Phase.ABORTED].act(c)
@@ -313,7 +328,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
-        floor_detected_at_s=NOW_S - 0.5, thrust=half, reckoning=aside,
+        floor_detected_at_s=NOW_S - 0.5, thrust=half, dead_reckoning=aside,
     )  # fmt: skip
     state, command = descent.act(c)
     assert (state.descent.floor_detected_at_s is not None) is stands
@@ -326,7 +341,7 @@ def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, flo
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
     imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_at_s=NOW_S - 0.05)
     struck = DeadReckoning(imu=imu, climb_before_impact_mps=impact_mps)
-    c = context("imu", z_m=0.15, reckoning=struck)
+    c = context("imu", z_m=0.15, dead_reckoning=struck)
     c = Context(
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
     )
@@ -351,46 +366,48 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     wind_g=st.floats(-0.09, 0.09),
     heading_rad=st.floats(-3.1, 3.1),
     age_s=st.sampled_from([0.05, 2.0, 7.0]),
-    held_s=st.sampled_from([0.0, 1.0, 4.0, 30.0]),
+    true_for_s=st.sampled_from([0.0, 1.0, 4.0, 30.0]),
 )
 def test_level_is_against_the_wind_and_the_error_of_the_attitude(
-    wrong_rad: float, wind_g: float, heading_rad: float, age_s: float, held_s: float
+    wrong_rad: float, wind_g: float, heading_rad: float, age_s: float, true_for_s: float
 ) -> None:
     """An attitude that is 0.02 rad wrong makes 0.2 m/s of speed a second. In a wind the estimate
     takes for a tilt, both cancel, and the level that it reads is what stands against the wind. A
     position of less than 4 s has taught only a part of it; the rest is what pictures show."""
-    bias_mps2 = 9.81 * wrong_rad
+    acceleration_bias_mps2 = 9.81 * wrong_rad
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
-    reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoning(
         imu=imu,
-        bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
+        acceleration_bias_mps2=(acceleration_bias_mps2 * cos, acceleration_bias_mps2 * sin, 0.0),
         mean_specific_force_world_xy_mps2=(reads_mps2 * cos, reads_mps2 * sin),
-        time_under_position_control_s=held_s,
+        time_under_position_control_s=true_for_s,
     )
-    c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
-    felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
+    c = context("imu", dead_reckoning=dead_reckoning, tel={"yaw_rad": heading_rad})
+    felt = VisualInertialMotion(
+        NOW_S - age_s, (0.0, 0.0), dead_reckoning.acceleration_bias_mps2[:2], 0.0
+    )
     c = context_at(c.state, replace(c.obs, imu=imu, visual_inertial_motion=felt), c.profile)
     command = descent.act(c)[1]
     assert isinstance(command, RawThrust)
     assert command.roll_rad == pytest.approx(0.0, abs=1e-9)
-    known = min(1.0, held_s / 4.0)
+    known = min(1.0, true_for_s / 4.0)
     shown = max(0.0, 1.0 - age_s / 6.0)
     against_rad = math.atan((known + (1.0 - known) * shown) * wrong_rad - known * wind_g)
     assert command.pitch_rad == pytest.approx(against_rad, abs=1e-9)
 
 
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
-    c = context("imu", reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    c = context("imu", dead_reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
     state = observing(c.state, obs, c.profile)
-    assert state.belief.reckoning.velocity_mps[:2] == (0.3, 0.0)
+    assert state.belief.dead_reckoning.velocity_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
     moved = remembering(
-        state, reckoning=replace(state.belief.reckoning, velocity_mps=(0.1, 0.0, 0.0))
+        state, dead_reckoning=replace(state.belief.dead_reckoning, velocity_mps=(0.1, 0.0, 0.0))
     )
-    assert observing(moved, later, c.profile).belief.reckoning.velocity_mps[0] < 0.2
+    assert observing(moved, later, c.profile).belief.dead_reckoning.velocity_mps[0] < 0.2
 
 
 @pytest.mark.parametrize(("phase", "since_s", "is_there"), [
@@ -400,19 +417,17 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     phase: Phase, since_s: float, is_there: bool
 ) -> None:
     """Late pictures show it lower. On its way down the floor carries it, too."""
-    c = context(
-        "sight", phase=phase, condition_start_times_s={SUPPORT_SHOWN_BY_IMU: NOW_S - since_s}
-    )
-    reckoning = replace(c.state.belief.reckoning, gear_below_target_m=0.1)
-    state = observing(remembering(c.state, reckoning=reckoning), c.obs, c.profile)
-    assert (state.belief.reckoning.gear_below_target_m == 0.0) is is_there
+    c = context("sight", phase=phase, condition_start_times_s={IMU_SHOWS_SUPPORT: NOW_S - since_s})
+    dead_reckoning = replace(c.state.belief.dead_reckoning, gear_below_target_m=0.1)
+    state = observing(remembering(c.state, dead_reckoning=dead_reckoning), c.obs, c.profile)
+    assert (state.belief.dead_reckoning.gear_below_target_m == 0.0) is is_there
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
-    reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
-    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning)
+    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    c = context("imu", dead_reckoned_height_m=2.0, dead_reckoning=dead_reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
     obs = replace(
         c.obs,
@@ -421,11 +436,11 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     )
     obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
     state = observing(c.state, obs, c.profile)
-    assert state.belief.reckoning.velocity_mps[2] == pytest.approx(
+    assert state.belief.dead_reckoning.velocity_mps[2] == pytest.approx(
         -0.4 if later_s else -0.7, abs=0.05
     )
     state = remembering(
-        state, reckoning=replace(state.belief.reckoning, velocity_mps=(0.0, 0.0, -0.4))
+        state, dead_reckoning=replace(state.belief.dead_reckoning, velocity_mps=(0.0, 0.0, -0.4))
     )
     _, command = descent.act(context_at(state, obs, c.profile))
     assert isinstance(command, RawThrust)
@@ -436,8 +451,13 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
 def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -> None:
     """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
     at the speed that is meant for free air."""
-    reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S), velocity_mps=(0.0, 0.0, -0.4))
-    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning, is_position_diverged=diverged)
+    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S), velocity_mps=(0.0, 0.0, -0.4))
+    c = context(
+        "imu",
+        dead_reckoned_height_m=2.0,
+        dead_reckoning=dead_reckoning,
+        is_position_diverged=diverged,
+    )
     _, command = descent.act(c)
     assert isinstance(command, RawThrust)
     assert (command.thrust > 0.97 * HOVER_THRUST) is diverged
@@ -450,13 +470,16 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     before is none."""
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
-        state_in(Phase.LANDING, z_m=MIN_HANGING_HEIGHT_M),
-        last_telemetry=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_setpoint_above_vehicle_m=1.0,
-        condition_start_times_s={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
+        state_in(Phase.LANDING, z_m=MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
+        last_telemetry=telemetry(NOW_S, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
+        catch_setpoint_above_vehicle_m=1.0, condition_start_times_s={MOTORS_STOPPED: 0.0,
+        BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
-    obs = observation(later_s, telemetry=telemetry(later_s, MIN_HANGING_HEIGHT_M, **off))
+    obs = observation(
+        later_s, telemetry=telemetry(later_s, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, **off)
+    )
     after = observing(state, obs, profile)
     assert after.belief.condition_start_times_s[MOTORS_STOPPED] == (later_s if stale else 0.0)
     assert after.belief.condition_start_times_s[BATTERY_LOW] == 1.0
@@ -477,16 +500,16 @@ UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
 def ended(
     in_magnet_reach_since_s: float | None = None,
     imu: ImuMotion = UNMOVED,
-    reckoning: DeadReckoning = UNRECKONED,
+    dead_reckoning: DeadReckoning = UNRECKONED,
     floor_detected_at_s: float | None = None,
     **observed: Any,
 ) -> RestState:
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_ordered_at_s=NOW_S - 1.0,
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_commanded_at_s=NOW_S - 1.0,
         in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_at_s=floor_detected_at_s,
-        reckoning=replace(reckoning, imu=imu),
+        dead_reckoning=replace(dead_reckoning, imu=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, BY_TARGET))
 
@@ -529,9 +552,10 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
         return at(HANG_Z_M, obs=unseen, roll_rad=shakes_rad, **tel)(t_s)
 
     begun = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_order_count=6,
-        last_stop_or_land_order_at_s=BEGIN_S,
-        in_magnet_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(gear_below_target_m=0.0),
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_command_count=6,
+        last_stop_or_land_command_at_s=BEGIN_S,
+        in_magnet_reach_since_s=BEGIN_S - 1.0,
+        dead_reckoning=DeadReckoning(gear_below_target_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
     assert (state.belief.in_magnet_reach_since_s is not None) is (part < 1.0)
@@ -543,15 +567,15 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(last_gap_magnet_may_attach_ended_at_s=NOW_S - 3.0)
-    assert ended(in_magnet_reach_since_s, reckoning=silence) is RestState.UNKNOWN
+    silence = DeadReckoning(last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S - 3.0)
+    assert ended(in_magnet_reach_since_s, dead_reckoning=silence) is RestState.UNKNOWN
     assert (
-        ended(in_magnet_reach_since_s, reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
+        ended(in_magnet_reach_since_s, dead_reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
         is RestState.STANDS
     )
     seen = replace(silence, last_sighting_at_s=NOW_S - 2.5)
     told = RestState.STANDS if in_magnet_reach_since_s is None else RestState.HANGS
-    assert ended(in_magnet_reach_since_s, reckoning=seen) is told
+    assert ended(in_magnet_reach_since_s, dead_reckoning=seen) is told
 
 
 @pytest.mark.parametrize(
@@ -565,13 +589,13 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = remembering(
-        before, reckoning=DeadReckoning(UNMOVED, gear_below_target_m=gear_below_target_m)
+        before, dead_reckoning=DeadReckoning(UNMOVED, gear_below_target_m=gear_below_target_m)
     )
     entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = descent.enter_descent(
         context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
     )
-    assert new.motor_stop_ordered_at_s == NOW_S
+    assert new.motor_stop_commanded_at_s == NOW_S
     assert rest.find_rest_state(context_at(new, obs, BY_TARGET)) is RestState.HANGS
 
 
@@ -602,7 +626,7 @@ BIT = st.fixed_dictionaries(
                 {},
                 {"has_estimated_position_jumped": True},
                 {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5},
-                {"loop_late_s": 1.2},
+                {"tick_start_delay_s": 1.2},
                 {"link_problem": "gone"},
                 {"operator_request": OperatorRequest.LAND},
             ]
@@ -617,19 +641,19 @@ REMEMBERED = st.sampled_from(
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
-            "release_began_s": 9.9,
+            "release_began_at_s": 9.9,
         },
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
-            "release_began_s": 9.0,
-            "motor_stop_ordered_at_s": 9.8,
-            "stop_or_land_order_count": 2,
+            "release_began_at_s": 9.0,
+            "motor_stop_commanded_at_s": 9.8,
+            "stop_or_land_command_count": 2,
         },
         {"catch_setpoint_above_vehicle_m": 1.0},
         {"must_end_press": True},
         {"hover_thrust": 0.0},
-        {"dead_reckoning_since_s": 9.0, "reckoned_height_m": 1.0},
+        {"dead_reckoning_since_s": 9.0, "dead_reckoned_height_m": 1.0},
     ]
 )
 

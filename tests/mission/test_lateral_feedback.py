@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import CameraImuMismatch, Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
 from perchctl.mission.setpoints import LEAN_ACCELERATION_DAMPING_S2
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import (
@@ -283,7 +283,7 @@ def test_the_pictures_tell_whether_the_vehicle_has_settled(
 def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
     """Neither one whose mounting is wrong, nor one whose pictures disagree with the
     accelerometer."""
-    turned = MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS)
+    turned = MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)
     late = CameraImuMismatch(0.2, 0.0)
     for state, changes, known in (
         (ascending(), {}, True),

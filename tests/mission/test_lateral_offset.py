@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission.belief.lateral_offset import (
-    MAX_PICTURE_GAP_S,
-    MAX_SIGMA_OF_USED_VELOCITY_MPS,
+    MAX_AGE_OF_NEWEST_PICTURE_S,
+    MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS,
     LateralOffset,
     LateralOffsetFilter,
     LateralVector,
@@ -68,7 +68,9 @@ def watch(
             if exposure_s <= last_picture_s:
                 x_m, y_m = motion(exposure_s)[0]
                 n_x, n_y = rng.normal(0.0, sigma_m, 2) if sigma_m else (0.0, 0.0)
-                filtered = filtered.with_picture(exposure_s, (x_m + n_x, y_m + n_y), sigma_m)
+                filtered = filtered.with_picture_measurement(
+                    exposure_s, (x_m + n_x, y_m + n_y), sigma_m
+                )
     return filtered
 
 
@@ -144,23 +146,23 @@ def test_the_spread_grows_until_the_estimate_is_unknown() -> None:
     spreads = [known(filtered, 1.5 + t_s).sigma_m for t_s in np.linspace(0.0, 0.48, 10)]
     assert spreads == sorted(spreads)
     assert spreads[-1] > 2.0 * spreads[0]
-    assert filtered.predict(1.5 + MAX_PICTURE_GAP_S + PICTURE_S) is None
+    assert filtered.predict(1.5 + MAX_AGE_OF_NEWEST_PICTURE_S + PICTURE_S) is None
     assert filtered.predict(0.5) is None
 
 
 def test_nothing_is_known_before_the_pictures_show_a_velocity() -> None:
     assert LateralOffsetFilter().predict(0.0) is None
-    one = LateralOffsetFilter().with_picture(1.0, (0.0, 0.0), 0.001)
+    one = LateralOffsetFilter().with_picture_measurement(1.0, (0.0, 0.0), 0.001)
     assert one.predict(1.0) is None
     with_more = watch(swaying(0.005, 1.7, 0.0), 0.5)
-    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_SIGMA_OF_USED_VELOCITY_MPS
+    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS
 
 
 def test_a_step_of_the_pose_is_no_velocity() -> None:
     """A pose that jumps by 5 cm, and stays there: the velocity starts again from rest."""
     filtered = watch(swaying(0.002, 2.0, 0.0), 1.0)
     t_s = filtered.t_s + PICTURE_S
-    jumped = filtered.with_picture(t_s, (0.05, 0.0), 0.001)
+    jumped = filtered.with_picture_measurement(t_s, (0.05, 0.0), 0.001)
     assert jumped.offset_m == (0.05, 0.0)
     assert jumped.velocity_mps == (0.0, 0.0)
     assert jumped.predict(t_s) is None
@@ -168,7 +170,7 @@ def test_a_step_of_the_pose_is_no_velocity() -> None:
 
 def test_a_picture_or_sample_from_the_past_changes_nothing() -> None:
     filtered = watch(swaying(0.005, 1.7, 0.0), 1.0)
-    assert filtered.with_picture(filtered.t_s, (1.0, 1.0), 0.001) is filtered
+    assert filtered.with_picture_measurement(filtered.t_s, (1.0, 1.0), 0.001) is filtered
     assert filtered.with_sample(MotionSample(1.0, (9.0, 9.0), (9.0, 9.0))) is filtered
 
 

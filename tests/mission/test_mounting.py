@@ -17,7 +17,7 @@ from perchctl.mission.belief.mounting import (
     MountingMonitor,
     MountingSample,
     make_mounting_sample,
-    update_monitor,
+    update_mounting_monitor,
 )
 from perchctl.vehicle import Command, PositionSetpoint
 from tests.helpers.mission import CEILING_M, remembering, state_in, target_at, telemetry
@@ -46,7 +46,7 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = update_monitor(watch, MountingSample(t_s, p, spoiled))
+        watch = update_mounting_monitor(watch, MountingSample(t_s, p, spoiled))
     return watch, moved_m
 
 
@@ -69,7 +69,9 @@ def _tilting(deg: float) -> MountingMonitor:
     for i in range(120):
         t_s = i * FRAME_S
         lean = reach_m * complex(math.sin(4.0 * t_s), 0.8 * math.sin(5.0 * t_s + 1.0))
-        watch = update_monitor(watch, MountingSample(t_s, 0j, turned(deg)(t_s, lean), lean))
+        watch = update_mounting_monitor(
+            watch, MountingSample(t_s, 0j, turned(deg)(t_s, lean), lean)
+        )
     return watch
 
 
@@ -96,7 +98,7 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(contradictions=9, camera_yaw_error_rad=math.pi / 2)
+    watch = MountingMonitor(contradicting_sighting_count=9, camera_yaw_error_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
     assert flight.state.row_name == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
@@ -129,7 +131,9 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
     watch = MountingMonitor()
     for i in range(900):
         shift = frame_shift_m(i)
-        watch = update_monitor(watch, MountingSample(i * FRAME_S, complex(shift), TARGET + shift))
+        watch = update_mounting_monitor(
+            watch, MountingSample(i * FRAME_S, complex(shift), TARGET + shift)
+        )
         assert not watch.is_camera_mounting_wrong
 
 

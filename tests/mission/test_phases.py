@@ -39,8 +39,8 @@ def test_what_the_camera_steers_and_what_flies_in_the_open_is_declared_once() ->
     assert {
         p for p, each in PHASES.items() if each.maneuver.is_camera_guided
     } == CAMERA_GUIDED_PHASES
-    assert {p for p, each in PHASES.items() if each.maneuver.in_free_air} == FREE_AIR_PHASES
-    assert {p for p, each in PHASES.items() if each.maneuver.descends} == {Phase.LANDING}
+    assert {p for p, each in PHASES.items() if each.maneuver.is_in_free_air} == FREE_AIR_PHASES
+    assert {p for p, each in PHASES.items() if each.maneuver.descends_to_floor} == {Phase.LANDING}
 
 
 def test_the_sets_are_those_of_the_paper_s_phases() -> None:

@@ -13,7 +13,7 @@ from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import current_gear_offset
 from perchctl.mission.belief.quality import MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.descent import MIN_LANDING_ORDERS
+from perchctl.mission.descent import MIN_LANDING_COMMANDS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -192,7 +192,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
     drift_mps: float,
 ) -> None:
     """To thrust again for a slide of the estimate would take a vehicle off its magnet."""
-    begin = at_the_magnet(release_began_s=BEGIN_S)
+    begin = at_the_magnet(release_began_at_s=BEGIN_S)
     flight = fly(begin, Hangs(drift_mps), 12.0, MOCAP, feels=True)
     assert flight.state.phase is Phase.PERCHED
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
@@ -203,7 +203,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
 def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     carries: float, drift_mps: float
 ) -> None:
-    it, begin = Hangs(drift_mps, carries), at_the_magnet(release_began_s=BEGIN_S)
+    it, begin = Hangs(drift_mps, carries), at_the_magnet(release_began_at_s=BEGIN_S)
     flight = fly(begin, it, 4.0, MOCAP, feels=True, one_phase=True)
     assert not flight.stops_s
     assert it.fell_s is not None
@@ -212,9 +212,9 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
 
 
 STOPPED: dict[str, Any] = {
-    "motor_stop_ordered_at_s": BEGIN_S - 1.0,
-    "release_began_s": BEGIN_S - 3.0,
-    "stop_or_land_order_count": 5,
+    "motor_stop_commanded_at_s": BEGIN_S - 1.0,
+    "release_began_at_s": BEGIN_S - 3.0,
+    "stop_or_land_command_count": 5,
 }
 
 
@@ -254,8 +254,9 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
         state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, vehicle_world_z_at_last_contact_m=0.6,
-        release_began_s=9.0,
-        motor_stop_ordered_at_s=9.9, position_last_stale_at_s=BEGIN_S, in_magnet_reach_since_s=8.0,
+        release_began_at_s=9.0,
+        motor_stop_commanded_at_s=9.9, position_last_stale_at_s=BEGIN_S,
+        in_magnet_reach_since_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -327,9 +328,9 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.belief.reckoning.position_step_sum_xy_m) == pytest.approx(
-        sigma_m, abs=1e-3
-    )
+    assert math.hypot(
+        *flight.state.belief.dead_reckoning.unexplained_position_step_sum_xy_m
+    ) == pytest.approx(sigma_m, abs=1e-3)
     assert current_gear_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
@@ -498,14 +499,15 @@ def gains_beside(
     felt = Felt()
     begun = felt(at()(BEGIN_S))
     state = remembering(
-        state, last_telemetry=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu)
+        state, last_telemetry=begun.telemetry, dead_reckoning=DeadReckoning(imu=begun.imu)
     )
     for t_s in times(lasts_s):
         if not state.belief.is_position_diverged:
             beside = replace(
-                state.belief.reckoning, lateral_velocity_unseen_by_imu_mps=(0.0, estimate_only_mps)
+                state.belief.dead_reckoning,
+                lateral_velocity_unseen_by_imu_mps=(0.0, estimate_only_mps),
             )
-            state = remembering(state, reckoning=beside)
+            state = remembering(state, dead_reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
         obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
         state, command = step_mission(state, felt(obs), MOCAP)
@@ -522,8 +524,8 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(
         state_in(Phase.LANDING),
-        stop_or_land_order_count=MIN_LANDING_ORDERS,
-        last_stop_or_land_order_at_s=BEGIN_S,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS,
+        last_stop_or_land_command_at_s=BEGIN_S,
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.is_position_diverged is (
@@ -537,4 +539,4 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
     not, and what is reckoned by it would brake a speed that is none."""
     state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
     assert state.row_name == "position-astray"
-    assert abs(state.belief.reckoning.velocity_mps[1]) < 0.15
+    assert abs(state.belief.dead_reckoning.velocity_mps[1]) < 0.15

@@ -22,7 +22,7 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
 from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
@@ -153,7 +153,7 @@ CASES: dict[str, Case] = {
     "hung-but-locked": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
         O.PERCHED, state={
-            "motor_stop_ordered_at_s": BEGIN_S,
+            "motor_stop_commanded_at_s": BEGIN_S,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
         },
         z_m=CONTACT_Z_M,
@@ -193,7 +193,8 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mounting": MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS)},
+        state={"mounting":
+        MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -201,14 +202,14 @@ CASES: dict[str, Case] = {
     "camera-gone": Case(
         P.ALIGN, P.LANDING, seen(last_good_frame_age_s=4.0, has_new_frame=False), 0.1, O.SAFETY
     ),
-    "loop-late": Case(P.ALIGN, P.LANDING, seen(loop_late_s=1.2), 0.1, O.SAFETY),
+    "loop-late": Case(P.ALIGN, P.LANDING, seen(tick_start_delay_s=1.2), 0.1, O.SAFETY),
     "markers-disagree": Case(P.ALIGN, P.LANDING, seen(successive_marker_conflicts=40), 0.1,
         O.SAFETY),
     "log-lost": Case(
         P.ALIGN, P.LANDING, seen(flight_log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
     ),
     "time-over": Case(
-        P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"started_s": -1000.0}
+        P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"flight_started_at_s": -1000.0}
     ),
     "caught": Case(
         P.PERCH, P.COMPLETE, at(CONTACT_Z_M - 0.03, thrust=QUIET), 1.2, z_m=CONTACT_Z_M - 0.03
@@ -237,7 +238,7 @@ CASES: dict[str, Case] = {
     ),
     "too-weak": Case(
         P.SEARCH, P.LANDING, blind(at(thrust=FULL)), 2.3, O.SAFETY,
-        state={"search_step_began_s": BEGIN_S + 9.0},
+        state={"search_step_began_at_s": BEGIN_S + 9.0},
     ),
     "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
     "approach-timeout": Case(
@@ -245,7 +246,7 @@ CASES: dict[str, Case] = {
     ),
     "found": Case(P.SEARCH, P.ESTIMATE, seen(), 0.2),
     "searched-out": Case(
-        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searched_positions": 6}
+        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searched_position_count": 6}
     ),
     "estimate-lost": Case(P.ESTIMATE, P.SEARCH, unseen(), 1.2),
     "estimated": Case(P.ESTIMATE, P.ALIGN, seen(), 0.6),
@@ -295,7 +296,7 @@ CASES: dict[str, Case] = {
     "perched": Case(
         P.COMPLETE, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
         state={
-            "motor_stop_ordered_at_s": BEGIN_S - 3.0,
+            "motor_stop_commanded_at_s": BEGIN_S - 3.0,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
         },
         z_m=CONTACT_Z_M,
@@ -303,14 +304,14 @@ CASES: dict[str, Case] = {
     "fell-unseen": Case(
         P.COMPLETE, P.LANDING, at(0.02, **OFF), 0.3, O.SAFETY,
         state={
-            "motor_stop_ordered_at_s": BEGIN_S - 3.0,
+            "motor_stop_commanded_at_s": BEGIN_S - 3.0,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
         },
         z_m=CONTACT_Z_M,
     ),
     "not-stopped": Case(
         P.COMPLETE, P.LANDING, at(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
-        state={"motor_stop_ordered_at_s": BEGIN_S - 12.0, "stop_or_land_order_count": 5,
+        state={"motor_stop_commanded_at_s": BEGIN_S - 12.0, "stop_or_land_command_count": 5,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
@@ -329,24 +330,24 @@ CASES: dict[str, Case] = {
     "sunk": Case(P.HOVER, P.ASCEND, seen(0.9), 0.5, profile=HOVERING),
     "hung": Case(
         P.LANDING, P.PERCHED, at(CONTACT_Z_M, **OFF), 0.3, O.ENDED_BY_OPERATOR,
-        state={"outcome": O.ENDED_BY_OPERATOR, "motor_stop_ordered_at_s": BEGIN_S,
+        state={"outcome": O.ENDED_BY_OPERATOR, "motor_stop_commanded_at_s": BEGIN_S,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "landed": Case(
         P.LANDING, P.LANDED, at(0.02, **OFF), 0.3, O.ENDED_BY_OPERATOR,
-        state={"outcome": O.ENDED_BY_OPERATOR, "stop_or_land_order_count": 1}, z_m=0.02,
+        state={"outcome": O.ENDED_BY_OPERATOR, "stop_or_land_command_count": 1}, z_m=0.02,
     ),
     "held-elsewhere": Case(
         P.LANDING, P.ABORTED, at(CONTACT_Z_M - 0.2, **OFF), 0.3, O.SAFETY,
-        state={"outcome": O.SAFETY, "motor_stop_ordered_at_s": BEGIN_S, "row": "held",
+        state={"outcome": O.SAFETY, "motor_stop_commanded_at_s": BEGIN_S, "row": "held",
             "entered_s": BEGIN_S},
         z_m=CONTACT_Z_M - 0.2,
     ),
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
-            "outcome": O.SAFETY, "motor_stop_ordered_at_s": BEGIN_S,
+            "outcome": O.SAFETY, "motor_stop_commanded_at_s": BEGIN_S,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
             "in_magnet_reach_since_s": BEGIN_S - 1.0,
         },
@@ -354,8 +355,8 @@ CASES: dict[str, Case] = {
     ),
     "landing-timeout": Case(
         P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,
-        state={"entered_s": -40.0, "stop_or_land_order_count": 1,
-            "last_stop_or_land_order_at_s": BEGIN_S},
+        state={"entered_s": -40.0, "stop_or_land_command_count": 1,
+            "last_stop_or_land_command_at_s": BEGIN_S},
     ),
 }  # fmt: skip
 
@@ -380,7 +381,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     """It hangs, but nobody has seen whether it hangs on the target: its outcome is that of what led
     to the landing."""
     state = remembering(
-        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), motor_stop_ordered_at_s=BEGIN_S - 1.0,
+        state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), motor_stop_commanded_at_s=BEGIN_S - 1.0,
         vehicle_world_z_at_last_contact_m=CONTACT_Z_M, outcome=O.ENDED_BY_OPERATOR,
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
@@ -417,7 +418,7 @@ ROGUE = Transition(
 
 def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
-    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, stop_or_land_order_count=1)
+    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, stop_or_land_command_count=1)
     context = context_at(landing, observation(BEGIN_S), PROFILE)
     assert first_transition(context, (ROGUE,)) is None
     flying = context_at(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
@@ -490,12 +491,12 @@ def test_a_row_of_your_own_waits_in_the_alignment() -> None:
         waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
     assert (waiting.phase, waiting.pause_reason, waiting.hold_reason) == (P.ALIGN, "mine", "")
     assert isinstance(command, PositionSetpoint)
-    assert waiting.waited_in_phase_s == 39.0 > PROFILE.planner.align.timeout_s
+    assert waiting.total_wait_in_phase_s == 39.0 > PROFILE.planner.align.timeout_s
     after, _ = planner.step_mission(waiting, observation(50.0), PROFILE, table)
     assert (after.phase, after.pause_reason) == (P.ALIGN, "")  # it has yet to stay aligned
     for tick in range(1, 25):
         after, _ = planner.step_mission(after, observation(50.0 + TICK_S * tick), PROFILE, table)
-    assert (after.phase, after.pause_reason, after.waited_in_phase_s) == (P.ASCEND, "", 0.0)
+    assert (after.phase, after.pause_reason, after.total_wait_in_phase_s) == (P.ASCEND, "", 0.0)
     lost = observation(11.0, target=None)
     assert planner.step_mission(state, lost, PROFILE, table)[0].phase is P.SEARCH
     stopped = observation(11.0, operator_request=OperatorRequest.LAND)

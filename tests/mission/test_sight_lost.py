@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.belief import (
-    MAX_POSITION_AGE_BEYOND_LATENCY_S,
+    MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S,
     MIN_SPEED_GAINED_IN_GUST_MPS,
 )
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import (
     BRAKE_GAIN_RAD_PER_MPS,
     MAX_BRAKE_TILT_RAD,
-    SINK_SETPOINT_MPS,
+    SINK_RATE_SETPOINT_MPS,
 )
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import MAX_SPEED_USED_FOR_BRAKING_MPS, ONBOARD_POSITION_GAIN_PER_S
-from perchctl.mission.setpoints import MIN_HOLD_HEIGHT_M
+from perchctl.mission.release import MAX_BRAKED_LATERAL_SPEED_MPS, ONBOARD_POSITION_GAIN_PER_S
+from perchctl.mission.setpoints import MIN_HELD_SETPOINT_HEIGHT_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
 from tests.helpers.mission import (
@@ -65,10 +65,10 @@ def blinded(
     z_m: float, velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes: object
 ) -> PlannerState:
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
-    reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
+    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
     state = remembering(
-        state_in(Phase.LANDING, z_m=z_m), dead_reckoning_since_s=BEGIN_S, reckoned_height_m=z_m,
-        severity=Severity.LAND, reckoning=reckoning,
+        state_in(Phase.LANDING, z_m=z_m), dead_reckoning_since_s=BEGIN_S,
+        dead_reckoned_height_m=z_m, severity=Severity.LAND, dead_reckoning=dead_reckoning,
     )  # fmt: skip
     return remembering(state, **changes)  # type: ignore[arg-type]
 
@@ -117,17 +117,21 @@ def test_what_sightings_contradict_is_not_flown_by(
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
-    state = remembering(state_in(phase, z_m=z_m), searched_positions=2, search_step_began_s=0.0)
+    state = remembering(
+        state_in(phase, z_m=z_m), searched_position_count=2, search_step_began_at_s=0.0
+    )
     after = fly(state, unseen(z_m, for_s=max(age_s, HOLD_S + 0.01)), profile=PROFILE).state
     assert after.setpoint is None or after.setpoint.z_m <= z_m
 
 
 def test_sinking_ends_above_the_floor() -> None:
     state = lost(
-        state_in(Phase.ALIGN, z_m=MIN_HOLD_HEIGHT_M + 0.05), LAND_S - 0.1, MIN_HOLD_HEIGHT_M + 0.05
+        state_in(Phase.ALIGN, z_m=MIN_HELD_SETPOINT_HEIGHT_M + 0.05),
+        LAND_S - 0.1,
+        MIN_HELD_SETPOINT_HEIGHT_M + 0.05,
     ).state
     assert state.setpoint is not None
-    assert state.setpoint.z_m == pytest.approx(MIN_HOLD_HEIGHT_M)
+    assert state.setpoint.z_m == pytest.approx(MIN_HELD_SETPOINT_HEIGHT_M)
 
 
 @given(
@@ -144,7 +148,9 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     assume(math.hypot(vx_mps, vy_mps) > 0.1)
     sinks = {"velocity_mps": (0.0, 0.0, -0.5), "yaw_rad": yaw_rad}
     look = at(obs={"position_age_s": age_s}, **sinks)
-    command = fly(blinded(1.0, (vx_mps, vy_mps, -SINK_SETPOINT_MPS)), look, profile=PROFILE).command
+    command = fly(
+        blinded(1.0, (vx_mps, vy_mps, -SINK_RATE_SETPOINT_MPS)), look, profile=PROFILE
+    ).command
     assert isinstance(command, RawThrust)
     # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
     ahead, left = command.pitch_rad, -command.roll_rad
@@ -175,7 +181,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
     assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_SPEED_GAINED_IN_GUST_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.row_name == "position-lost"
-        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_POSITION_AGE_BEYOND_LATENCY_S
+        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3
@@ -217,9 +223,9 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
         state_in(Phase.LANDING, z_m=1.9), vehicle_world_z_at_last_contact_m=1.9,
-        release_began_s=BEGIN_S - 1.0,
+        release_began_at_s=BEGIN_S - 1.0,
         in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
-        reckoning=DeadReckoning(
+        dead_reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
             lateral_velocity_unseen_by_estimate_mps=(x_mps, y_mps),
         ),
@@ -231,9 +237,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     assert isinstance(command, PositionSetpoint)
     if unknown_mps > MIN_SPEED_GAINED_IN_GUST_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
-            braked_mps = max(
-                -MAX_SPEED_USED_FOR_BRAKING_MPS, min(MAX_SPEED_USED_FOR_BRAKING_MPS, mps)
-            )
+            braked_mps = max(-MAX_BRAKED_LATERAL_SPEED_MPS, min(MAX_BRAKED_LATERAL_SPEED_MPS, mps))
             assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)
     else:
         assert (command.x_m, command.y_m) == (0.0, 0.0)
@@ -244,7 +248,7 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
     speed_mps: float, blind: bool
 ) -> None:
     """Blind by the felt speed, whatever the estimate says; without a heading by the estimate's."""
-    state = blinded(1.0, (0.0, 0.0, speed_mps)) if blind else heading_lost()
+    state = blinded(1.0, (0.0, 0.0, speed_mps)) if blind else is_heading_lost()
     look = unseen(1.0, for_s=2.0) if blind else at()
     estimated_mps = 0.5 if blind else speed_mps
 
@@ -255,8 +259,8 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
 
     command = fly(state, sinks, profile=PROFILE if blind else DECKS).command
     assert isinstance(command, RawThrust)
-    beside = abs(speed_mps + SINK_SETPOINT_MPS) < 0.02
-    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_SETPOINT_MPS)
+    beside = abs(speed_mps + SINK_RATE_SETPOINT_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_RATE_SETPOINT_MPS)
     assert command.thrust <= 60000  # more is clipped
     assert blind or (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
 
@@ -323,8 +327,8 @@ def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
 # --- Without a heading: level, on the vertical speed alone ----------------------------------------
 
 
-def heading_lost() -> PlannerState:
-    return remembering(state_in(Phase.LANDING), heading_lost=True)
+def is_heading_lost() -> PlannerState:
+    return remembering(state_in(Phase.LANDING), is_heading_lost=True)
 
 
 def test_what_does_not_sink_gets_less_until_the_floor_proves_itself() -> None:
@@ -332,7 +336,7 @@ def test_what_does_not_sink_gets_less_until_the_floor_proves_itself() -> None:
         def look(self, t_s: float, state: PlannerState) -> Observation:
             return at(0.05, thrust=self.thrust)(t_s)
 
-    flight = fly(heading_lost(), OnTheFloor(HOVER_THRUST), 4.0, DECKS)
+    flight = fly(is_heading_lost(), OnTheFloor(HOVER_THRUST), 4.0, DECKS)
     stopped = next(i for i, c in enumerate(flight.commands) if isinstance(c, StopMotors))
     thrusts = [c.thrust for c in flight.commands[:stopped] if isinstance(c, RawThrust)]
     assert len(thrusts) == stopped

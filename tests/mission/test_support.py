@@ -23,7 +23,7 @@ from tests.helpers.mission import (
 
 T_S = 10.0
 LOW_THRUST = 0.4 * HOVER_THRUST
-ORDER = [Support.MAGNET, Support.UNKNOWN, Support.HELD_BY_OTHER]
+ORDER = [Support.MAGNET, Support.UNKNOWN, Support.HELD_BY_OTHER_OBJECT]
 """The farther from the magnet, the later."""
 heights_m = st.floats(-0.05, 0.0)
 angles_rad = st.floats(-math.pi, math.pi)
@@ -65,12 +65,12 @@ def test_an_offset_in_doubt_is_neither_the_magnet_nor_something_else(angle_rad: 
     assert supported(hanging(0.5 * radius_m, angle_rad)) is Support.MAGNET
     assert supported(hanging(0.9 * radius_m, angle_rad, sigma_m=0.01)) is Support.UNKNOWN
     assert supported(hanging(1.1 * radius_m, angle_rad, sigma_m=0.01)) is Support.UNKNOWN
-    assert supported(hanging(3.0 * radius_m, angle_rad)) is Support.HELD_BY_OTHER
+    assert supported(hanging(3.0 * radius_m, angle_rad)) is Support.HELD_BY_OTHER_OBJECT
 
 
 @given(below_m=st.floats(0.15, 0.6))
 def test_what_holds_it_below_the_target_is_something_else(below_m: float) -> None:
-    assert supported(hanging(0.0, below_m=below_m)) is Support.HELD_BY_OTHER
+    assert supported(hanging(0.0, below_m=below_m)) is Support.HELD_BY_OTHER_OBJECT
 
 
 @given(above_m=st.floats(0.15, 0.4), angle_rad=angles_rad)
@@ -81,7 +81,7 @@ def test_what_holds_it_at_an_impossible_height_may_be_the_target(
     offset from the axis still counts."""
     radius_m = PROFILE.planner.perch.contact_xy_m
     assert supported(hanging(0.5 * radius_m, angle_rad, -above_m)) is Support.UNKNOWN
-    assert supported(hanging(3.0 * radius_m, angle_rad, -above_m)) is Support.HELD_BY_OTHER
+    assert supported(hanging(3.0 * radius_m, angle_rad, -above_m)) is Support.HELD_BY_OTHER_OBJECT
 
 
 @given(ratio=st.floats(0.97, 1.03), offset_m=st.floats(0.0, 0.2))

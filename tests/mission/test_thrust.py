@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
-from perchctl.mission.belief.contact import MAGNET_HOLDS, SATURATED_THRUST
+from perchctl.mission.belief.contact import MAGNET_HOLDS_VEHICLE, THRUST_SATURATED_WITHOUT_CLIMB
 from perchctl.mission.phase import PRE_LANDING_PHASES
-from perchctl.mission.setpoints import GROUND_CLEARANCE_M, limit_setpoint
+from perchctl.mission.setpoints import MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M, limit_setpoint
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
@@ -70,7 +70,7 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
         state_in(Phase.COMPLETE), hover_thrust=hover, vehicle_world_z_at_last_contact_m=CONTACT_Z_M
     )
     c = context_at(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
-    assert MAGNET_HOLDS.holds(c.belief) is holds
+    assert MAGNET_HOLDS_VEHICLE.predicate(c.belief) is holds
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
 
 
 @pytest.mark.parametrize(
-    ("raw_thrust_order", "reads", "known"),
+    ("commanded_raw_thrust", "reads", "known"),
     [
         (1000, 20000.0, False),  # stands still where it was before the order
         (1000, 0.0, True),
@@ -142,24 +142,24 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     ],
 )
 def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
-    raw_thrust_order: int | None, reads: float, known: bool
+    commanded_raw_thrust: int | None, reads: float, known: bool
 ) -> None:
     """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
     state = remembering(
-        state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_thrust_order=raw_thrust_order,
-        release_began_s=9.5,
-        setpoint=None if raw_thrust_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
+        state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), commanded_raw_thrust=commanded_raw_thrust,
+        release_began_at_s=9.5,
+        setpoint=None if commanded_raw_thrust else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
     for t_s in times(0.38):
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
         state = replace(observing(state, obs, PROFILE), t_s=t_s)
     b = state.belief
-    assert b.is_thrust_known is MAGNET_HOLDS.holds(b) is known
+    assert b.is_thrust_known is MAGNET_HOLDS_VEHICLE.predicate(b) is known
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
     """A vehicle that touches something with all its thrust, seen by a late turn."""
-    late = {"target": None, "has_new_frame": False, "loop_late_s": late_s}
+    late = {"target": None, "has_new_frame": False, "tick_start_delay_s": late_s}
     return at(CONTACT_Z_M, obs=late, thrust=float(FULL_THRUST))(t_s)
 
 
@@ -174,7 +174,7 @@ def test_a_press_ends_before_the_turn_that_would_be_too_late(late_s: float) -> N
 def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     """Late turns hold a vehicle in place: by the press's own setpoint they would press on."""
     t_s = 10.1 + PROFILE.planner.perch.timeout_s
-    saturated = {SATURATED_THRUST: 10.5}
+    saturated = {THRUST_SATURATED_WITHOUT_CLIMB: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
     state = remembering(
         above, condition_start_times_s=saturated, catch_setpoint_above_vehicle_m=None
@@ -199,7 +199,7 @@ GROUND_Z_M = 0.4
 def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = remembering(state_in(phase), takeoff_position_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
-    lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else GROUND_CLEARANCE_M)
+    lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M)
     sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
@@ -227,7 +227,7 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     below = target_at(BEGIN_S, (0.0, 0.0, -1.0), tracked=False, measured=False)
     it = Follows(1.0, target=below)
     fly(state_in(phase), it, 8.0)
-    assert min(it.sent_m) >= GROUND_CLEARANCE_M
+    assert min(it.sent_m) >= MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M
 
 
 @pytest.mark.parametrize("handover_m", [0.1, pytest.param(0.3, marks=pytest.mark.long)])
@@ -237,5 +237,5 @@ def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     it = Follows(0.1, operator_request=OperatorRequest.LAND)
     flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
     ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
-    assert flight.ticks[ordered].state.stop_or_land_order_count == 1
-    assert GROUND_CLEARANCE_M <= it.sent_m[ordered] < handover_m
+    assert flight.ticks[ordered].state.stop_or_land_command_count == 1
+    assert MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M <= it.sent_m[ordered] < handover_m

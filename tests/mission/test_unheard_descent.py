@@ -71,10 +71,10 @@ def test_a_step_of_the_pose_is_no_motion(
     """As when the small marker takes over from the large one."""
     before = watched((0.0, 0.0, 1.0), velocity_mps, 30.0)
     t_s = before.t_s + 1 / 30
-    stepped = np.add(before.target_from_gear_m, (0.0, 0.0, step_m))
+    stepped = np.add(before.gear_to_target_vector_m, (0.0, 0.0, step_m))
     after = before.with_detection(replace(target_at(t_s), e_m=stepped))
     assert after.vehicle_velocity_mps == before.vehicle_velocity_mps
-    assert after.target_from_gear_m == pytest.approx(tuple(stepped))
+    assert after.gear_to_target_vector_m == pytest.approx(tuple(stepped))
 
 
 def test_after_a_gap_the_motion_has_to_be_seen_again() -> None:

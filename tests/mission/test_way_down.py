@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import CONTACT, MOTORS_OFF_DWELL_S
 from perchctl.mission.descent import (
-    MAX_HEIGHT_ESTIMATE_DRIFT_M,
-    ONBOARD_LANDING_MARGIN_S,
-    ONBOARD_LANDING_MEAN_MPS,
-    make_onboard_landing,
+    MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M,
+    ONBOARD_LANDING_DURATION_MARGIN_S,
+    ONBOARD_LANDING_MEAN_SPEED_MPS,
+    make_onboard_landing_command,
 )
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import EXTRA_HANG_IF_THRUST_UNCONFIRMED_S
+from perchctl.mission.release import EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S
 from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
@@ -102,8 +102,8 @@ BITS = st.tuples(
 STATES: tuple[dict[str, Any], ...] = (
     {},
     {"vehicle_world_z_at_last_contact_m": HANG_Z_M},
-    {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 9.9},
-    {"stop_or_land_order_count": 2, "last_stop_or_land_order_at_s": 9.9},
+    {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 9.9},
+    {"stop_or_land_command_count": 2, "last_stop_or_land_command_at_s": 9.9},
     {"hover_thrust": 0.0},
 )
 
@@ -141,7 +141,7 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     hang_s = PROFILE.planner.complete.hang_s
     recent, longer = (
         _was_fresh(seen, hang_s),
-        _was_fresh(seen, hang_s + EXTRA_HANG_IF_THRUST_UNCONFIRMED_S),
+        _was_fresh(seen, hang_s + EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S),
     )
     if longer is not None and all(_at_rest(o) for o in longer):
         return True
@@ -160,7 +160,7 @@ def motors_off(seen: list[Observation]) -> bool:
 @settings(max_examples=400)
 @example(
     bits=[(8, 0.02, 0.0, 1.0, 0.0, 0.01)],
-    begin={"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_s": 9.9},
+    begin={"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 9.9},
     doubt={},
     flying=False,
 )
@@ -172,7 +172,7 @@ def motors_off(seen: list[Observation]) -> bool:
             {},
             {"has_estimated_position_jumped": True},
             {"link_problem": "gone"},
-            {"loop_late_s": 0.5},
+            {"tick_start_delay_s": 0.5},
         ]
     ),
     flying=st.booleans(),
@@ -197,8 +197,8 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
                 floor = on_the_floor(
                     seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
                 )
-                ceiling = (begin or state.release_began_s) and on_the_ceiling(seen)
-                assert floor or ceiling or (state.release_began_s and motors_off(seen))
+                ceiling = (begin or state.release_began_at_s) and on_the_ceiling(seen)
+                assert floor or ceiling or (state.release_began_at_s and motors_off(seen))
                 return
             if state.phase is not Phase.LANDING:
                 return
@@ -233,7 +233,7 @@ def test_motors_that_are_off_despite_an_order_are_stopped_before_the_flight_ends
     """The supervisor ends a flight whose motors idle, and soon lets them turn by the last order
     again: seed 20731163 ended with raw thrust as its last order, and a motor turned 5 s later."""
     idles = at(z_m, acc_z_g=1.15, **OFF)
-    ticks = fly(hanging(raw_thrust_order=1000, release_began_s=BEGIN_S), idles, 3.0).ticks
+    ticks = fly(hanging(commanded_raw_thrust=1000, release_began_at_s=BEGIN_S), idles, 3.0).ticks
     assert ticks[-1].state.phase is ends
     orders = [tick.command for tick in ticks if not isinstance(tick.command, Idle)]
     assert isinstance(orders[-1], StopMotors)
@@ -265,7 +265,7 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
     """Its own landing ended up there, motors off."""
     z_m = HANG_Z_M - distance_below_m
     target = target_at(BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
-    begin = landing(z_m, stop_or_land_order_count=3, last_stop_or_land_order_at_s=9.9)
+    begin = landing(z_m, stop_or_land_command_count=3, last_stop_or_land_command_at_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
     assert state.phase is ends
     assert words in state.reason
@@ -456,12 +456,12 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
     on the floor before the link counts as lost. Seen again, it begins anew."""
     look = at(HANG_Z_M, thrust=1000.0)
-    half_way = hanging(Phase.COMPLETE, entered_s=8.0, release_began_s=9.5, t_s=9.98)
+    half_way = hanging(Phase.COMPLETE, entered_s=8.0, release_began_at_s=9.5, t_s=9.98)
     state, command = step_mission(half_way, look(10.0), PROFILE)
     assert isinstance(command, RawThrust)
     state, command = step_mission(state, replace(look(10.0), t_s=10.2), PROFILE)
     assert is_setpoint(command, above_m=HANG_Z_M)
-    assert state.release_began_s is None
+    assert state.release_began_at_s is None
     for i in range(12):
         seen_again = at(HANG_Z_M, thrust=20000.0)(10.22 + TICK_S * i)
         state, command = step_mission(state, seen_again, PROFILE)
@@ -486,10 +486,10 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     stopped = hanging(
         Phase.COMPLETE,
         in_magnet_reach_since_s=9.0,
-        release_began_s=9.0,
-        motor_stop_ordered_at_s=10.0,
-        last_stop_or_land_order_at_s=10.0,
-        stop_or_land_order_count=1,
+        release_began_at_s=9.0,
+        motor_stop_commanded_at_s=10.0,
+        last_stop_or_land_command_at_s=10.0,
+        stop_or_land_command_count=1,
     )
     flight = fly(stopped, at(HANG_Z_M, **frozen), 50.0, PROFILES[positioning], feels=True)
     assert all(isinstance(command, StopMotors | Idle) for command in flight.commands)
@@ -510,7 +510,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     """Locked by a lost notify while it slips: it is not reported as perched."""
     locked = {**OFF, "supervisor": READY | LOCKED, "velocity_mps": (0.0, 0.0, -0.9)}
     flight = fly(
-        hanging(Phase.COMPLETE, motor_stop_ordered_at_s=9.0, stop_or_land_order_count=5),
+        hanging(Phase.COMPLETE, motor_stop_commanded_at_s=9.0, stop_or_land_command_count=5),
         at(HANG_Z_M - 0.05, **locked),
     )
     assert flight.state.phase is not Phase.PERCHED
@@ -553,8 +553,8 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     lands = AIRBORNE | HL_ACTIVE
     state = landing(
         0.4,
-        stop_or_land_order_count=3,
-        last_stop_or_land_order_at_s=9.0,
+        stop_or_land_command_count=3,
+        last_stop_or_land_command_at_s=9.0,
         last_telemetry=telemetry(9.98, 0.4, supervisor=lands),
     )
     up = at(
@@ -582,10 +582,10 @@ def cut(z_m: float, climb_mps: float, **obs: Any) -> Look:
 
 OVERDUE = landing(3.0, entered_s=10.0 - 0.6 * PROFILE.planner.landing.timeout_s)
 ORDERED, LOW = (
-    landing(1.5, stop_or_land_order_count=1, last_stop_or_land_order_at_s=9.5),
-    landing(1.5, stop_or_land_order_count=3, last_stop_or_land_order_at_s=5.0),
+    landing(1.5, stop_or_land_command_count=1, last_stop_or_land_command_at_s=9.5),
+    landing(1.5, stop_or_land_command_count=3, last_stop_or_land_command_at_s=5.0),
 )
-HIGH = landing(1.8, stop_or_land_order_count=3, last_stop_or_land_order_at_s=5.0)
+HIGH = landing(1.8, stop_or_land_command_count=3, last_stop_or_land_command_at_s=5.0)
 
 
 @pytest.mark.parametrize(
@@ -622,12 +622,12 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     """Also from below the ground, from where it would climb to it. Of a quintic the largest speed
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
-    order = make_onboard_landing(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MAX_HEIGHT_ESTIMATE_DRIFT_M, config.drift_mps * flown_s)
+    order = make_onboard_landing_command(PROFILE.planner, 0.0, flown_s, z_m)
+    drift_m = min(MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
-    assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_MARGIN_S) == pytest.approx(
-        ONBOARD_LANDING_MEAN_MPS
+    assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_DURATION_MARGIN_S) == pytest.approx(
+        ONBOARD_LANDING_MEAN_SPEED_MPS
     )
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
-from perchctl.mission.phases.recover import STEADY
-from perchctl.mission.setpoints import MAX_IN_PLACE_SPEED_MPS, MAX_LATERAL_INTEGRAL_M
+from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
+from perchctl.mission.phases.recover import STEADY_AFTER_ATTEMPT
+from perchctl.mission.setpoints import MAX_LATERAL_INTEGRAL_M, MAX_SPEED_HOVERING_IN_PLACE_MPS
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import BY_TARGET, MOCAP, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Look, at, fly
@@ -53,7 +53,7 @@ def test_a_velocity_that_no_position_shows_is_no_motion(
     wind, while the vehicle stands still."""
     flight = fly(state_in(Phase.RECOVER), blown(0.0, reads_mps, towards_rad), LEARNED_S, MOCAP)
     assert Phase.ESTIMATE in {tick.state.phase for tick in flight.ticks}  # steady, it goes on
-    bias_mps = flight.state.belief.reckoning.estimated_velocity_bias_world_xy_mps
+    bias_mps = flight.state.belief.dead_reckoning.estimated_velocity_bias_world_xy_mps
     assert bias_mps == pytest.approx(
         (reads_mps * math.cos(towards_rad), reads_mps * math.sin(towards_rad)), abs=0.02
     )
@@ -65,8 +65,10 @@ def test_a_motion_that_positions_show_stays_one(flown_mps: float, towards_rad: f
     look = blown(0.6, 0.0, towards_rad, flown_mps)
     flight = fly(state_in(Phase.RECOVER), look, 3.0, MOCAP, one_phase=True)
     assert flight.state.phase is Phase.RECOVER
-    assert math.hypot(*flight.state.belief.reckoning.estimated_velocity_bias_world_xy_mps) < 0.02
-    assert STEADY not in flight.state.condition_start_times_s
+    assert (
+        math.hypot(*flight.state.belief.dead_reckoning.estimated_velocity_bias_world_xy_mps) < 0.02
+    )
+    assert STEADY_AFTER_ATTEMPT not in flight.state.condition_start_times_s
 
 
 @BRIEFLY
@@ -83,7 +85,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
 
 
 @BRIEFLY
-@given(flown_mps=st.floats(2.0 * MAX_IN_PLACE_SPEED_MPS, 0.5))
+@given(flown_mps=st.floats(2.0 * MAX_SPEED_HOVERING_IN_PLACE_MPS, 0.5))
 def test_an_offset_on_the_way_is_not_trimmed(flown_mps: float) -> None:
     flight = fly(state_in(Phase.ALIGN), blown(0.3, 0.0, 0.0, flown_mps), 0.4, MOCAP)
     assert flight.state.phase is Phase.ALIGN
@@ -125,7 +127,7 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
         wind_g * math.cos(towards_rad - heading_rad),
         wind_g * math.sin(towards_rad - heading_rad),
     )
-    reckoning, imu, last = DeadReckoning(), ImuMotion(), None
+    dead_reckoning, imu, last = DeadReckoning(), ImuMotion(), None
     for k in range(2400):
         kicked_g = 1.7 if 2000 <= k < 2004 else 0.0
         sample = telemetry(
@@ -138,14 +140,17 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
         )
         imu = imu.with_sample(last, sample)
         last = sample
-        reckoning = advance_reckoning(
-            reckoning,
+        dead_reckoning = advance_dead_reckoning(
+            dead_reckoning,
             imu,
             sample,
-            is_estimate_believed=True,
+            is_estimate_trusted=True,
             is_estimated_velocity_being_corrected=True,
         )
-    (bx, by, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_specific_force_world_xy_mps2
+    (bx, by, _), (x_mps2, y_mps2) = (
+        dead_reckoning.acceleration_bias_mps2,
+        dead_reckoning.mean_specific_force_world_xy_mps2,
+    )
     assert (bx - x_mps2) / 9.81 == pytest.approx(-wind_g * math.cos(towards_rad), abs=0.01)
     assert (by - y_mps2) / 9.81 == pytest.approx(-wind_g * math.sin(towards_rad), abs=0.01)
 
@@ -170,8 +175,14 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
 
     flight = fly(state_in(Phase.PERCH, z_m=1.9), look, 1.2, BY_TARGET, feels=True, one_phase=True)
     assert flight.state.phase is Phase.PERCH
-    first = next(tick.state.belief.reckoning for tick in flight.ticks if tick.t_s > lost_s + 0.2)
-    last = flight.state.belief.reckoning
-    assert last.bias_mps2[0] == pytest.approx(first.bias_mps2[0], abs=1e-6)
+    first = next(
+        tick.state.belief.dead_reckoning for tick in flight.ticks if tick.t_s > lost_s + 0.2
+    )
+    last = flight.state.belief.dead_reckoning
+    assert last.acceleration_bias_mps2[0] == pytest.approx(
+        first.acceleration_bias_mps2[0], abs=1e-6
+    )
     way_m = 0.5 * 9.81 * push_g * 0.5**2
-    assert first.lateral_offset_m[0] - last.lateral_offset_m[0] == pytest.approx(way_m, rel=0.1)
+    assert first.gear_to_target_world_xy_m[0] - last.gear_to_target_world_xy_m[0] == pytest.approx(
+        way_m, rel=0.1
+    )

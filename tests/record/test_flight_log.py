@@ -21,7 +21,7 @@ from perchctl.mission import (
     Phase,
     RestState,
 )
-from perchctl.mission.phase import VehicleClaim
+from perchctl.mission.phase import VehicleDiagnosis
 from perchctl.mission.state import BatteryOutlook
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_rounded_json
@@ -142,7 +142,7 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     """As it ends, and as its log is read: the simulated camera is the scenario's."""
     landing = Event(
         1.0, EventKind.PHASE, "the camera seems to be rotated", Phase.LANDING, "mounting",
-        claims=VehicleClaim.PROFILE_MAY_BE_WRONG,
+        diagnosis=VehicleDiagnosis.PROFILE_MAY_BE_WRONG,
     )  # fmt: skip
     found = CameraFindings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(uri=uri))
@@ -169,7 +169,7 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
 @pytest.mark.parametrize("rest", RestState)
 def test_a_rescue_is_a_note_with_its_rest(rest: RestState) -> None:
     """A reader needs no prose to tell where the vehicle is."""
-    record = event_record(Event.note_from_rescue(9.0, ValueError(), rest, rest.value))
+    record = event_record(Event.make_rescue_note(9.0, ValueError(), rest, rest.value))
     assert (record["event"], record["rest"]) == ("note", rest.name.lower())
     assert record["reason"] == f"ValueError in flight: {rest.value}"
     assert event_record(Event(9.0, EventKind.NOTE, "a note in flight: "))["rest"] is None

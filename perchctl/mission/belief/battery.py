@@ -1,10 +1,10 @@
 """Estimate the battery's charge from its voltage readings.
 
 A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
-voltage as a function of its charge (`REST_VOLTAGES_V`) and the current at full thrust
-(`PowerTrain`). It fits two parameters by least squares with exponential forgetting: the voltage sag
-at full thrust, and `true_to_counted_discharge_ratio`, the discharge rate of this battery divided by
-the rate counted from the assumed current:
+voltage as a function of its charge (`DISCHARGE_CURVE_REST_VOLTAGES_V`) and the current at full
+thrust (`PowerTrain`). It fits two parameters by least squares with exponential forgetting: the
+voltage sag at full thrust, and `true_to_counted_discharge_ratio`, the discharge rate of this
+battery divided by the rate counted from the assumed current:
 
     reading = rest voltage(charge) - sag * load
     d charge / dt = -true_to_counted_discharge_ratio * load * current / capacity
@@ -20,11 +20,39 @@ from typing import NamedTuple
 from perchctl.values import replace
 from perchctl.vehicle import AUTO_ARM, FULL_THRUST, Telemetry, is_battery_reading
 
-CHARGE_FRACTIONS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Charges (0..1) at which `REST_VOLTAGES_V` gives the resting voltage."""
-REST_VOLTAGES_V = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
-"""Resting voltage of a cell, V, at each charge in `CHARGE_FRACTIONS` (0..1); slightly below the
-table in the firmware."""
+DISCHARGE_CURVE_CHARGE_FRACTIONS = (
+    0.0,
+    0.02,
+    0.05,
+    0.1,
+    0.2,
+    0.3,
+    0.4,
+    0.5,
+    0.6,
+    0.7,
+    0.8,
+    0.9,
+    1.0,
+)
+"""Charges (0..1) at which `DISCHARGE_CURVE_REST_VOLTAGES_V` gives the resting voltage."""
+DISCHARGE_CURVE_REST_VOLTAGES_V = (
+    3.0,
+    3.4,
+    3.64,
+    3.76,
+    3.82,
+    3.86,
+    3.885,
+    3.915,
+    3.955,
+    3.995,
+    4.04,
+    4.1,
+    4.2,
+)
+"""Resting voltage of a cell, V, at each charge in `DISCHARGE_CURVE_CHARGE_FRACTIONS` (0..1);
+slightly below the table in the firmware."""
 TYPICAL_FULL_THRUST_SAG_V = 0.63
 """Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
 battery could finish."""
@@ -46,19 +74,19 @@ VOLTAGE_READING_SIGMA_V = 0.02
 BATTERY_FIT_TIME_CONSTANT_S = 40.0
 """Time constant with which the fit forgets old readings, s. Larger: the fit follows a change of
 temperature late."""
-REST_VOLTAGE_TIME_CONSTANT_S = 1.0
+REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
-VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
+THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 """Time constant with which the voltage reading follows a change of thrust, s."""
-MAX_STEADY_THRUST_DEVIATION_FRACTION = 0.06
+MAX_THRUST_DEVIATION_TO_USE_VOLTAGE_FRACTION = 0.06
 """Largest difference between the current load and the filtered load, as a share of full thrust. A
 reading with a larger difference belongs to an earlier thrust and is not used."""
-MIN_CHARGE_FRACTION_TO_COUNT_DISCHARGE = 0.05
+MIN_COUNTED_CHARGE_FRACTION = 0.05
 """Share of the full charge below which the discharge counted from the assumed current is not used:
 the voltage curve is so steep there that the readings alone determine the charge."""
-MIN_FIT_THRUST_FRACTION = 0.2
+MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
 """Smallest load, as a share of full thrust, at which a reading contributes to the fitted sag."""
-MIN_TIME_UNDER_LOAD_S = 1.0
+MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
 """Time of readings under load that an estimate requires, s."""
 MAX_BATTERY_READING_AGE_S = 1.0
 """Age at which a voltage reading is no longer used, s."""
@@ -72,7 +100,7 @@ class SagModel(NamedTuple):
     true_to_counted_discharge_ratio: float
 
 
-class FitSums(NamedTuple):
+class NormalEquationSums(NamedTuple):
     """Weighted sums over the voltage readings: the normal equations of the least-squares fit.
 
     The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
@@ -82,13 +110,13 @@ class FitSums(NamedTuple):
     """
 
     thrust_squared: float = 0.0
-    thrust_times_rest_drop: float = 0.0
-    rest_drop_squared: float = 0.0
+    thrust_times_rest_v_drop: float = 0.0
+    rest_v_drop_squared: float = 0.0
     thrust_times_voltage_error: float = 0.0
-    rest_drop_times_voltage_error: float = 0.0
+    rest_v_drop_times_voltage_error: float = 0.0
 
 
-NO_READINGS = FitSums()
+ZERO_SUMS = NormalEquationSums()
 
 
 @dataclass(frozen=True)
@@ -103,13 +131,13 @@ class BatteryFit:
     # resting voltage before take-off, estimated if the first reading was under load
     takeoff_rest_v: float | None = None
     counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
-    # load, low-pass filtered with `VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
+    # load, low-pass filtered with `THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
     filtered_thrust_fraction: float = 0.0
     mean_thrust_fraction: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
     time_under_load_s: float = 0.0  # total time of readings under load
     time_since_battery_reading_s: float = 0.0  # time since the last reading
-    normal_equation_sums: FitSums = NO_READINGS
+    normal_equation_sums: NormalEquationSums = ZERO_SUMS
 
 
 # --- Brushed and brushless motors ---
@@ -130,9 +158,9 @@ class PowerTrain:
     low_power_warning_v: float
 
 
-BRUSHED = PowerTrain(full_thrust_current_a=4.4, low_power_warning_v=3.2)
+BRUSHED_POWER_TRAIN = PowerTrain(full_thrust_current_a=4.4, low_power_warning_v=3.2)
 """Drive of the vehicles with brushed motors, which arm themselves."""
-BRUSHLESS = PowerTrain(full_thrust_current_a=7.3, low_power_warning_v=3.35)
+BRUSHLESS_POWER_TRAIN = PowerTrain(full_thrust_current_a=7.3, low_power_warning_v=3.35)
 """The current of the brushless motors is not published. The value assumes the same current per
 newton as the brushed motors (0.80 N at full thrust, 0.48 N brushed). It is an upper bound because
 brushless motors are designed to be more efficient."""
@@ -140,13 +168,13 @@ brushless motors are designed to be more efficient."""
 
 def identify_power_train(telemetry: Telemetry) -> PowerTrain:
     """Return the vehicle's drive: motors that start only after an arming request are brushless."""
-    return BRUSHED if telemetry.has_bit(AUTO_ARM) else BRUSHLESS
+    return BRUSHED_POWER_TRAIN if telemetry.has_bit(AUTO_ARM) else BRUSHLESS_POWER_TRAIN
 
 
 # --- The battery's state, fitted reading by reading ---
 
 
-def update_from_telemetry(
+def update_battery_fit_from_telemetry(
     old: BatteryFit,
     telemetry: Telemetry,
     reading_age_s: float,
@@ -180,12 +208,16 @@ def update_battery_fit(
     state = replace(
         state,
         counted_discharge_fraction=state.counted_discharge_fraction
-        + thrust_fraction * full_thrust_discharge_per_s(battery_capacity_mah, power_train) * dt_s,
+        + thrust_fraction
+        * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
+        * dt_s,
         filtered_thrust_fraction=_low_pass(
-            state.filtered_thrust_fraction, thrust_fraction, dt_s / VOLTAGE_LAG_TIME_CONSTANT_S
+            state.filtered_thrust_fraction,
+            thrust_fraction,
+            dt_s / THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S,
         ),
     )
-    if thrust_fraction >= MIN_FIT_THRUST_FRACTION:
+    if thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
         known = dt_s / 3.0 if state.mean_thrust_fraction else 1.0
         state = replace(
             state,
@@ -201,22 +233,28 @@ def update_battery_fit(
         spent = (
             fit_sag_model(state).true_to_counted_discharge_ratio
             * state.filtered_thrust_fraction
-            * full_thrust_discharge_per_s(battery_capacity_mah, power_train)
+            * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
             * dt_s
         )
-        return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
+        return replace(
+            state,
+            rest_v=rest_v_from_charge_fraction(charge_fraction_from_rest_v(state.rest_v) - spent),
+        )
     state = replace(state, time_since_battery_reading_s=0.0)
     if thrust_fraction == 0.0 and not state.time_under_load_s:
         return replace(state, takeoff_rest_v=battery_v, rest_v=battery_v)
-    if abs(thrust_fraction - state.filtered_thrust_fraction) > MAX_STEADY_THRUST_DEVIATION_FRACTION:
+    if (
+        abs(thrust_fraction - state.filtered_thrust_fraction)
+        > MAX_THRUST_DEVIATION_TO_USE_VOLTAGE_FRACTION
+    ):
         return state
     if state.takeoff_rest_v is None:
         state = replace(
             state,
             takeoff_rest_v=battery_v + TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction,
         )
-    if state.filtered_thrust_fraction >= MIN_FIT_THRUST_FRACTION:
-        fit = _add_reading_to_fit_sums(state, dt_s, battery_v)
+    if state.filtered_thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
+        fit = _add_voltage_reading_to_sums(state, dt_s, battery_v)
         state = replace(
             state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
         )
@@ -224,7 +262,7 @@ def update_battery_fit(
     rest_v = (
         now_v
         if state.rest_v is None
-        else _low_pass(state.rest_v, now_v, dt_s / REST_VOLTAGE_TIME_CONSTANT_S)
+        else _low_pass(state.rest_v, now_v, dt_s / REST_VOLTAGE_FILTER_TIME_CONSTANT_S)
     )
     return replace(state, rest_v=rest_v)
 
@@ -249,14 +287,22 @@ def fit_sag_model(state: BatteryFit) -> SagModel:
     )
 
 
-def charge_from_rest_v(rest_v: float) -> float:
+def charge_fraction_from_rest_v(rest_v: float) -> float:
     """Return the charge (0..1) of a cell with the resting voltage `rest_v`."""
-    return min(1.0, max(0.0, _interpolate(REST_VOLTAGES_V, CHARGE_FRACTIONS, rest_v)))
+    return min(
+        1.0,
+        max(
+            0.0,
+            _interpolate(DISCHARGE_CURVE_REST_VOLTAGES_V, DISCHARGE_CURVE_CHARGE_FRACTIONS, rest_v),
+        ),
+    )
 
 
-def rest_v_from_charge(charge_fraction: float) -> float:
+def rest_v_from_charge_fraction(charge_fraction: float) -> float:
     """Return the resting voltage, V, of a cell with the charge `charge_fraction` (0..1)."""
-    return _interpolate(CHARGE_FRACTIONS, REST_VOLTAGES_V, charge_fraction)
+    return _interpolate(
+        DISCHARGE_CURVE_CHARGE_FRACTIONS, DISCHARGE_CURVE_REST_VOLTAGES_V, charge_fraction
+    )
 
 
 def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
@@ -264,15 +310,15 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
     return ys[i - 1] + (x - xs[i - 1]) * (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
 
 
-def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -> FitSums:
+def _add_voltage_reading_to_sums(
+    state: BatteryFit, dt_s: float, battery_v: float
+) -> NormalEquationSums:
     """Return the sums after one more reading. The fit solves for the deviations from the typical
     sag and the typical discharge rate factor."""
     assert state.takeoff_rest_v is not None
-    begun = charge_from_rest_v(state.takeoff_rest_v)
-    counted = max(
-        min(begun, MIN_CHARGE_FRACTION_TO_COUNT_DISCHARGE), begun - state.counted_discharge_fraction
-    )
-    spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
+    begun = charge_fraction_from_rest_v(state.takeoff_rest_v)
+    counted = max(min(begun, MIN_COUNTED_CHARGE_FRACTION), begun - state.counted_discharge_fraction)
+    spent_v = rest_v_from_charge_fraction(begun) - rest_v_from_charge_fraction(counted)
     off_v = (
         state.takeoff_rest_v
         - battery_v
@@ -281,7 +327,7 @@ def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -
     )
     weight, keep = dt_s / VOLTAGE_READING_SIGMA_V**2, math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S)
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
-    return FitSums(
+    return NormalEquationSums(
         a + weight * state.filtered_thrust_fraction * state.filtered_thrust_fraction,
         b + weight * state.filtered_thrust_fraction * spent_v,
         c + weight * spent_v * spent_v,
@@ -290,10 +336,12 @@ def _add_reading_to_fit_sums(state: BatteryFit, dt_s: float, battery_v: float) -
     )
 
 
-def full_thrust_discharge_per_s(battery_capacity_mah: float, power_train: PowerTrain) -> float:
+def full_thrust_discharge_fraction_per_s(
+    battery_capacity_mah: float, power_train: PowerTrain
+) -> float:
     """Return the share of the full charge that one second of full thrust consumes."""
     return power_train.full_thrust_current_a / (3.6 * battery_capacity_mah)
 
 
-def _low_pass(value: float, new_value: float, weight: float) -> float:
-    return value + min(1.0, weight) * (new_value - value)
+def _low_pass(old_value: float, new_value: float, new_value_weight: float) -> float:
+    return old_value + min(1.0, new_value_weight) * (new_value - old_value)

@@ -16,8 +16,8 @@ from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.lateral_offset import LateralOffset, LateralOffsetFilter
-from perchctl.mission.belief.maneuver import Maneuver, SentOrders
-from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
+from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
+from perchctl.mission.belief.motion import ZERO_VECTOR, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.belief.target import TargetBelief, VisualMotion
@@ -30,18 +30,18 @@ from perchctl.vehicle import Telemetry
 POSITION_SETTLING_AFTER_GAP_S = 0.5
 """Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
 trusted before it has converged."""
-MAX_POSITION_AGE_BEYOND_LATENCY_S = 0.13
+MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """How much older than the camera's latency the newest external position may be while it still
 corrects the estimated velocity, s: three pictures at 30 per second. Larger: `has_uncorrected_gust`
 reacts to a blow later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
 """Lateral speed that the vehicle gains without a sighting in a blow or gust, m/s; flights without a
 fault show 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
-GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
+GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
 """Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
 deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
 uncertain latency, blows go unnoticed."""
-THRUST_REPORT_DELAY_S = 0.2
+MAX_THRUST_REPORT_DELAY_S = 0.2
 """Time within which the telemetry reports an ordered raw thrust, s. Smaller: late telemetry looks
 like a thrust that the vehicle does not follow."""
 
@@ -75,26 +75,30 @@ class Belief:
 
     obs: Observation  #: newest observation, on which all properties depend
     profile: Profile
-    sent: SentOrders = field(default_factory=lambda: SentOrders(maneuver=Maneuver()))
+    command_history: CommandHistory = field(
+        default_factory=lambda: CommandHistory(maneuver=Maneuver())
+    )
     t_s: float = 0.0  #: time of the last update
     last_telemetry: Telemetry | None = None  #: newest sample that an update has used
 
     # --- world frame of the state estimate, and how far to trust it ---
     takeoff_position_m: Vector | None = None  #: position where the flight started
     first_estimate_jump_at_s: float | None = None  #: first jump of the state estimate
-    world_frame_shift_m: Vector = ZERO  #: motion of the estimate's world frame in this tick
+    world_frame_shift_in_tick_m: Vector = (
+        ZERO_VECTOR  #: motion of the estimate's world frame in this tick
+    )
     position_last_stale_at_s: float | None = None  #: last time at which the position was stale
     #: external positions lead away from the setpoint and count as no evidence from then on
     is_position_diverged: bool = False
     #: heading is so wrong that position control would leave its setpoint
-    heading_lost: bool = False
+    is_heading_lost: bool = False
     #: time since which only accelerometer and attitude are used
     dead_reckoning_since_s: float | None = None
     #: height above the ground, integrated since `dead_reckoning_since_s`
-    reckoned_height_m: float = 0.0
+    dead_reckoned_height_m: float = 0.0
 
     # --- motion, target and contact ---
-    reckoning: DeadReckoning = field(default_factory=DeadReckoning)
+    dead_reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     last_target_world_m: Array | None = None  #: target's world position in its last measured frame
     target_position_scatter_m: float = 0.0  #: distance between the targets of successive frames
     #: vehicle's velocity from pictures alone
@@ -102,7 +106,7 @@ class Belief:
     #: Kalman filter of the lateral offset from the target
     lateral_offset_filter: LateralOffsetFilter = field(default_factory=LateralOffsetFilter)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
-    #: low-passed `lean_sine_world_xy`, with the time constant `LEAN_TIME_CONSTANT_S`
+    #: low-passed `lean_sine_world_xy`, with the time constant `MEAN_LEAN_TIME_CONSTANT_S`
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
     #: height of the body where the magnet may hold it
     vehicle_world_z_at_last_contact_m: float | None = None
@@ -117,9 +121,9 @@ class Belief:
     #: thrust that the rotors produce, 0..65535; None before a sample
     rotor_thrust: float | None = None
     #: time since which the reported thrust differs from the ordered one
-    thrust_differs_from_order_since_s: float | None = None
-    #: last tick in which that difference was older than `THRUST_REPORT_DELAY_S`
-    thrust_last_differed_from_order_at_s: float = -math.inf
+    thrust_differs_from_command_since_s: float | None = None
+    #: last tick in which that difference was older than `MAX_THRUST_REPORT_DELAY_S`
+    thrust_last_differed_from_command_at_s: float = -math.inf
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
     @classmethod
@@ -135,7 +139,7 @@ class Belief:
         `update_belief`."""
         return replace(self, obs=obs, profile=profile)
 
-    def held_s(self, condition: Condition[Belief]) -> float:
+    def true_for_s(self, condition: Condition[Belief]) -> float:
         """Seconds for which the condition has been true; -1 while it is false."""
         began_s = self.condition_start_times_s.get(condition)
         return -1.0 if began_s is None else self.obs.t_s - began_s
@@ -255,14 +259,16 @@ class Belief:
     @cached_property
     def is_estimated_velocity_being_corrected(self) -> bool:
         """True while the newest external position still corrects the estimated velocity: it is at
-        most `MAX_POSITION_AGE_BEYOND_LATENCY_S` older than the camera's latency."""
-        return self.position_age_s <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_LATENCY_S
+        most `MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S` older than the camera's latency."""
+        return (
+            self.position_age_s <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
+        )
 
     @cached_property
     def has_uncorrected_gust(self) -> bool:
         """True after a blow or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
-        is_reckoned = self.reckoning.imu is not None
+        is_reckoned = self.dead_reckoning.imu is not None
         if not (
             self.is_positioned_by_target
             and is_reckoned
@@ -271,9 +277,9 @@ class Belief:
             return False
         least_mps = (
             MIN_SPEED_GAINED_IN_GUST_MPS
-            + GUST_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
+            + GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
-        return math.hypot(*self.reckoning.lateral_velocity_unseen_by_estimate_mps) > least_mps
+        return math.hypot(*self.dead_reckoning.lateral_velocity_unseen_by_estimate_mps) > least_mps
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
@@ -285,7 +291,7 @@ class Belief:
             self.obs.link_problem is not None
             or self.telemetry_age_s > safety.telemetry_hold_s
             or self.first_estimate_jump_at_s is not None
-            or self.obs.loop_late_s > safety.loop_late_hold_s
+            or self.obs.tick_start_delay_s > safety.loop_late_hold_s
         )
 
     @cached_property
@@ -320,7 +326,7 @@ class Belief:
             return False
         # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
-        return not (self.heading_lost and (self.is_positioned_by_target or heard))
+        return not (self.is_heading_lost and (self.is_positioned_by_target or heard))
 
     # --- Motion ---
 
@@ -342,7 +348,7 @@ class Belief:
         return math.acos(max(-1.0, min(1.0, up)))
 
     @cached_property
-    def is_reading_one_g(self) -> bool:
+    def is_accelerometer_reading_one_g(self) -> bool:
         """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as in hover, or at rest
         on the floor, at the ceiling or on the magnet."""
         return abs(self.obs.telemetry.acc_z_g - 1.0) <= self.profile.planner.perch.contact_acc_g
@@ -353,7 +359,7 @@ class Belief:
         adds to the estimate is subtracted."""
         vx_mps, vy_mps, vz_mps = self.obs.telemetry.velocity_mps
         if self.is_position_valid:
-            bias_x_mps, bias_y_mps = self.reckoning.estimated_velocity_bias_world_xy_mps
+            bias_x_mps, bias_y_mps = self.dead_reckoning.estimated_velocity_bias_world_xy_mps
             vx_mps, vy_mps = vx_mps - bias_x_mps, vy_mps - bias_y_mps
         return vx_mps, vy_mps, vz_mps
 
@@ -370,9 +376,9 @@ class Belief:
     @cached_property
     def lean_acceleration_world_xy_mps2(self) -> tuple[float, float]:
         """Lateral acceleration (x, y), m/s^2, world axes, that follows from the difference between
-        the present lean and its mean (low-passed with `LEAN_TIME_CONSTANT_S`). The mean lean itself
-        causes none: it balances the wind, an unbalanced vehicle, or an error of the estimated
-        attitude. Wrong after a change of the wind, until the mean has followed."""
+        the present lean and its mean (low-passed with `MEAN_LEAN_TIME_CONSTANT_S`). The mean lean
+        itself causes none: it balances the wind, an unbalanced vehicle, or an error of the
+        estimated attitude. Wrong after a change of the wind, until the mean has followed."""
         (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
@@ -385,9 +391,9 @@ class Belief:
     def climb_mps(self) -> float:
         """Vertical speed, m/s: from the state estimate while it is valid, otherwise from the
         accelerometer."""
-        is_reckoned = self.reckoning.imu is not None
+        is_reckoned = self.dead_reckoning.imu is not None
         if is_reckoned and (self.dead_reckoning_since_s is not None or not self.is_position_valid):
-            return self.reckoning.velocity_mps[2]
+            return self.dead_reckoning.velocity_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 
     def is_sinking(self, min_sink_mps: float) -> bool:
@@ -408,10 +414,10 @@ class Belief:
     @cached_property
     def is_thrust_known(self) -> bool:
         """True if the reported thrust can be used: it agrees with the ordered raw thrust if there
-        is one, or has differed from it for at most `THRUST_REPORT_DELAY_S`."""
+        is one, or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
         return (
-            self.thrust_differs_from_order_since_s is None
-            or self.obs.t_s - self.thrust_differs_from_order_since_s <= THRUST_REPORT_DELAY_S
+            self.thrust_differs_from_command_since_s is None
+            or self.obs.t_s - self.thrust_differs_from_command_since_s <= MAX_THRUST_REPORT_DELAY_S
         )
 
     # --- The target ---
@@ -442,7 +448,7 @@ class Belief:
     @cached_property
     def sighting_age_s(self) -> float:
         """Seconds since the exposure of the last picture that shows the target."""
-        return max(0.0, self.obs.t_s - self.reckoning.last_sighting_at_s)
+        return max(0.0, self.obs.t_s - self.dead_reckoning.last_sighting_at_s)
 
     @cached_property
     def does_camera_motion_match_vehicle(self) -> bool:
@@ -452,7 +458,9 @@ class Belief:
             return (
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None
             )
-        return not (self.mounting.is_awaiting_evidence or self.mounting.is_camera_mounting_wrong)
+        return not (
+            self.mounting.is_target_motion_undetermined or self.mounting.is_camera_mounting_wrong
+        )
 
     @property
     def is_in_magnet_reach(self) -> bool:

@@ -9,14 +9,15 @@ distinguish the magnet from the floor, and both from another object.
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and against
-an unknown object without a position (`SUPPORT_SHOWN_BY_IMU`). The last one also covers too little
+an unknown object without a position (`IMU_SHOWS_SUPPORT`). The last one also covers too little
 thrust, by the same threshold below hover thrust as the other is above it:
-`MIN_PRESS_TO_HOVER_THRUST_RATIO` moves all of these, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS`
-and `ON_FLOOR` require a thrust too small to support the vehicle (`is_thrust_too_low_to_fly`).
+`MIN_PRESS_TO_HOVER_THRUST_RATIO` moves all of these, and `Support.AIR`. `HANGING`,
+`MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to support the vehicle
+(`is_thrust_too_low_to_fly`).
 
 `find_support` says in one word what these conditions show: the vehicle flies, presses, hangs on the
 magnet, hangs on something else, stands, or it is unknown. How long the evidence has lasted is the
-condition's `held_s`; each row chooses its own dwell time by what a mistake would cost.
+condition's `true_for_s`; each row chooses its own dwell time by what a mistake would cost.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from enum import Enum
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
 from perchctl.mission.belief.evidence import Condition, RequiredData
-from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
+from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
@@ -35,16 +36,16 @@ MIN_PRESS_TO_HOVER_THRUST_RATIO = 1.08
 """Reported thrust over hover thrust from which a vehicle at rest is pressing: more than five
 standard deviations of the hover thrust learned in quiet flight. Larger: a weak press goes
 undetected. Smaller: a gust or a sagging battery looks like a press."""
-SATURATED_FRACTION_OF_FULL_THRUST = 0.98
+MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
 """Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
 much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-MIN_PRESS_TO_ORDERED_THRUST_RATIO = 0.99
+MIN_PRESS_TO_COMMANDED_THRUST_RATIO = 0.99
 """Reported thrust over the ordered thrust of a raw press from which the vehicle always counts as
 pressing. Larger: a reading just below the ordered thrust goes undetected. Smaller: a heavy vehicle
 seems to press while it hovers."""
-MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS = 0.93
+MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS = 0.93
 """Hover thrust, as a share of full thrust, above which the thrust left for a press is too small to
 prove one. Smaller: a press is never detected on a heavy vehicle."""
 MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
@@ -56,19 +57,19 @@ MIN_POSSIBLE_HOVER_THRUST = 1000
 """Smallest reported thrust, 0..65535, that may be hover thrust; any vehicle's is far larger."""
 
 # --- motion and position ---
-MAX_MOTIONLESS_CLIMB_MPS = 0.05
+MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow sink looks like
 hanging."""
 MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
-MAX_HOVER_CLIMB_MPS = 0.27
+MAX_HOVER_CLIMB_RATE_MPS = 0.27
 """Largest vertical speed at which the thrust is hover thrust, m/s."""
 MAX_HOVER_DEVIATION_FROM_1G_G = 0.1
 """Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
 MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
-MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
+MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
 """Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
 climb is detected late."""
 TOUCH_OFFSET_SIGMA_M = 0.001
@@ -77,39 +78,39 @@ POSITION_DECK_IMPACT_SIGMA_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 POSITION_DECK_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-MAX_UPWARD_DRIFT_DURING_SLIP_M = 0.02
+MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M = 0.02
 """Upward drift of the estimate in spite of which a slip is still detected, m."""
-MIN_DESCENT_BEFORE_FLOOR_M = 0.1
+MIN_DESCENT_TO_ACCEPT_FLOOR_M = 0.1
 """Distance below its start at which a descent counts as under way, m."""
-MAX_DESCENT_WHILE_HELD_M = 0.1
+MAX_DESCENT_IF_HELD_AT_START_M = 0.1
 """Distance from its start within which a vehicle in a descent may still be held there, m."""
-MAX_HEIGHT_STANDING_ON_FLOOR_M = 0.3
+MAX_DRIFTED_HEIGHT_STANDING_ON_FLOOR_M = 0.3
 """Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
-hanging, m; allows for the drift of the height in flight. (`MAX_STANDING_HEIGHT_M` applies to a
-vehicle that has not drifted yet.)"""
-MIN_BLOCKED_HEIGHT_M = 0.15
+hanging, m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M`
+applies to a vehicle that has not drifted yet.)"""
+MIN_HEIGHT_OF_BLOCKED_CLIMB_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
-MAX_STANDING_HEIGHT_M = 0.1
+MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M = 0.1
 """Height below which a vehicle may still stand on the ground instead of pressing, m."""
 MAX_HANGING_GEAR_TO_TARGET_Z_M = 0.15
 """Largest height difference between gear and target, m, at which the vehicle may hang on its
 magnet."""
 MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
 """Least height difference between gear and target, m, of a vehicle that stands on the floor."""
-MAX_CLIMB_IN_FALL_AFTER_RELEASE_MPS = -0.05
+MAX_CLIMB_RATE_OF_FALL_AFTER_RELEASE_MPS = -0.05
 """Climb rate below which a released vehicle with a low specific force is falling, m/s."""
-MIN_CLIMB_AT_SATURATED_THRUST_MPS = -0.15
+MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS = -0.15
 """Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
 falls."""
 
 # --- time ---
-MOTORS_OFF_AFTER_STOP_ORDER_S = 5.0
+MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S = 5.0
 """Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
 s."""
 MOTORS_OFF_DWELL_S = 0.1
 """Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
 sample ends the flight. Larger: the flight ends later."""
-HANGING_DWELL_S = 1.0
+HANGING_CONFIRMATION_DWELL_S = 1.0
 """Time that the proof of a magnet's hold takes, s."""
 
 
@@ -152,25 +153,34 @@ def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
 
 
 def _reckoned_gear_offset(b: Belief) -> ContactOffset:
-    reckoning = b.reckoning
+    dead_reckoning = b.dead_reckoning
     sigma_m = math.hypot(
-        reckoning.lateral_sigma_m, TOUCH_OFFSET_SIGMA_M, *reckoning.position_step_sum_xy_m
+        dead_reckoning.gear_to_target_sigma_m,
+        TOUCH_OFFSET_SIGMA_M,
+        *dead_reckoning.unexplained_position_step_sum_xy_m,
     )
     if b.profile.positioning.source.is_deck and b.is_position_valid:
         sigma_m = math.hypot(
             sigma_m, POSITION_DECK_IMPACT_SIGMA_M, POSITION_DECK_SIGMA_GROWTH_MPS * b.sighting_age_s
         )
-    return ContactOffset(math.hypot(*reckoning.lateral_offset_m), sigma_m)
+    return ContactOffset(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
 
 
 def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
     """Return the gear's offset from the target's axis at the last touch, while the vehicle retreats
     from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, or once motion
     capture shows that the vehicle has left the position of that touch."""
-    if not b.sent.maneuver.retreats or b.last_contact_offset is None or b.target.is_fresh:
+    if (
+        not b.command_history.maneuver.retreats_after_attempt
+        or b.last_contact_offset is None
+        or b.target.is_fresh
+    ):
         return None
     x_m, y_m, _ = b.telemetry.position_m
-    away_m = math.hypot(x_m - b.sent.maneuver_start_m[0], y_m - b.sent.maneuver_start_m[1])
+    away_m = math.hypot(
+        x_m - b.command_history.maneuver_start_position_m[0],
+        y_m - b.command_history.maneuver_start_position_m[1],
+    )
     by_capture = b.profile.positioning.source.is_mocap and b.is_position_valid
     if by_capture and away_m > b.profile.planner.perch.contact_xy_m:
         return None
@@ -202,7 +212,7 @@ def is_at_contact_height(b: Belief) -> bool:
     return abs(b.target.gear_to_target_z_m) <= contact_height_tolerance_m(b)
 
 
-def is_at_target(b: Belief) -> bool:
+def is_gear_certainly_in_magnet_reach(b: Belief) -> bool:
     """True if the gear is certainly within the magnet's reach."""
     near = current_gear_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
@@ -219,23 +229,23 @@ def max_press_thrust(profile: Profile) -> float:
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
     """True if the present thrust is hover thrust: speed, climb rate and specific force are within
-    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_MPS` and `MAX_HOVER_DEVIATION_FROM_1G_G` of those in
-    hover, and nothing blocks a climb."""
-    tel, setpoint = b.telemetry, b.sent.setpoint
+    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and `MAX_HOVER_DEVIATION_FROM_1G_G` of those
+    in hover, and nothing blocks a climb."""
+    tel, setpoint = b.telemetry, b.command_history.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
         setpoint is not None
-        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M
-        and vz < MAX_MOTIONLESS_CLIMB_MPS
+        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M
+        and vz < MAX_MOTIONLESS_CLIMB_RATE_MPS
     )
     return (
         b.is_telemetry_fresh
         and b.is_position_valid
         and MIN_POSSIBLE_HOVER_THRUST
         <= tel.thrust
-        < SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
+        < MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
         and b.speed_mps < MAX_HOVER_SPEED_MPS
-        and abs(vz) < MAX_HOVER_CLIMB_MPS
+        and abs(vz) < MAX_HOVER_CLIMB_RATE_MPS
         and abs(tel.acc_z_g - 1.0) < MAX_HOVER_DEVIATION_FROM_1G_G
         and not stuck
     )
@@ -244,12 +254,13 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
 def is_thrust_too_low_to_fly(b: Belief) -> bool:
     """True if the thrust is too small to support the vehicle.
 
-    The limit is `complete.hold_ratio` times hover thrust. It is `MIN_POSITION_MODE_THRUST` if that
-    is larger and still too small to lift the vehicle, since position mode does not order less.
+    The limit is `complete.hold_ratio` times hover thrust. It is `MIN_FIRMWARE_POSITION_MODE_THRUST`
+    if that is larger and still too small to lift the vehicle, since position mode does not order
+    less.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
-    if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
-        most = max(most, MIN_POSITION_MODE_THRUST)
+    if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_FIRMWARE_POSITION_MODE_THRUST:
+        most = max(most, MIN_FIRMWARE_POSITION_MODE_THRUST)
     return b.is_thrust_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
@@ -257,9 +268,12 @@ def is_above_hover_thrust(b: Belief) -> bool:
     """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If its
     maximum leaves less room than that, a thrust close to the maximum is enough. The maximum is the
     ordered thrust during a press by raw thrust, otherwise full thrust."""
-    most = SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
-    if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
-        most = MIN_PRESS_TO_ORDERED_THRUST_RATIO * max_press_thrust(b.profile)
+    most = MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    if (
+        b.command_history.maneuver.presses_against_target
+        and b.command_history.raw_thrust is not None
+    ):
+        most = MIN_PRESS_TO_COMMANDED_THRUST_RATIO * max_press_thrust(b.profile)
     least = (
         min(MIN_PRESS_TO_HOVER_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
     )
@@ -270,8 +284,8 @@ def is_pressing(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
     return (
         is_above_hover_thrust(b)
-        and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS
-        and b.height_m >= MAX_STANDING_HEIGHT_M
+        and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS
+        and b.height_m >= MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M
     )
 
 
@@ -286,7 +300,7 @@ def is_slipping(b: Belief) -> bool:
     above_m = tel.position_m[2] - b.vehicle_world_z_at_last_contact_m
     return (
         not b.is_position_valid
-        or above_m < MAX_UPWARD_DRIFT_DURING_SLIP_M
+        or above_m < MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M
         or tel.acc_z_g < complete.slip_acc_g
     )
 
@@ -294,8 +308,8 @@ def is_slipping(b: Belief) -> bool:
 def is_motionless(b: Belief) -> bool:
     """True if the vehicle is supported and does not move vertically: the accelerometer reads 1
     g."""
-    return b.is_reading_one_g and (
-        abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_MPS or not b.is_position_valid
+    return b.is_accelerometer_reading_one_g and (
+        abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_RATE_MPS or not b.is_position_valid
     )
 
 
@@ -306,21 +320,21 @@ def _is_in_contact(b: Belief) -> bool:
     hover thrust, so the ceiling must take the difference.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
-    steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS and b.is_position_valid
+    steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
     motionless_s = b.obs.t_s - b.imu.climb_steady_since_s
     return (
         abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
         + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_positioned_by_target else 0)
         and (steady or motionless_s >= perch.contact_dwell_s)
-        and b.is_reading_one_g
+        and b.is_accelerometer_reading_one_g
         and b.hover_thrust > 0
         and b.is_thrust_known
         and is_above_hover_thrust(b)
     )
 
 
-def _is_magnet_holding(b: Belief) -> bool:
+def _is_magnet_holding_vehicle(b: Belief) -> bool:
     return (
         is_thrust_too_low_to_fly(b)
         and not is_slipping(b)
@@ -328,10 +342,10 @@ def _is_magnet_holding(b: Belief) -> bool:
     )
 
 
-def _is_weight_hanging(b: Belief) -> bool:
+def _is_hanging_with_motors_stopped(b: Belief) -> bool:
     """True if the motors stand still and the vehicle hangs where it made contact."""
     return (
-        b.sent.release_began_s is not None
+        b.command_history.release_began_at_s is not None
         and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
         and is_motionless(b)
         and not is_slipping(b)
@@ -347,10 +361,10 @@ def _is_hanging(b: Belief) -> bool:
         return is_thrust_too_low_to_fly(b) and is_motionless(b)
     held = (
         is_thrust_too_low_to_fly(b)
-        and b.height_m > MAX_HEIGHT_STANDING_ON_FLOOR_M
+        and b.height_m > MAX_DRIFTED_HEIGHT_STANDING_ON_FLOOR_M
         and is_motionless(b)
     )
-    if not b.sent.maneuver.descends:
+    if not b.command_history.maneuver.descends_to_floor:
         return held
     at_contact = (
         b.vehicle_world_z_at_last_contact_m is not None
@@ -361,7 +375,8 @@ def _is_hanging(b: Belief) -> bool:
         and abs(b.target.gear_to_target_z_m) <= MAX_HANGING_GEAR_TO_TARGET_Z_M
     )
     stayed = (
-        b.sent.maneuver_start_m[2] - tel.position_m[2] < MAX_DESCENT_WHILE_HELD_M
+        b.command_history.maneuver_start_position_m[2] - tel.position_m[2]
+        < MAX_DESCENT_IF_HELD_AT_START_M
         and not b.target.is_far_above
     )
     return held and (at_contact or at_target or stayed)
@@ -369,25 +384,25 @@ def _is_hanging(b: Belief) -> bool:
 
 def _are_motors_off(b: Belief) -> bool:
     """True if the thrust is zero and the supervisor reports that the vehicle does not fly, or has
-    had `MOTORS_OFF_AFTER_STOP_ORDER_S` to do so."""
-    motor_stop_ordered_at_s = b.sent.motor_stop_ordered_at_s
+    had `MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S` to do so."""
+    motor_stop_commanded_at_s = b.command_history.motor_stop_commanded_at_s
     long_off = (
-        motor_stop_ordered_at_s is not None
-        and b.obs.t_s - motor_stop_ordered_at_s > MOTORS_OFF_AFTER_STOP_ORDER_S
+        motor_stop_commanded_at_s is not None
+        and b.obs.t_s - motor_stop_commanded_at_s > MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S
     )
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
 
-def _is_raw_thrust_ordered(b: Belief) -> bool:
-    return (b.sent.raw_thrust or 0) > 0
+def _is_raw_thrust_commanded(b: Belief) -> bool:
+    return (b.command_history.raw_thrust or 0) > 0
 
 
 def _have_motors_stopped(b: Belief) -> bool:
-    return _are_motors_off(b) and not _is_raw_thrust_ordered(b)
+    return _are_motors_off(b) and not _is_raw_thrust_commanded(b)
 
 
-def _are_motors_off_despite_thrust_order(b: Belief) -> bool:
-    return _are_motors_off(b) and _is_raw_thrust_ordered(b)
+def _are_motors_off_despite_thrust_command(b: Belief) -> bool:
+    return _are_motors_off(b) and _is_raw_thrust_commanded(b)
 
 
 def _is_on_floor(b: Belief) -> bool:
@@ -397,101 +412,111 @@ def _is_on_floor(b: Belief) -> bool:
         b.obs.target is not None
         and abs(b.target.gear_to_target_z_m) <= MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M
     )
-    came_down_m = b.sent.maneuver_start_m[2] - b.telemetry.position_m[2]
-    came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_BEFORE_FLOOR_M
+    came_down_m = b.command_history.maneuver_start_position_m[2] - b.telemetry.position_m[2]
+    came_down = (
+        b.command_history.maneuver.descends_to_floor and came_down_m > MIN_DESCENT_TO_ACCEPT_FLOOR_M
+    )
     handover_m = b.profile.planner.landing.handover_m
     low = b.height_m < handover_m or (came_down and b.vehicle_world_z_at_last_contact_m is None)
     return is_thrust_too_low_to_fly(b) and low and not near_target and is_motionless(b)
 
 
-def _is_blocked(b: Belief) -> bool:
+def _is_pressing_against_obstacle(b: Belief) -> bool:
     """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
     hover thrust or is at its limit, and nothing moves."""
-    setpoint, tel = b.sent.setpoint, b.telemetry
-    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_ABOVE_VEHICLE_TO_PRESS_M:
+    setpoint, tel = b.command_history.setpoint, b.telemetry
+    if (
+        setpoint is None
+        or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M
+    ):
         return False
     strong = (
-        b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS * FULL_THRUST
+        b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
         and is_above_hover_thrust(b)
     )
-    return strong and b.height_m > MIN_BLOCKED_HEIGHT_M and is_motionless(b)
+    return strong and b.height_m > MIN_HEIGHT_OF_BLOCKED_CLIMB_M and is_motionless(b)
 
 
-def _shows_support_by_imu(b: Belief) -> bool:
+def _does_imu_show_support(b: Belief) -> bool:
     """True if accelerometer and thrust alone show that something supports or presses the vehicle:
     in the air, a thrust that differs from hover thrust by as much as
     `MIN_PRESS_TO_HOVER_THRUST_RATIO` says, upwards or downwards, would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
-        0 < hover < MAX_HOVER_TO_FULL_THRUST_TO_PROVE_PRESS * FULL_THRUST
+        0 < hover < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
         and b.is_thrust_known
         and (
             is_above_hover_thrust(b)
             or tel.thrust <= (2.0 - MIN_PRESS_TO_HOVER_THRUST_RATIO) * hover
         )
-        and b.is_reading_one_g
+        and b.is_accelerometer_reading_one_g
         and b.obs.t_s - b.imu.climb_steady_since_s >= perch.contact_dwell_s
     )
 
 
 def _is_thrust_saturated(b: Belief) -> bool:
-    full = b.telemetry.thrust >= SATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
-    return full and MIN_CLIMB_AT_SATURATED_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
+    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    return (
+        full
+        and MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
+    )
 
 
-CONTACT = Condition("contact", _is_in_contact, depends_on=RequiredData.POSITION)
+CONTACT = Condition("contact", _is_in_contact, required_data=RequiredData.POSITION)
 """Contact with the target, proven by position, acceleration and thrust."""
-MAGNET_HOLDS = Condition("magnet holds", _is_magnet_holding, depends_on=RequiredData.TELEMETRY)
+MAGNET_HOLDS_VEHICLE = Condition(
+    "magnet holds", _is_magnet_holding_vehicle, required_data=RequiredData.TELEMETRY
+)
 """The magnet holds the vehicle: low thrust, and no slip."""
 SLIPPING = Condition("slipping", is_slipping)
 """The vehicle falls away from the proven contact."""
-FULL_WEIGHT_HANGS = Condition(
-    "the whole weight hangs", _is_weight_hanging, depends_on=RequiredData.TELEMETRY
+HANGING_WITH_MOTORS_STOPPED = Condition(
+    "the whole weight hangs", _is_hanging_with_motors_stopped, required_data=RequiredData.TELEMETRY
 )
 """The whole weight hangs: the motors stand still, and nothing slips."""
-HANGING = Condition("hanging", _is_hanging, depends_on=RequiredData.POSITION)
+HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
 """Something holds the vehicle up, off the floor."""
 MOTORS_STOPPED = Condition(
-    "motors stopped", _have_motors_stopped, depends_on=RequiredData.TELEMETRY
+    "motors stopped", _have_motors_stopped, required_data=RequiredData.TELEMETRY
 )
 """The motors are off, and the last order does not let them turn."""
-MOTORS_OFF_DESPITE_THRUST_ORDER = Condition(
+MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
     "motors off despite an order",
-    _are_motors_off_despite_thrust_order,
-    depends_on=RequiredData.TELEMETRY,
+    _are_motors_off_despite_thrust_command,
+    required_data=RequiredData.TELEMETRY,
 )
 """The motors are off although the last order was raw thrust: the supervisor has ended the flight.
 It soon lets them turn by that order again (docs/firmware.md, "Supervisor")."""
-ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=RequiredData.POSITION)
+ON_FLOOR = Condition("on the floor", _is_on_floor, required_data=RequiredData.POSITION)
 """The vehicle stands on the floor."""
-CLIMB_BLOCKED = Condition("blocked", _is_blocked)
+CLIMB_BLOCKED = Condition("blocked", _is_pressing_against_obstacle)
 """The vehicle presses against an obstacle below its setpoint."""
-SUPPORT_SHOWN_BY_IMU = Condition(
+IMU_SHOWS_SUPPORT = Condition(
     "supported, by accelerometer and thrust",
-    _shows_support_by_imu,
+    _does_imu_show_support,
     persists_across_phases=True,
-    depends_on=RequiredData.TELEMETRY,
+    required_data=RequiredData.TELEMETRY,
 )
 """Something supports or presses the vehicle, proven by accelerometer and thrust alone."""
-SATURATED_THRUST = Condition(
+THRUST_SATURATED_WITHOUT_CLIMB = Condition(
     "thrust at its limit",
     _is_thrust_saturated,
     persists_across_phases=True,
-    depends_on=RequiredData.TELEMETRY,
+    required_data=RequiredData.TELEMETRY,
 )
 """The thrust is at its limit, and the vehicle does not climb."""
 SUPPORT_CONDITIONS = (
     CONTACT,
-    MAGNET_HOLDS,
+    MAGNET_HOLDS_VEHICLE,
     SLIPPING,
-    FULL_WEIGHT_HANGS,
+    HANGING_WITH_MOTORS_STOPPED,
     HANGING,
     MOTORS_STOPPED,
-    MOTORS_OFF_DESPITE_THRUST_ORDER,
+    MOTORS_OFF_DESPITE_THRUST_COMMAND,
     ON_FLOOR,
     CLIMB_BLOCKED,
-    SUPPORT_SHOWN_BY_IMU,
-    SATURATED_THRUST,
+    IMU_SHOWS_SUPPORT,
+    THRUST_SATURATED_WITHOUT_CLIMB,
 )
 """All conditions of this module."""
 
@@ -502,7 +527,7 @@ class Support(Enum):
     AIR = "nothing: it flies"
     PRESSED_SURFACE = "the target or an obstacle, against which it presses"
     MAGNET = "the target's magnet"
-    HELD_BY_OTHER = "something away from the target, on which it hangs or stands"
+    HELD_BY_OTHER_OBJECT = "something away from the target, on which it hangs or stands"
     FLOOR = "the floor"
     UNKNOWN = "unknown"
 
@@ -535,12 +560,12 @@ def find_support(b: Belief) -> Support:
 def _find_what_vehicle_hangs_on(b: Belief) -> Support:
     touched, radius_m = gear_offset_at_last_touch(b), b.profile.planner.perch.contact_xy_m
     was_near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
-    if was_near or is_at_target(b):
+    if was_near or is_gear_certainly_in_magnet_reach(b):
         return Support.MAGNET
     offset = gear_offset_at_last_touch_or_now(b)
     is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > radius_m
     is_below = touched is None and b.target.gear_to_target_z_m > contact_height_tolerance_m(b)
-    return Support.HELD_BY_OTHER if is_off_axis or is_below else Support.UNKNOWN
+    return Support.HELD_BY_OTHER_OBJECT if is_off_axis or is_below else Support.UNKNOWN
 
 
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
@@ -552,15 +577,19 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     with poor telemetry would hang on the magnet with its motors running. The release that it starts
     still needs fresh telemetry.
     """
-    if condition is HANGING and b.sent.maneuver.descends:
+    if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
-    match condition.depends_on:
+    match condition.required_data:
         case RequiredData.NOTHING:
             return True
         case RequiredData.TELEMETRY:
             return b.is_imu_fresh
         case RequiredData.POSITION:
-            reckons = condition is CONTACT and b.is_positioned_by_target and b.sent.maneuver.presses
+            reckons = (
+                condition is CONTACT
+                and b.is_positioned_by_target
+                and b.command_history.maneuver.presses_against_target
+            )
             return b.is_imu_fresh and (b.is_position_valid or reckons)
 
 
@@ -569,7 +598,7 @@ def has_slipped(b: Belief) -> bool:
     `complete.slip_dwell_s` or, once raw thrust transfers the weight, at the first sign of free
     fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
-    falls = b.sent.release_began_s is not None and tel.acc_z_g < complete.slip_acc_g
-    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_IN_FALL_AFTER_RELEASE_MPS:
+    falls = b.command_history.release_began_at_s is not None and tel.acc_z_g < complete.slip_acc_g
+    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_OF_FALL_AFTER_RELEASE_MPS:
         return True
-    return b.held_s(SLIPPING) >= complete.slip_dwell_s
+    return b.true_for_s(SLIPPING) >= complete.slip_dwell_s

@@ -1,8 +1,8 @@
 """Conditions that become evidence after they have been true for some time.
 
 A condition is true or false in one tick. It counts as evidence only after it has been true without
-interruption for a dwell time, so that a single wrong sample proves nothing. `StartTimes` maps each
-true condition to the time at which it became true.
+interruption for a dwell time, so that a single wrong sample proves nothing. `ConditionStartTimes`
+maps each true condition to the time at which it became true.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
-Knowledge = TypeVar("Knowledge", contravariant=True)
+ConditionInput = TypeVar("ConditionInput", contravariant=True)
 
 
 class RequiredData(Enum):
@@ -25,39 +25,44 @@ class RequiredData(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Condition(Generic[Knowledge]):
-    """A predicate on the current knowledge, evaluated once per tick by `holds`.
+class Condition(Generic[ConditionInput]):
+    """A predicate on the current knowledge, evaluated once per tick by `predicate`.
 
     Attributes:
         name: readable name, for `repr`.
-        holds: function that returns True if the condition is true in this tick.
+        predicate: function that returns True if the condition is true in this tick.
         persists_across_phases: True if the condition describes the vehicle independently of its
             maneuver: a change of phase or a hold does not reset its start time.
-        depends_on: data that must be fresh for the condition to count. A condition that may stop
+        required_data: data that must be fresh for the condition to count. A condition that may stop
             the motors or end a flight depends at least on fresh telemetry.
     """
 
     name: str
-    holds: Callable[[Knowledge], bool]
+    predicate: Callable[[ConditionInput], bool]
     persists_across_phases: bool = False
-    depends_on: RequiredData = RequiredData.NOTHING
+    required_data: RequiredData = RequiredData.NOTHING
 
     def __repr__(self) -> str:
         return f"<condition: {self.name}>"
 
 
-StartTimes = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of several types
+ConditionStartTimes = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of several types
 
 
-def update_start_times(
-    old: StartTimes, conditions: Iterable[Condition[Knowledge]], knowledge: Knowledge, now_s: float
-) -> dict[Condition[Knowledge], float]:
-    """Return the start time of each condition that is true for `knowledge`: the time in `old` if
-    the condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
-    return {each: old.get(each, now_s) for each in conditions if each.holds(knowledge)}
+def update_condition_start_times(
+    old: ConditionStartTimes,
+    conditions: Iterable[Condition[ConditionInput]],
+    condition_input: ConditionInput,
+    now_s: float,
+) -> dict[Condition[ConditionInput], float]:
+    """Return the start time of each condition that is true for `condition_input`: the time in `old`
+    if the condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
+    return {each: old.get(each, now_s) for each in conditions if each.predicate(condition_input)}
 
 
-def keep_persistent_start_times(condition_start_times_s: StartTimes) -> dict[Condition, float]:  # type: ignore[type-arg]
+def keep_persistent_start_times(
+    condition_start_times_s: ConditionStartTimes,
+) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the start times of those conditions that do not restart when the phase changes or a
     hold pauses the mission: the ones with `persists_across_phases`."""
     return {

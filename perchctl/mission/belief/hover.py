@@ -1,11 +1,11 @@
 """Measure hover thrust for the filter in `perchctl.mission.belief.thrust`.
 
 Hover thrust is the reference for every proof of contact and for a descent by raw thrust. In quiet
-flight, the measurement is the thrust itself (`learn_in_quiet_flight`). In a descent by raw thrust,
-it is the thrust divided by the specific force (`learn_in_descent`). Before either has happened,
-`estimate_hover_thrust` falls back on the accelerometer, with a larger standard deviation. The
-estimate is wrong while something supports part of the weight undetected, and after a long descent
-by the scale error of the accelerometer.
+flight, the measurement is the thrust itself (`learn_hover_thrust_in_quiet_flight`). In a descent by
+raw thrust, it is the thrust divided by the specific force (`learn_hover_thrust_in_descent`). Before
+either has happened, `estimate_hover_thrust` falls back on the accelerometer, with a larger standard
+deviation. The estimate is wrong while something supports part of the weight undetected, and after a
+long descent by the scale error of the accelerometer.
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ import math
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_HOVER_THRUST_SIGMA,
-    MIN_POSITION_MODE_THRUST,
+    ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION,
+    MIN_FIRMWARE_POSITION_MODE_THRUST,
     HoverThrust,
 )
 from perchctl.values import replace
 
-HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S = 0.067
+HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT = 0.067
 """Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
 second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
 longer."""
-FALLBACK_HOVER_THRUST_SIGMA = 0.12
+FALLBACK_HOVER_THRUST_SIGMA_FRACTION = 0.12
 """Standard deviation, as a share, of an estimate from the accelerometer alone while the vehicle may
 have been supported. Larger: a descent may correct the estimate further. Smaller: a wrong estimate
 persists."""
-MIN_HOVER_THRUST_SIGMA_IN_DESCENT = 0.04
+MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT = 0.04
 """Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
-MAX_DESCENT_CORRECTION_SIGMAS = 3.0
+MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS = 3.0
 """Largest correction during a descent, in standard deviations at its start. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
-MAX_QUIET_THRUST_DEVIATION_FRACTION = 0.2
+MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION = 0.2
 """Largest difference, as a share, between the thrust in quiet flight and the estimate; a larger one
 means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
 Smaller: a real change is rejected."""
-ROTOR_LAG_S = 0.06
+ROTOR_THRUST_TIME_CONSTANT_S = 0.06
 """Time constant with which the rotors follow an ordered thrust, s (docs/firmware.md; 50 to 80 ms in
 real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
-MAX_TELEMETRY_AGE_S = 1.0
+MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S = 1.0
 """Age beyond which telemetry says nothing about the present thrust, s."""
-MIN_SPECIFIC_FORCE_FOR_LEARNING_G = 0.7
+MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 0.7
 """Smallest specific force at which thrust divided by specific force measures hover thrust, g.
 Smaller: a fall corrupts the estimate."""
-MAX_SPECIFIC_FORCE_FOR_LEARNING_G = 1.3
+MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: a blow corrupts the estimate."""
-MIN_THRUST_TO_HOVER_RATIO_FOR_LEARNING = 0.5
+MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST = 0.5
 """Share of the hover thrust at the start of the descent below which thrust is not proportional to
 force, so that nothing is learned from it."""
-SPECIFIC_FORCE_CLAMP_MIN_G = 0.75
+MIN_CLAMPED_SPECIFIC_FORCE_G = 0.75
 """Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
-SPECIFIC_FORCE_CLAMP_MAX_G = 1.5
+MAX_CLAMPED_SPECIFIC_FORCE_G = 1.5
 """Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
 it."""
 
@@ -63,56 +63,66 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
     """Return the hover thrust measured by the filter (`HoverThrust`). While it has measured
     nothing, return the mean ratio of thrust (0..65535) to specific force (g) in flight, and without
     that, the ratio in the newest sample. Both fallbacks have the standard deviation
-    `FALLBACK_HOVER_THRUST_SIGMA`."""
+    `FALLBACK_HOVER_THRUST_SIGMA_FRACTION`."""
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry
-    divisor_g = min(SPECIFIC_FORCE_CLAMP_MAX_G, max(SPECIFIC_FORCE_CLAMP_MIN_G, tel.acc_z_g))
-    sample = max(MIN_POSITION_MODE_THRUST, tel.thrust / divisor_g)
-    return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA)
+    divisor_g = min(MAX_CLAMPED_SPECIFIC_FORCE_G, max(MIN_CLAMPED_SPECIFIC_FORCE_G, tel.acc_z_g))
+    sample = max(MIN_FIRMWARE_POSITION_MODE_THRUST, tel.thrust / divisor_g)
+    return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA_FRACTION)
 
 
 def rotor_thrust(b: Belief, dt_s: float) -> float:
     """Return the thrust, 0..65535, that the rotors produce `dt_s` after the previous sample: the
-    reported thrust through a first-order lag with the time constant `ROTOR_LAG_S`."""
+    reported thrust through a first-order lag with the time constant
+    `ROTOR_THRUST_TIME_CONSTANT_S`."""
     before, read = b.rotor_thrust, b.telemetry.thrust
     if before is None:
         return read
-    return before + (1.0 - math.exp(-dt_s / ROTOR_LAG_S)) * (read - before)
+    return before + (1.0 - math.exp(-dt_s / ROTOR_THRUST_TIME_CONSTANT_S)) * (read - before)
 
 
-def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
+def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     """Return the estimate after a tick in which the thrust equals hover thrust. `dt_s` is the time
     since the previous sample, 0 if the telemetry has no new one."""
     thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
     if old.thrust == 0.0:
-        return HoverThrust(b.imu.mean_hover_thrust or thrust, ACCELEROMETER_HOVER_THRUST_SIGMA)
-    if abs(thrust / old.thrust - 1.0) > MAX_QUIET_THRUST_DEVIATION_FRACTION:
+        return HoverThrust(
+            b.imu.mean_hover_thrust or thrust, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION
+        )
+    if abs(thrust / old.thrust - 1.0) > MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION:
         return old  # the ceiling or a hand holds the vehicle
     return old.with_measurement(thrust, dt_s)
 
 
-def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
+def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     """Return the estimate after a tick of a descent by raw thrust; `dt_s` as in
-    `learn_in_quiet_flight`. The estimate does not change while the floor or a magnet may support
-    part of the weight, or while the telemetry is too old or outside the range in which thrust is
-    proportional to force."""
+    `learn_hover_thrust_in_quiet_flight`. The estimate does not change while the floor or a magnet
+    may support part of the weight, or while the telemetry is too old or outside the range in which
+    thrust is proportional to force."""
     tel, old = b.telemetry, estimate_hover_thrust(b)
     thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
     start = old.estimate_before_descent or HoverThrust(
-        old.thrust, max(MIN_HOVER_THRUST_SIGMA_IN_DESCENT, old.sigma)
+        old.thrust, max(MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT, old.sigma)
     )
     first, sigma = start.thrust, start.sigma
     old = replace(old, estimate_before_descent=start)
     shows = (
-        MIN_SPECIFIC_FORCE_FOR_LEARNING_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_FOR_LEARNING_G
-        and thrust >= MIN_THRUST_TO_HOVER_RATIO_FOR_LEARNING * first
+        MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
+        <= tel.acc_z_g
+        <= MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
+        and thrust >= MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST * first
     )
-    is_on_floor = b.sent.floor_detected_at_s is not None
-    if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or is_on_floor:
+    is_on_floor = b.command_history.floor_detected_at_s is not None
+    if (
+        b.attitude_age_s > MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+        or not shows
+        or b.is_in_magnet_reach
+        or is_on_floor
+    ):
         return old
-    new = old.propagate(dt_s, HOVER_THRUST_DESCENT_DRIFT_PER_SQRT_S).with_measurement(
+    new = old.propagate(dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT).with_measurement(
         thrust / tel.acc_z_g, dt_s
     )
-    most = MAX_DESCENT_CORRECTION_SIGMAS * sigma
+    most = MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS * sigma
     return replace(new, thrust=min((1.0 + most) * first, max((1.0 - most) * first, new.thrust)))

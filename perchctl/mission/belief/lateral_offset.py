@@ -24,29 +24,29 @@ from perchctl.values import replace
 
 LateralVector = tuple[float, float]
 
-ACCELERATION_NOISE_MPS2 = 0.15
+ACCELERATION_NOISE_SIGMA_MPS2 = 0.15
 """Standard deviation of the acceleration that the lean does not explain, m/s^2. Larger: the
 velocity follows the noise of single pictures. Smaller: after a gust, the offset lags behind."""
-ACCELERATION_NOISE_CORRELATION_S = 0.1
+ACCELERATION_NOISE_CORRELATION_TIME_S = 0.1
 """Correlation time of that acceleration, s. Larger: as a larger standard deviation."""
-MIN_PICTURE_SIGMA_M = 0.0005
+MIN_PICTURE_OFFSET_SIGMA_M = 0.0005
 """Smallest standard deviation of a picture's offset, m: attitude and exposure time are not exact,
 either. Smaller: the velocity follows their errors."""
-START_VELOCITY_SIGMA_MPS = 0.3
+INITIAL_VELOCITY_SIGMA_MPS = 0.3
 """Standard deviation of the unknown velocity at the first picture, m/s."""
 ESTIMATED_VELOCITY_SIGMA_MPS = 0.04
 """Standard deviation of the estimated velocity, m/s, as if each sample had an error of its own; the
 error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an acceleration that the
 lean does not explain is noticed a picture later. Smaller: the error of the estimate moves the
 vehicle."""
-MAX_PICTURE_GAP_S = 0.5
+MAX_AGE_OF_NEWEST_PICTURE_S = 0.5
 """Longest time from picture to picture, and from the newest picture to a prediction, s. Larger: a
 gust moves the vehicle unnoticed. Smaller: the last centimetres are flown by the state estimate."""
-RESTART_NIS = 20.0
+MIN_NIS_TO_RESTART_FILTER = 20.0
 """Normalized innovation squared, two degrees of freedom, with which a picture restarts the filter:
 exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
 wrong."""
-MAX_SIGMA_OF_USED_VELOCITY_MPS = 0.03
+MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS = 0.03
 """Largest standard deviation of the filter's velocity with which the filter is used, m/s; with a
 larger one, `predict` returns None. Larger: the vehicle is steered by the first pictures' noise."""
 
@@ -75,9 +75,9 @@ class OffsetVelocityCovariance(NamedTuple):
     """Covariance of lateral offset and lateral velocity along one axis; that along x and that along
     y are equal."""
 
-    offset_m2: float = 0.0  # variance of the offset
-    offset_velocity_m2ps: float = 0.0  # covariance of offset and velocity
-    velocity_m2ps2: float = 0.0  # variance of the velocity
+    offset_variance_m2: float = 0.0  # variance of the offset
+    offset_velocity_covariance_m2ps: float = 0.0  # covariance of offset and velocity
+    velocity_variance_m2ps2: float = 0.0  # variance of the velocity
 
 
 UNKNOWN_COVARIANCE = OffsetVelocityCovariance()
@@ -106,18 +106,18 @@ class LateralOffsetFilter:
         if kept and sample.t_s <= kept[-1].t_s:
             return self
         first = 0
-        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_PICTURE_GAP_S:
+        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_AGE_OF_NEWEST_PICTURE_S:
             first += 1
         return replace(self, samples=(*kept[first:], sample))
 
-    def with_picture(
+    def with_picture_measurement(
         self, t_s: float, offset_m: LateralVector, sigma_m: float
     ) -> LateralOffsetFilter:
         """Return the filter after a picture exposed at `t_s` that measured the offset."""
         if t_s <= self.t_s:
             return self
-        variance_m2 = max(sigma_m, MIN_PICTURE_SIGMA_M) ** 2
-        if t_s - self.t_s > MAX_PICTURE_GAP_S:
+        variance_m2 = max(sigma_m, MIN_PICTURE_OFFSET_SIGMA_M) ** 2
+        if t_s - self.t_s > MAX_AGE_OF_NEWEST_PICTURE_S:
             return self._restart(t_s, offset_m, variance_m2)
         predicted = self._predict(t_s)
         p_ee, p_ev, p_vv = predicted.covariance
@@ -126,13 +126,13 @@ class LateralOffsetFilter:
             offset_m[1] - predicted.offset_m[1],
         )
         innovation_variance_m2 = p_ee + variance_m2
-        if math.hypot(*innovation_m) ** 2 > RESTART_NIS * innovation_variance_m2:
+        if math.hypot(*innovation_m) ** 2 > MIN_NIS_TO_RESTART_FILTER * innovation_variance_m2:
             return self._restart(t_s, offset_m, variance_m2)
         gain_e, gain_v = p_ee / innovation_variance_m2, p_ev / innovation_variance_m2
         return replace(
             predicted,
-            offset_m=_add(predicted.offset_m, gain_e, innovation_m),
-            velocity_mps=_add(predicted.velocity_mps, gain_v, innovation_m),
+            offset_m=_add_scaled(predicted.offset_m, gain_e, innovation_m),
+            velocity_mps=_add_scaled(predicted.velocity_mps, gain_v, innovation_m),
             covariance=OffsetVelocityCovariance(
                 (1.0 - gain_e) * p_ee, (1.0 - gain_e) * p_ev, p_vv - gain_v * p_ev
             ),
@@ -140,11 +140,14 @@ class LateralOffsetFilter:
 
     def predict(self, t_s: float) -> LateralOffset | None:
         """Return the estimate at `t_s`; None if the newest picture is older than
-        `MAX_PICTURE_GAP_S`, or while the velocity is less certain than
-        `MAX_SIGMA_OF_USED_VELOCITY_MPS`."""
-        if not 0.0 <= t_s - self.t_s <= MAX_PICTURE_GAP_S:
+        `MAX_AGE_OF_NEWEST_PICTURE_S`, or while the velocity is less certain than
+        `MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS`."""
+        if not 0.0 <= t_s - self.t_s <= MAX_AGE_OF_NEWEST_PICTURE_S:
             return None
-        if math.sqrt(self.covariance.velocity_m2ps2) > MAX_SIGMA_OF_USED_VELOCITY_MPS:
+        if (
+            math.sqrt(self.covariance.velocity_variance_m2ps2)
+            > MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS
+        ):
             return None
         predicted = self._predict(t_s)
         p_ee, _, p_vv = predicted.covariance
@@ -160,7 +163,7 @@ class LateralOffsetFilter:
             t_s=t_s,
             offset_m=offset_m,
             velocity_mps=(0.0, 0.0),
-            covariance=OffsetVelocityCovariance(variance_m2, 0.0, START_VELOCITY_SIGMA_MPS**2),
+            covariance=OffsetVelocityCovariance(variance_m2, 0.0, INITIAL_VELOCITY_SIGMA_MPS**2),
         )
 
     def _predict(self, t_s: float) -> LateralOffsetFilter:
@@ -170,7 +173,7 @@ class LateralOffsetFilter:
         for sample in self.samples:
             if sample.t_s > predicted.t_s:
                 assert before is not None
-                mean_mps2 = _add(
+                mean_mps2 = _add_scaled(
                     (0.5 * before.acceleration_mps2[0], 0.5 * before.acceleration_mps2[1]),
                     0.5,
                     sample.acceleration_mps2,
@@ -178,21 +181,21 @@ class LateralOffsetFilter:
                 predicted = predicted._propagate(min(t_s, sample.t_s), mean_mps2)
                 if sample.t_s > t_s:
                     return predicted
-                predicted = predicted._with_velocity(sample.velocity_mps)
+                predicted = predicted._with_velocity_measurement(sample.velocity_mps)
             before = sample
         return predicted._propagate(t_s, (0.0, 0.0) if before is None else before.acceleration_mps2)
 
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
         """Return the filter at `t_s` after a constant acceleration."""
         dt_s = t_s - self.t_s
-        density = ACCELERATION_NOISE_MPS2**2 * ACCELERATION_NOISE_CORRELATION_S
+        density = ACCELERATION_NOISE_SIGMA_MPS2**2 * ACCELERATION_NOISE_CORRELATION_TIME_S
         p_ee, p_ev, p_vv = self.covariance
-        moved_m = _add(self.offset_m, -dt_s, self.velocity_mps)
+        moved_m = _add_scaled(self.offset_m, -dt_s, self.velocity_mps)
         return replace(
             self,
             t_s=t_s,
-            offset_m=_add(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
-            velocity_mps=_add(self.velocity_mps, dt_s, acceleration_mps2),
+            offset_m=_add_scaled(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
+            velocity_mps=_add_scaled(self.velocity_mps, dt_s, acceleration_mps2),
             covariance=OffsetVelocityCovariance(
                 p_ee - 2.0 * dt_s * p_ev + dt_s**2 * p_vv + density * dt_s**3 / 3.0,
                 p_ev - dt_s * p_vv - density * dt_s**2 / 2.0,
@@ -200,23 +203,23 @@ class LateralOffsetFilter:
             ),
         )
 
-    def _with_velocity(self, velocity_mps: LateralVector) -> LateralOffsetFilter:
+    def _with_velocity_measurement(self, velocity_mps: LateralVector) -> LateralOffsetFilter:
         """Return the filter after a measurement of the vehicle's velocity at the filter's time,
         `t_s`."""
         p_ee, p_ev, p_vv = self.covariance
         variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
         gain_e, gain_v = p_ev / variance, p_vv / variance
-        innovation_mps = _add(velocity_mps, -1.0, self.velocity_mps)
+        innovation_mps = _add_scaled(velocity_mps, -1.0, self.velocity_mps)
         return replace(
             self,
-            offset_m=_add(self.offset_m, gain_e, innovation_mps),
-            velocity_mps=_add(self.velocity_mps, gain_v, innovation_mps),
+            offset_m=_add_scaled(self.offset_m, gain_e, innovation_mps),
+            velocity_mps=_add_scaled(self.velocity_mps, gain_v, innovation_mps),
             covariance=OffsetVelocityCovariance(
                 p_ee - gain_e * p_ev, (1.0 - gain_v) * p_ev, (1.0 - gain_v) * p_vv
             ),
         )
 
 
-def _add(a: LateralVector, factor: float, b: LateralVector) -> LateralVector:
-    """Return ``a + factor * b``."""
-    return a[0] + factor * b[0], a[1] + factor * b[1]
+def _add_scaled(vector: LateralVector, factor: float, added_vector: LateralVector) -> LateralVector:
+    """Return ``vector + factor * b``."""
+    return vector[0] + factor * added_vector[0], vector[1] + factor * added_vector[1]

@@ -34,19 +34,19 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, FULL_THRUST, Telemetry
 
 Vector = tuple[float, float, float]
-ZERO: Vector = (0.0, 0.0, 0.0)
+ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 MAX_TELEMETRY_GAP_S = 0.2
 """Time without telemetry that counts as a silence, s. In this time a vehicle falls 20 cm, more than
 is possible for one that still hangs. Larger: a silence can hide a fall. Smaller: two lost packets
 count as a silence."""
-MAX_GAP_SPEED_CHANGE_MPS = 0.25
+MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
 """Largest speed that noise of the estimate can add to a hanging vehicle across a silence, m/s.
 Larger: a short fall goes undetected."""
 MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
 """Largest distance across a silence that the speed before it does not explain, m. Larger: a short
 fall goes undetected."""
-MAX_CLIMB_IN_FALL_ACROSS_GAP_MPS = -0.3
+MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS = -0.3
 """Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging one
 never reaches it, a fall reaches it after 5 cm. Closer to 0: noise counts as a fall."""
 MAX_FROZEN_READING_S = 0.2
@@ -58,26 +58,26 @@ fall."""
 MIN_FREE_FALL_DURATION_S = 0.1
 """Time for which a falling vehicle reads less than `MAX_FREE_FALL_READING_G`, s; a rebound is
 shorter. Larger: a fall is detected 5 cm later."""
-MAX_CLIMB_GAINED_IN_FALL_MPS = -0.25
-"""Climb rate gained within `SINK_TIME_CONSTANT_S` below which the vehicle falls whatever the
-accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
-MAX_RISE_BEFORE_FALL_MPS = 0.5
-"""Largest upward speed, gained within `SINK_TIME_CONSTANT_S`, that a vehicle must lose before it
-falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a climb that is braked
-counts as a fall."""
-SINK_TIME_CONSTANT_S = 1.5
+MAX_CLIMB_RATE_GAINED_IN_FALL_MPS = -0.25
+"""Climb rate gained within `FALL_SPEED_GAIN_TIME_CONSTANT_S` below which the vehicle falls whatever
+the accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
+MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS = 0.5
+"""Largest upward speed, gained within `FALL_SPEED_GAIN_TIME_CONSTANT_S`, that a vehicle must lose
+before it falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a climb that is
+braked counts as a fall."""
+FALL_SPEED_GAIN_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
 UP_ACCELERATION_OFFSET_TIME_CONSTANT_S = 3.0
 """Time constant with which the offset of the vertical acceleration is learned, s. Smaller: a slow
 fall is learned as an offset."""
-MAX_UP_ACCELERATION_CEILING_IMPACT_G = -0.3
+MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G = -0.3
 """Acceleration along the world's upward axis below which a reading is an impact on the ceiling and
 not a fall, g. Closer to 0: the first samples of a fall are cut off."""
 MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
-"""Upward speed gained within `FLOOR_IMPACT_TIME_CONSTANT_S` that only the floor can cause, m/s.
-Smaller: an increase of thrust counts as the floor."""
-FLOOR_IMPACT_TIME_CONSTANT_S = 0.1
+"""Upward speed gained within `FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S` that only the floor can
+cause, m/s. Smaller: an increase of thrust counts as the floor."""
+FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S = 0.1
 """Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to a
 blow."""
 MAX_IMPACT_DETECTION_DELAY_S = 0.05
@@ -97,17 +97,17 @@ LATERAL_VELOCITY_TIME_CONSTANT_S = 0.15
 ACCELEROMETER_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
 of the floor is learned."""
-MIN_PUSH_G = 0.06
+MIN_LATERAL_PUSH_G = 0.06
 """Lateral specific force that only a push causes, g. Smaller: drag in flight counts as a push."""
-MAX_PUSH_TO_ESTIMATE_DELAY_S = 1.5
+MAX_DELAY_OF_PUSH_IN_ESTIMATE_S = 1.5
 """Longest delay with which a push shows in the state estimate, s."""
-PUSH_TIME_CONSTANT_S = 0.05
+LATERAL_PUSH_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: running motors shake single samples as hard as a
 push."""
-MIN_ESTIMATE_VELOCITY_STEP_MPS = 0.08
+MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
 """Lateral speed gained between two samples above which the gain is a correction of the estimate and
 not a motion, m/s."""
-ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 = 5.0
+ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 = 5.0
 """Increase of that threshold for each second between the two samples, m/s^2."""
 TILT_ERROR_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes a wrong tilt, s."""
@@ -115,9 +115,9 @@ HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
 MIN_HOVER_FRACTION_OF_FULL_THRUST = 0.4
 """Share of full thrust below which no vehicle hovers."""
-HOVER_THRUST_SATURATION_FRACTION = 0.95
+MAX_UNSATURATED_FRACTION_OF_FULL_THRUST = 0.95
 """Share of full thrust above which the motors are saturated and the thrust for 1 g is unknown."""
-MIN_VARIANCE_GROWTH_M2PS2_PER_S = 5e-4
+MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S = 5e-4
 """Least growth of the variance of the vertical speed that shows a missing correction, (m/s)^2 per
 second: half of its growth without any corrections."""
 NO_FUSION_TIMEOUT_S = 0.45
@@ -144,7 +144,9 @@ class FusionAge:
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
-        least = MIN_VARIANCE_GROWTH_M2PS2_PER_S * (sample.t_s - self.variance_changed_at_s)
+        least = MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S * (
+            sample.t_s - self.variance_changed_at_s
+        )
         grows = before is not None and variance - before >= least
         no_fusion_since_s = (
             min(self.no_fusion_since_s, self.variance_changed_at_s) if grows else math.inf
@@ -158,9 +160,9 @@ class Impact:
 
     t_s: float = -math.inf  # -inf: no impact yet
     # vertical speed just before the blow, from the state estimate
-    estimated_climb_before_mps: float = 0.0
+    estimated_climb_before_impact_mps: float = 0.0
     # vertical speed just before the blow, from `ImuMotion.velocity_mps`
-    imu_climb_before_mps: float = 0.0
+    imu_climb_before_impact_mps: float = 0.0
     peak_g: float = 0.0  # largest specific force during the blow along the body's z axis
     z_m: float = 0.0  # height in the state estimate at the blow
 
@@ -208,44 +210,53 @@ class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
     Let a be the vertical acceleration minus its slowly learned offset, positive up, without
-    decelerations harder than `MAX_UP_ACCELERATION_CEILING_IMPACT_G`. The climb rate v gained
+    decelerations harder than `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`. The climb rate v gained
     recently is
 
-        v' = min(MAX_RISE_BEFORE_FALL_MPS, v + a dt - v dt / SINK_TIME_CONSTANT_S)
+        v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS, v + a dt - v dt /
+        FALL_SPEED_GAIN_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
-    `MAX_CLIMB_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less than
-    `MAX_FREE_FALL_READING_G` for `MIN_FREE_FALL_DURATION_S`, longer than a rebound lasts. A slow
-    sink goes undetected because it is learned as an offset.
+    `MAX_CLIMB_RATE_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less
+    than `MAX_FREE_FALL_READING_G` for `MIN_FREE_FALL_DURATION_S`, longer than a rebound lasts. A
+    slow sink goes undetected because it is learned as an offset.
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
     # time since which the accelerometer has read less than `MAX_FREE_FALL_READING_G`
     low_g_since_s: float = math.inf
-    sink_mps: float = 0.0
-    vertical_offset_mps2: float = 0.0
+    climb_rate_gained_mps: float = 0.0
+    vertical_acceleration_offset_mps2: float = 0.0
 
-    def update_fall(self, t_s: float, up_mps2: float, acc_z_g: float, dt_s: float) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `acc_z_g` is the
-        specific force along the body's z axis at the end of that time."""
-        offset = self.vertical_offset_mps2 + (
+    def update_fall(
+        self, t_s: float, up_acceleration_mps2: float, acc_z_g: float, dt_s: float
+    ) -> Self:
+        """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`;
+        `acc_z_g` is the specific force along the body's z axis at the end of that time."""
+        offset = self.vertical_acceleration_offset_mps2 + (
             max(
-                MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2,
-                min(-MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2),
+                MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2,
+                min(-MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2, up_acceleration_mps2),
             )
-            - self.vertical_offset_mps2
+            - self.vertical_acceleration_offset_mps2
         ) * min(1.0, dt_s / UP_ACCELERATION_OFFSET_TIME_CONSTANT_S)
-        corrected_mps2 = max(up_mps2, MAX_UP_ACCELERATION_CEILING_IMPACT_G * GRAVITY_MPS2) - offset
-        sink = self.sink_mps + corrected_mps2 * dt_s
-        sink = min(MAX_RISE_BEFORE_FALL_MPS, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
+        corrected_mps2 = (
+            max(up_acceleration_mps2, MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2)
+            - offset
+        )
+        sink = self.climb_rate_gained_mps + corrected_mps2 * dt_s
+        sink = min(
+            MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
+            sink - sink * dt_s / FALL_SPEED_GAIN_TIME_CONSTANT_S,
+        )
         light = min(self.low_g_since_s, t_s) if acc_z_g < MAX_FREE_FALL_READING_G else math.inf
-        fell = sink < MAX_CLIMB_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
+        fell = sink < MAX_CLIMB_RATE_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
         return replace(
             self,
             last_fall_at_s=t_s if fell else self.last_fall_at_s,
             low_g_since_s=light,
-            sink_mps=sink,
-            vertical_offset_mps2=offset,
+            climb_rate_gained_mps=sink,
+            vertical_acceleration_offset_mps2=offset,
         )
 
 
@@ -259,14 +270,17 @@ class ImpactDetector:
     recent_samples: tuple[Impact, ...] = ()  # states just before a blow that begins now
     newest_impact: Impact = Impact()  # newest blow from below
 
-    def update_impact(self, newest_sample: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `newest_sample`
-        holds time, speeds and specific force of the new sample, and `z_m` is its estimated
-        height."""
+    def update_impact(
+        self, newest_sample: Impact, z_m: float, up_acceleration_mps2: float, dt_s: float
+    ) -> Self:
+        """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`.
+        `newest_sample` holds time, speeds and specific force of the new sample, and `z_m` is its
+        estimated height."""
         speed_gained_in_impact_mps = max(
             0.0,
-            self.speed_gained_in_impact_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S)
-            + up_mps2 * dt_s,
+            self.speed_gained_in_impact_mps
+            * math.exp(-dt_s / FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S)
+            + up_acceleration_mps2 * dt_s,
         )
         recent = (
             m
@@ -305,8 +319,8 @@ def _newest_impact(
     if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
         begun = Impact(
             newest_sample.t_s,
-            min(moment.estimated_climb_before_mps for moment in recent_samples),
-            min(moment.imu_climb_before_mps for moment in recent_samples),
+            min(moment.estimated_climb_before_impact_mps for moment in recent_samples),
+            min(moment.imu_climb_before_impact_mps for moment in recent_samples),
             max(moment.peak_g for moment in recent_samples),
             z_m,
         )
@@ -315,16 +329,18 @@ def _newest_impact(
         return replace(
             old,
             peak_g=max(old.peak_g, begun.peak_g),
-            estimated_climb_before_mps=min(
-                old.estimated_climb_before_mps, begun.estimated_climb_before_mps
+            estimated_climb_before_impact_mps=min(
+                old.estimated_climb_before_impact_mps, begun.estimated_climb_before_impact_mps
             ),
-            imu_climb_before_mps=min(old.imu_climb_before_mps, begun.imu_climb_before_mps),
+            imu_climb_before_impact_mps=min(
+                old.imu_climb_before_impact_mps, begun.imu_climb_before_impact_mps
+            ),
         )
     return replace(old, peak_g=max(old.peak_g, newest_sample.peak_g)) if follows else old
 
 
 @dataclass(frozen=True)
-class SteadySpeed:
+class SteadySpeedDetector:
     """Loop times since when the vertical speed has been constant, and since when the lateral
     velocity has been close to its mean."""
 
@@ -333,7 +349,7 @@ class SteadySpeed:
     # time since which the lateral velocity has been constant
     lateral_steady_since_s: float = math.inf
     # mean over `LATERAL_VELOCITY_TIME_CONSTANT_S`
-    mean_lateral_mps: tuple[float, float] = (0.0, 0.0)
+    mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
 
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, at a velocity in world axes."""
@@ -343,44 +359,47 @@ class SteadySpeed:
             climb_steady_since_s, steady_climb_mps = t_s, z
         lateral_steady_since_s, (mean_x, mean_y) = (
             self.lateral_steady_since_s,
-            self.mean_lateral_mps,
+            self.mean_lateral_velocity_mps,
         )
         keeps = math.exp(-dt_s / LATERAL_VELOCITY_TIME_CONSTANT_S)
-        mean_lateral_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-        if math.dist((x, y), mean_lateral_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
+        mean_lateral_velocity_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
+        if math.dist((x, y), mean_lateral_velocity_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
             lateral_steady_since_s = t_s
         return replace(
             self,
             climb_steady_since_s=climb_steady_since_s,
             steady_climb_mps=steady_climb_mps,
             lateral_steady_since_s=lateral_steady_since_s,
-            mean_lateral_mps=mean_lateral_mps,
+            mean_lateral_velocity_mps=mean_lateral_velocity_mps,
         )
 
 
 @dataclass(frozen=True)
-class PushDetector:
+class LateralPushDetector:
     """Time of the last lateral push: the specific force perpendicular to the body's z axis,
-    averaged with the time constant `PUSH_TIME_CONSTANT_S`, exceeded `MIN_PUSH_G`, more than drag in
-    flight causes."""
+    averaged with the time constant `LATERAL_PUSH_TIME_CONSTANT_S`, exceeded `MIN_LATERAL_PUSH_G`,
+    more than drag in flight causes."""
 
-    mean_lateral_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
-    last_push_at_s: float = -math.inf  # time of the last lateral push
+    mean_lateral_specific_force_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
+    last_lateral_push_at_s: float = -math.inf  # time of the last lateral push
 
-    def update_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
-        """Return the detector after `dt_s`; `offset_g` is the accelerometer's offset at rest."""
-        keeps = math.exp(-dt_s / PUSH_TIME_CONSTANT_S)
-        x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
-        mean_x_g, mean_y_g = self.mean_lateral_g
-        mean_lateral_g = (
-            x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
-            y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
+    def update_lateral_push(
+        self, new: Telemetry, accelerometer_offset_g: Vector, dt_s: float
+    ) -> Self:
+        """Return the detector after `dt_s`; `accelerometer_offset_g` is the accelerometer's offset
+        at rest."""
+        keeps = math.exp(-dt_s / LATERAL_PUSH_TIME_CONSTANT_S)
+        x_g, y_g = new.acc_x_g - accelerometer_offset_g[0], new.acc_y_g - accelerometer_offset_g[1]
+        mean_x_g, mean_y_g = self.mean_lateral_specific_force_g
+        mean_lateral_specific_force_g = (
+            x_g + keeps * (mean_x_g - new.acc_x_g + accelerometer_offset_g[0]),
+            y_g + keeps * (mean_y_g - new.acc_y_g + accelerometer_offset_g[1]),
         )
-        pushes = math.hypot(*mean_lateral_g) > MIN_PUSH_G
+        pushes = math.hypot(*mean_lateral_specific_force_g) > MIN_LATERAL_PUSH_G
         return replace(
             self,
-            mean_lateral_g=mean_lateral_g,
-            last_push_at_s=new.t_s if pushes else self.last_push_at_s,
+            mean_lateral_specific_force_g=mean_lateral_specific_force_g,
+            last_lateral_push_at_s=new.t_s if pushes else self.last_lateral_push_at_s,
         )
 
 
@@ -388,18 +407,22 @@ class PushDetector:
 
 
 @dataclass(frozen=True)
-class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushDetector):
+class ImuMotion(
+    FreezeDetector, FallDetector, ImpactDetector, SteadySpeedDetector, LateralPushDetector
+):
     """The vehicle's motion from accelerometer and attitude alone; a loop time of -inf means
     never."""
 
     t_s: float = -math.inf  # time of the newest sample
-    velocity_mps: Vector = ZERO  # velocity gained since the first sample, world axes
-    accelerometer_offset_g: Vector = ZERO  # offset of the accelerometer at rest, body axes
+    velocity_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
+    accelerometer_offset_g: Vector = ZERO_VECTOR  # offset of the accelerometer at rest, body axes
     last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest silence
     # end of the newest silence that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
-    restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
-    sunk_while_frozen_m: float = 0.0  # descent by the estimate while the accelerometer was frozen
+    integration_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
+    descent_while_frozen_m: float = (
+        0.0  # descent by the estimate while the accelerometer was frozen
+    )
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
     # errors of roll and pitch due to corrections
     roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
@@ -417,7 +440,7 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         motion = replace(
             self.update_freeze(last, new),
             t_s=new.t_s,
-            restarted_at_s=new.t_s if started_anew else self.restarted_at_s,
+            integration_restarted_at_s=new.t_s if started_anew else self.integration_restarted_at_s,
             fusion_age=self.fusion_age.update(new),
             motors_off_since_s=min(self.motors_off_since_s, new.t_s)
             if new.thrust < 1
@@ -429,20 +452,22 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
             or motion.acceleration_frozen_for_s > MAX_FROZEN_READING_S
         ):
             return _restart_after_gap(motion, last, new)
-        motion, up_mps2 = _integrate_acceleration(motion, last, new, dt_s)
+        motion, up_acceleration_mps2 = _integrate_acceleration(motion, last, new, dt_s)
         now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
         motion = (
-            motion.update_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
-            .update_impact(now, new.position_m[2], up_mps2, dt_s)
+            motion.update_fall(new.t_s, up_acceleration_mps2, new.acc_z_g, dt_s)
+            .update_impact(now, new.position_m[2], up_acceleration_mps2, dt_s)
             .update_steady_speed(new.t_s, motion.velocity_mps, dt_s)
-            .update_push(new, motion.accelerometer_offset_g, dt_s)
+            .update_lateral_push(new, motion.accelerometer_offset_g, dt_s)
         )
         hover_thrust = _filter_hover_thrust(motion.mean_hover_thrust, new, dt_s)
-        return replace(motion, sunk_while_frozen_m=0.0, mean_hover_thrust=hover_thrust)
+        return replace(motion, descent_while_frozen_m=0.0, mean_hover_thrust=hover_thrust)
 
     @staticmethod
-    def acceleration_mps2(
-        sample: Telemetry, offset_g: Vector, tilt_error_rad: tuple[float, float] = (0.0, 0.0)
+    def compute_acceleration_world_mps2(
+        sample: Telemetry,
+        accelerometer_offset_g: Vector,
+        tilt_error_rad: tuple[float, float] = (0.0, 0.0),
     ) -> Vector:
         """Return the acceleration in world axes from the specific force and attitude of a sample,
         corrected for the accelerometer's offset and for the error of roll and pitch,
@@ -454,8 +479,11 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
         cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
-        fx, fy = sample.acc_x_g - offset_g[0], sample.acc_y_g - offset_g[1]
-        fz = sample.acc_z_g - offset_g[2]
+        fx, fy = (
+            sample.acc_x_g - accelerometer_offset_g[0],
+            sample.acc_y_g - accelerometer_offset_g[1],
+        )
+        fz = sample.acc_z_g - accelerometer_offset_g[2]
         level_x = cp * fx + sp * (sr * fy + cr * fz)
         level_y = cr * fy - sr * fz
         up = -sp * fx + cp * (sr * fy + cr * fz)
@@ -476,26 +504,28 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
         climb_steady_since_s=new.t_s,
         steady_climb_mps=motion.velocity_mps[2],
         lateral_steady_since_s=new.t_s,
-        mean_lateral_mps=motion.velocity_mps[:2],
-        sink_mps=0.0,
+        mean_lateral_velocity_mps=motion.velocity_mps[:2],
+        climb_rate_gained_mps=0.0,
         speed_gained_in_impact_mps=0.0,
         low_g_since_s=math.inf,
     )
     if last is None:
-        return replace(motion, sunk_while_frozen_m=0.0)
-    sunk_m = min(0.0, motion.sunk_while_frozen_m + new.position_m[2] - last.position_m[2])
+        return replace(motion, descent_while_frozen_m=0.0)
+    descended_m = min(0.0, motion.descent_while_frozen_m + new.position_m[2] - last.position_m[2])
     alive = 0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_S and new.start == last.start
-    if alive and _excludes_fall(last, new, sunk_m):
-        return replace(motion, last_telemetry_gap_ended_at_s=new.t_s, sunk_while_frozen_m=sunk_m)
+    if alive and _can_exclude_fall(last, new, descended_m):
+        return replace(
+            motion, last_telemetry_gap_ended_at_s=new.t_s, descent_while_frozen_m=descended_m
+        )
     return replace(
         motion,
         last_telemetry_gap_ended_at_s=new.t_s,
         last_gap_that_may_hide_fall_ended_at_s=new.t_s,
-        sunk_while_frozen_m=0.0,
+        descent_while_frozen_m=0.0,
     )
 
 
-def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
+def _can_exclude_fall(last: Telemetry, new: Telemetry, descended_m: float) -> bool:
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     unexplained_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
@@ -503,11 +533,11 @@ def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return (
-            new.velocity_mps[2] > MAX_CLIMB_IN_FALL_ACROSS_GAP_MPS
-            and sunk_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
+            new.velocity_mps[2] > MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS
+            and descended_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
         )
     return (
-        abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS
+        abs(gained_mps) <= MAX_SPEED_NOISE_ACROSS_GAP_MPS
         and abs(unexplained_m) <= MAX_UNEXPLAINED_MOVE_IN_GAP_M
     )
 
@@ -518,20 +548,24 @@ def _integrate_acceleration(
     """Return the motion with its velocity integrated by the trapezoid rule, and the mean vertical
     acceleration between the two samples, m/s^2. The accelerometer's offsets are learned while the
     motors are off and the vehicle does not fly."""
-    offset_g = motion.accelerometer_offset_g
+    accelerometer_offset_g = motion.accelerometer_offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
-        offset_g = _filter_accelerometer_offset(
-            offset_g, new, min(1.0, dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
+        accelerometer_offset_g = _filter_accelerometer_offset(
+            accelerometer_offset_g, new, min(1.0, dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
         )
     roll_pitch_error_rad, body_roll_pitch_rate_radps = _estimate_tilt_error(motion, last, new, dt_s)
-    before = ImuMotion.acceleration_mps2(last, offset_g, motion.roll_pitch_error_rad)
-    after = ImuMotion.acceleration_mps2(new, offset_g, roll_pitch_error_rad)
+    before = ImuMotion.compute_acceleration_world_mps2(
+        last, accelerometer_offset_g, motion.roll_pitch_error_rad
+    )
+    after = ImuMotion.compute_acceleration_world_mps2(
+        new, accelerometer_offset_g, roll_pitch_error_rad
+    )
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
     x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
     motion = replace(
         motion,
         velocity_mps=(x, y, z),
-        accelerometer_offset_g=offset_g,
+        accelerometer_offset_g=accelerometer_offset_g,
         roll_pitch_error_rad=roll_pitch_error_rad,
         body_roll_pitch_rate_radps=body_roll_pitch_rate_radps,
     )
@@ -558,7 +592,11 @@ def _estimate_tilt_error(
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
     (roll, pitch), rates = motion.roll_pitch_error_rad, motion.body_roll_pitch_rate_radps
-    if gained_mps <= MIN_ESTIMATE_VELOCITY_STEP_MPS + ESTIMATE_VELOCITY_STEP_GROWTH_MPS2 * dt_s:
+    if (
+        gained_mps
+        <= MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS
+        + ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 * dt_s
+    ):
         return TiltError((kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s))
     error = (
         kept * roll + turned[0] - rates[0] * dt_s,
@@ -573,19 +611,24 @@ _POSITION_AND_VELOCITY = attrgetter("position_m", "velocity_mps")
 
 
 def _frozen_for_s(
-    frozen_so_far_s: float,
+    previously_frozen_for_s: float,
     last: Telemetry | None,
     new: Telemetry,
     reading: Callable[[Telemetry], object],
 ) -> float:
     if last is None:
-        return frozen_so_far_s
-    return 0.0 if reading(last) != reading(new) else frozen_so_far_s + max(0.0, new.t_s - last.t_s)
+        return previously_frozen_for_s
+    return (
+        0.0
+        if reading(last) != reading(new)
+        else previously_frozen_for_s + max(0.0, new.t_s - last.t_s)
+    )
 
 
 def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     flies = (
-        sample.has_bit(FLYING) and sample.thrust < HOVER_THRUST_SATURATION_FRACTION * FULL_THRUST
+        sample.has_bit(FLYING)
+        and sample.thrust < MAX_UNSATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
     )
     if (
         not flies
@@ -601,9 +644,15 @@ def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     )
 
 
-def _filter_accelerometer_offset(old: Vector, sample: Telemetry, share: float) -> Vector:
+def _filter_accelerometer_offset(
+    old: Vector, sample: Telemetry, new_sample_weight: float
+) -> Vector:
     cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
     cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
     x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr
     ox, oy, oz = old
-    return (ox + share * (x - ox), oy + share * (y - oy), oz + share * (z - oz))
+    return (
+        ox + new_sample_weight * (x - ox),
+        oy + new_sample_weight * (y - oy),
+        oz + new_sample_weight * (z - oz),
+    )

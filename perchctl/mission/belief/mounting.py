@@ -16,8 +16,8 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-MOUNTING_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
-MIN_MOUNTING_SIGHTINGS = 10
+MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
+MIN_SIGHTINGS_TO_JUDGE_MOUNTING = 10
 """Number of sightings that a judgement requires."""
 MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
 """Motion of the axis, m, above which the mounting is judged and above which it is proven."""
@@ -28,24 +28,24 @@ MIN_TARGET_POSITION_SPREAD_RMS_M = 0.05
 """Least RMS distance of the target's estimated world positions from their mean that shows a motion
 of the target, m."""
 MAX_ROTATION_FIT_RESIDUAL_FRACTION = 0.45  # share of the target's spread
-MIN_ROTATION_FIT_GAIN = 0.5  # magnitude of M; near 0, the world frame drifts
+MIN_FITTED_ROTATION_MAGNITUDE = 0.5  # magnitude of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
-MIN_WRONG_ROTATION_RAD = math.radians(65.0)
-REQUIRED_CONTRADICTIONS = 4
+MIN_WRONG_CAMERA_YAW_RAD = math.radians(65.0)
+MIN_CONTRADICTING_SIGHTINGS = 4
 """Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
 poses end the flight."""
 TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 """`TARGET_JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the
 distance plus twice the vehicle's motion within the time was moved. `JUMP_PAUSE_S` is the pause
 after a move, s."""
-MIN_ONBOARD_POSITION_JUMP_M = 0.05
+MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
 """Motion of the vehicle's estimated position between two sightings, m, beyond
-`ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS`, above which the state estimate has jumped. Larger: sightings
+`ESTIMATE_JUMP_DISTANCE_GROWTH_MPS`, above which the state estimate has jumped. Larger: sightings
 from before and after a jump are compared."""
-ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
+ESTIMATE_JUMP_DISTANCE_GROWTH_MPS = 1.5
 """Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
 fast vehicle are dropped."""
-_MAX_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
+_MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 
 
 @dataclass(frozen=True)
@@ -89,51 +89,55 @@ class MountingMonitor:
     mounting in the profile."""
 
     sightings: tuple[MountingSample, ...] = ()
-    paused_until_s: float = -math.inf
+    check_paused_until_s: float = -math.inf
     # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
     is_camera_mounting_confirmed: bool = False
     is_target_stationary: bool = False  # the target has stood still so far
-    contradictions: int = 0  # successive sightings that contradict the mounting
+    contradicting_sighting_count: int = 0  # successive sightings that contradict the mounting
     # rotation of the mounting with which the target would stand still
     camera_yaw_error_rad: float = 0.0
 
     @property
     def is_camera_mounting_wrong(self) -> bool:
         """True once enough successive sightings contradict the mounting."""
-        return self.contradictions >= REQUIRED_CONTRADICTIONS
+        return self.contradicting_sighting_count >= MIN_CONTRADICTING_SIGHTINGS
 
     @property
-    def is_awaiting_evidence(self) -> bool:
+    def is_target_motion_undetermined(self) -> bool:
         """True until the vehicle has moved far enough to show that the target stands still, as it
         does if the mounting is right."""
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 
-def update_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
+def update_mounting_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
     """Return the monitor after one more sighting of a measured target."""
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
-    kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_WINDOW_S)
-    if kept and _is_jump(kept, sample):
-        return MountingMonitor(paused_until_s=sample.t_s + JUMP_PAUSE_S)
-    if sample.t_s < old.paused_until_s:
+    kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_CHECK_WINDOW_S)
+    if kept and _is_target_or_estimate_jump(kept, sample):
+        return MountingMonitor(check_paused_until_s=sample.t_s + JUMP_PAUSE_S)
+    if sample.t_s < old.check_paused_until_s:
         return old
-    new = replace(old, sightings=(*kept, sample), is_target_stationary=False, contradictions=0)
+    new = replace(
+        old, sightings=(*kept, sample), is_target_stationary=False, contradicting_sighting_count=0
+    )
     return (
         new
-        if len(new.sightings) < MIN_MOUNTING_SIGHTINGS
-        else _judge_mounting(new, old.contradictions)
+        if len(new.sightings) < MIN_SIGHTINGS_TO_JUDGE_MOUNTING
+        else _judge_mounting(new, old.contradicting_sighting_count)
     )
 
 
-def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool:
-    last = before[-1]
-    far = MIN_ONBOARD_POSITION_JUMP_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (sample.t_s - last.t_s)
+def _is_target_or_estimate_jump(
+    earlier_samples: tuple[MountingSample, ...], sample: MountingSample
+) -> bool:
+    last = earlier_samples[-1]
+    far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_DISTANCE_GROWTH_MPS * (sample.t_s - last.t_s)
     if abs(sample.vehicle_world_xy_m - last.vehicle_world_xy_m) > far:
         return True
-    for s in reversed(before):
+    for s in reversed(earlier_samples):
         age_s = sample.t_s - s.t_s
-        if age_s > _MAX_JUMP_DURATION_S:
+        if age_s > _MAX_TARGET_JUMP_DURATION_S:
             return False
         target_m, vehicle_m = (
             abs(sample.target_world_xy_m - s.target_world_xy_m),
@@ -145,7 +149,9 @@ def _is_jump(before: tuple[MountingSample, ...], sample: MountingSample) -> bool
     return False
 
 
-def _judge_mounting(monitor: MountingMonitor, previous_contradictions: int) -> MountingMonitor:
+def _judge_mounting(
+    monitor: MountingMonitor, previous_contradicting_sighting_count: int
+) -> MountingMonitor:
     aims, targets = (
         [s.up_axis_at_target_height_world_xy_m for s in monitor.sightings],
         [s.target_world_xy_m for s in monitor.sightings],
@@ -168,14 +174,14 @@ def _judge_mounting(monitor: MountingMonitor, previous_contradictions: int) -> M
     turn = 1.0 - along
     if (
         abs(along) >= MIN_MOVING_RATIO
-        and abs(turn) >= MIN_ROTATION_FIT_GAIN
-        and abs(cmath.phase(turn)) >= MIN_WRONG_ROTATION_RAD
+        and abs(turn) >= MIN_FITTED_ROTATION_MAGNITUDE
+        and abs(cmath.phase(turn)) >= MIN_WRONG_CAMERA_YAW_RAD
         and spread_m >= MIN_TARGET_POSITION_SPREAD_RMS_M
         and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_FRACTION * spread_m
     ):
         return replace(
             monitor,
-            contradictions=previous_contradictions + 1,
+            contradicting_sighting_count=previous_contradicting_sighting_count + 1,
             camera_yaw_error_rad=-cmath.phase(turn),
         )
     return monitor

@@ -10,14 +10,16 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
-MAX_DRAUGHT_SPEED_MPS = 0.5
+MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 """Lateral speed that no draught causes, m/s. Larger: a blow during the press is noticed late."""
 MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS = 0.15
 """Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
-MIN_TARGET_BELOW_M = 0.3
+MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
 """Distance below the vehicle that excludes a target on the ceiling, m."""
-NO_CORRECTION_TEXT = "the estimate's variance keeps growing; the positioning system may have failed"
+NO_ESTIMATE_CORRECTION_TEXT = (
+    "the estimate's variance keeps growing; the positioning system may have failed"
+)
 
 
 def _does_estimate_contradict_imu(b: Belief) -> bool:
@@ -25,12 +27,12 @@ def _does_estimate_contradict_imu(b: Belief) -> bool:
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
-        and math.hypot(*b.reckoning.lateral_velocity_unseen_by_imu_mps)
+        and math.hypot(*b.dead_reckoning.lateral_velocity_unseen_by_imu_mps)
         > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
     )
 
 
-def _is_tilted(b: Belief) -> bool:
+def _is_tilt_too_large(b: Belief) -> bool:
     return b.is_imu_fresh and b.tilt_rad > math.radians(b.profile.safety.max_tilt_deg)
 
 
@@ -42,20 +44,24 @@ def _is_battery_low(b: Belief) -> bool:
     return tel.battery_state == LOW_POWER or low
 
 
-TILTED = Condition("tilted", _is_tilted, persists_across_phases=True)
+TILT_TOO_LARGE = Condition("tilted", _is_tilt_too_large, persists_across_phases=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
-LATERAL_SPEED_BEYOND_DRAUGHT = Condition[Belief](
+LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT = Condition[Belief](
     "lateral blow",
-    lambda b: b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_DRAUGHT_SPEED_MPS,
+    lambda b: (
+        b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
+    ),
 )
 """The vehicle moves laterally faster than any draught moves it."""
 ESTIMATE_VARIANCE_TOO_LARGE = Condition[Belief](
     "variance too large", lambda b: b.is_estimate_variance_too_large, persists_across_phases=True
 )
 """The variance of the state estimate is too large for position control."""
-TARGET_BELOW = Condition[Belief](
+TARGET_BELOW_VEHICLE = Condition[Belief](
     "target below",
-    lambda b: b.target.is_fresh and b.target.gear_to_target_z_m < -MIN_TARGET_BELOW_M,
+    lambda b: (
+        b.target.is_fresh and b.target.gear_to_target_z_m < -MIN_TARGET_DISTANCE_BELOW_VEHICLE_M
+    ),
 )
 """The target appears below the vehicle, so the mounting must be wrong."""
 BATTERY_LOW = Condition("battery low", _is_battery_low, persists_across_phases=True)
@@ -65,10 +71,10 @@ ESTIMATE_CONTRADICTS_IMU = Condition(
 )
 """The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (
-    TILTED,
-    LATERAL_SPEED_BEYOND_DRAUGHT,
+    TILT_TOO_LARGE,
+    LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT,
     ESTIMATE_VARIANCE_TOO_LARGE,
-    TARGET_BELOW,
+    TARGET_BELOW_VEHICLE,
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
 )
@@ -79,7 +85,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     """Return why the vehicle must hold its position in this tick of the maneuver, or an empty
     string."""
     safety = b.profile.safety
-    if maneuver.in_free_air and b.is_position_stale:
+    if maneuver.is_in_free_air and b.is_position_stale:
         return position_loss_text(b)
     if not maneuver.is_camera_guided:
         return ""
@@ -88,10 +94,10 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     if b.first_estimate_jump_at_s is not None:
         return "the state estimate jumped"
     if b.is_estimate_variance_too_large:
-        return f"the state estimate is uncertain ({variance_text(b)})"
-    if b.obs.loop_late_s > safety.loop_late_hold_s:
-        return f"the control loop is {b.obs.loop_late_s:.1f} s late"
-    if maneuver.needs_pictures and b.obs.last_good_frame_age_s > safety.camera_hold_s:
+        return f"the state estimate is uncertain ({excessive_variance_text(b)})"
+    if b.obs.tick_start_delay_s > safety.loop_late_hold_s:
+        return f"the control loop is {b.obs.tick_start_delay_s:.1f} s late"
+    if maneuver.requires_pictures and b.obs.last_good_frame_age_s > safety.camera_hold_s:
         return no_picture_reason(b)
     return ""
 
@@ -102,7 +108,7 @@ def position_loss_text(b: Belief) -> str:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
-        why = why or NO_CORRECTION_TEXT
+        why = why or NO_ESTIMATE_CORRECTION_TEXT
     if b.obs.rejected_sighting_to_estimate_m > 0.0:
         why = (
             f"the target shows the vehicle {b.obs.rejected_sighting_to_estimate_m:.2f} m from its "
@@ -112,7 +118,7 @@ def position_loss_text(b: Belief) -> str:
     return f"{text}: {why}" if why else text
 
 
-def variance_text(b: Belief) -> str:
+def excessive_variance_text(b: Belief) -> str:
     """Return which variance is too large, and the limit."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.worst_axis_velocity_variance_m2ps2, "(m/s)^2"

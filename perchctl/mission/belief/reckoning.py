@@ -5,13 +5,13 @@ velocity e, and the bias b (the error of accelerometer and attitude) is learned 
 
     v += (dv_imu - b dt)                                each sample
     v += (e - v) dt / RECKONED_VELOCITY_TIME_CONSTANT_S          while e is believed
-    b += (dv_imu - de - b dt) / BIAS_TIME_CONSTANT_S    while e is believed
+    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S    while e is believed
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
 distance flown. All results are wrong by the change of the bias since the position was lost: 0.1
 m/s^2 becomes 0.45 m after 3 s. The gains are fixed. A Kalman filter of velocity, bias and the
-positions from pictures is no better (`benchmarks/reckoning.py`) because the same change limits
+positions from pictures is no better (`benchmarks/dead_reckoning.py`) because the same change limits
 both.
 """
 
@@ -23,10 +23,10 @@ from dataclasses import dataclass
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
     ACCELEROMETER_OFFSET_TIME_CONSTANT_S,
+    MAX_DELAY_OF_PUSH_IN_ESTIMATE_S,
     MAX_FROZEN_READING_S,
-    MAX_PUSH_TO_ESTIMATE_DELAY_S,
     MAX_TELEMETRY_GAP_S,
-    ZERO,
+    ZERO_VECTOR,
     ImuMotion,
     Vector,
 )
@@ -36,29 +36,29 @@ from perchctl.vehicle import Telemetry
 RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a believed estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
-BIAS_TIME_CONSTANT_S = 4.0
+ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
 """Time constant with which the bias is learned, s. Larger: a change of the wind is followed late.
 Smaller: a gust is learned as a bias."""
-MAX_BIAS_MPS2 = 1.5
+MAX_ACCELERATION_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware takes for a tilt, causes 1.2. Larger:
 wrong positions can add a bias that no attitude error has."""
-MAX_BIAS_INNOVATION_MPS2 = 2.0
+MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
 """Largest difference in one sample from which the bias is learned, m/s^2; a larger one is a blow or
 a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not learned."""
-CLIMB_UNCERTAINTY_MPS = 0.1
+CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
-MAX_CLIMB_IN_TELEMETRY_GAP_MPS = 1.0
+MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
 """Largest climb rate during a gap in the telemetry, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
-MAX_BOUNCE_DISTANCE_M = 0.1
+MAX_BOUNCE_DISTANCE_BELOW_TARGET_M = 0.1
 """Distance below the target within which the reckoned vertical speed follows the estimate, m: a
 bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
 Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
 to 0.3 m/s."""
-IMU_ONLY_VELOCITY_TIME_CONSTANT_S = 1.0
+VELOCITY_UNSEEN_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like a blow. Smaller: a blow just
 before the last sighting is forgotten."""
@@ -69,19 +69,19 @@ VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
-ESTIMATE_ONLY_VELOCITY_TIME_CONSTANT_S = 0.5
+VELOCITY_UNSEEN_BY_IMU_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
-MIN_POSITION_STEP_M = 0.005
+MIN_UNEXPLAINED_POSITION_STEP_M = 0.005
 """Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
 counts as a step."""
-POSITION_STEP_THRESHOLD_GROWTH_MPS = 0.2
+UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS = 0.2
 """Increase of that threshold for each second between two samples, m/s."""
-MAX_POSITION_STEP_INTERVAL_S = 0.15
+MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S = 0.15
 """Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
 motion."""
-MAX_UP_TO_DATE_POSITION_LAG_S = 0.05
+MAX_NEGLIGIBLE_POSITION_LAG_S = 0.05
 """Longest time for which the position in a sample is regarded as current, s."""
-BIAS_SIGMA_MPS2 = 0.06
+ACCELERATION_BIAS_SIGMA_MPS2 = 0.06
 """Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
 is claimed too precisely."""
 VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
@@ -103,11 +103,11 @@ class DeadReckoning:
     the accelerometer since the last good position or sighting."""
 
     imu: ImuMotion | None = None  # motion up to which this value is integrated
-    velocity_mps: Vector = ZERO
-    bias_mps2: Vector = ZERO  # error of accelerometer and attitude
+    velocity_mps: Vector = ZERO_VECTOR
+    acceleration_bias_mps2: Vector = ZERO_VECTOR  # error of accelerometer and attitude
     # mean lateral reading of the accelerometer
     mean_specific_force_world_xy_mps2: tuple[float, float] = (0.0, 0.0)
-    estimated_velocity_mps: Vector = ZERO
+    estimated_velocity_mps: Vector = ZERO_VECTOR
     # lateral velocity gained recently by the state estimate alone
     lateral_velocity_unseen_by_imu_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
@@ -117,15 +117,17 @@ class DeadReckoning:
     # lower bound of `gear_below_target_m`: allows for climbs in silences, and falls only add to it
     min_gear_below_target_m: float = math.inf
     # end of the newest silence after which the magnet may hold the vehicle
-    last_gap_magnet_may_attach_ended_at_s: float = -math.inf
+    last_gap_in_which_magnet_may_attach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
-    lateral_offset_m: tuple[float, float] = (0.0, 0.0)
-    lateral_sigma_m: float = math.inf  # standard deviation of `lateral_offset_m`; inf if unknown
+    gear_to_target_world_xy_m: tuple[float, float] = (0.0, 0.0)
+    gear_to_target_sigma_m: float = (
+        math.inf
+    )  # standard deviation of `gear_to_target_world_xy_m`; inf if unknown
     # exposure of the sighting from which the offset is integrated
     last_sighting_at_s: float = -math.inf
     # sum of the steps of the estimated position since that sighting
-    position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
-    last_position_step_s: float = -math.inf  # time of the newest step
+    unexplained_position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
+    last_unexplained_position_step_at_s: float = -math.inf  # time of the newest step
     climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
     # lateral bias of the estimated velocity
     estimated_velocity_bias_world_xy_mps: tuple[float, float] = (0.0, 0.0)
@@ -135,19 +137,19 @@ class DeadReckoning:
     time_under_position_control_s: float = 0.0  # total time in free air under position control
 
 
-def advance_reckoning(
+def advance_dead_reckoning(
     old: DeadReckoning,
     imu: ImuMotion,
     sample: Telemetry,
     *,
-    is_estimate_believed: bool,
+    is_estimate_trusted: bool,
     is_position_diverged: bool = False,
     is_estimated_velocity_being_corrected: bool = False,
     ignores_lateral_estimate: bool = False,
 ) -> DeadReckoning:
     """Return the reckoning one tick later.
 
-    - `is_estimate_believed`: adopt the sample's estimated velocity, and learn from it the bias of
+    - `is_estimate_trusted`: adopt the sample's estimated velocity, and learn from it the bias of
       the acceleration, which is due to accelerometer and attitude.
     - `is_estimated_velocity_being_corrected`: positions have corrected the estimated velocity
       recently.
@@ -159,10 +161,14 @@ def advance_reckoning(
     estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
     if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
         carried = not old.imu.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
-        carried_mps = old.velocity_mps[2] + impact.imu_climb_before_mps - old.imu.velocity_mps[2]
+        carried_mps = (
+            old.velocity_mps[2] + impact.imu_climb_before_impact_mps - old.imu.velocity_mps[2]
+        )
         old = replace(
             old,
-            climb_before_impact_mps=carried_mps if carried else impact.estimated_climb_before_mps,
+            climb_before_impact_mps=carried_mps
+            if carried
+            else impact.estimated_climb_before_impact_mps,
         )
     frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_S
     if old.imu is None or imu.last_telemetry_gap_ended_at_s > old.imu.t_s or frozen:
@@ -170,7 +176,7 @@ def advance_reckoning(
             old,
             imu,
             estimated_velocity_mps,
-            is_estimate_believed=is_estimate_believed,
+            is_estimate_trusted=is_estimate_trusted,
             is_position_diverged=is_position_diverged,
         )
     return _integrate_sample(
@@ -178,7 +184,7 @@ def advance_reckoning(
         old.imu,
         imu,
         sample,
-        is_estimate_believed=is_estimate_believed,
+        is_estimate_trusted=is_estimate_trusted,
         is_estimated_velocity_being_corrected=is_estimated_velocity_being_corrected,
         ignores_lateral_estimate=ignores_lateral_estimate,
     )
@@ -189,7 +195,7 @@ def _restart(
     imu: ImuMotion,
     estimated_velocity_mps: Vector,
     *,
-    is_estimate_believed: bool,
+    is_estimate_trusted: bool,
     is_position_diverged: bool,
 ) -> DeadReckoning:
     """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
@@ -198,13 +204,13 @@ def _restart(
     estimated velocity did during the silence. With diverged positions, it does not use the
     estimate.
     """
-    velocity_mps = estimated_velocity_mps if is_estimate_believed else ZERO
+    velocity_mps = estimated_velocity_mps if is_estimate_trusted else ZERO_VECTOR
     if is_position_diverged:
         vx, vy, vz = old.velocity_mps
         if old.imu is not None and imu.last_telemetry_gap_ended_at_s <= old.imu.t_s:
             vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
         velocity_mps = (vx, vy, vz)
-    elif not is_estimate_believed and old.imu is not None:
+    elif not is_estimate_trusted and old.imu is not None:
         vx, vy, vz = (
             v + e - o
             for v, e, o in zip(
@@ -226,64 +232,77 @@ def _restart(
         # Motors that were off on both sides of the silence, or a restarted vehicle, cannot have
         # climbed under power.
         off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
-        flew = not (off or imu.restarted_at_s > old.imu.t_s)
-        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_UNCERTAINTY_MPS
+        flew = not (off or imu.integration_restarted_at_s > old.imu.t_s)
+        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MAX_CLIMB_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
+            climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
         min_gear_below_target_m = old.min_gear_below_target_m - climb_m
         near = min_gear_below_target_m < MAGNET_REACH_M
         unknown = replace(
             unknown,
             min_gear_below_target_m=min_gear_below_target_m,
-            last_gap_magnet_may_attach_ended_at_s=imu.t_s
+            last_gap_in_which_magnet_may_attach_ended_at_s=imu.t_s
             if near
-            else old.last_gap_magnet_may_attach_ended_at_s,
+            else old.last_gap_in_which_magnet_may_attach_ended_at_s,
             gear_below_target_m=old.gear_below_target_m if near or flew else math.inf,
         )
-    return replace(unknown, lateral_sigma_m=math.inf)
+    return replace(unknown, gear_to_target_sigma_m=math.inf)
 
 
 def _integrate_sample(
     old: DeadReckoning,
-    before: ImuMotion,
+    previous_imu: ImuMotion,
     imu: ImuMotion,
     sample: Telemetry,
     *,
-    is_estimate_believed: bool,
+    is_estimate_trusted: bool,
     is_estimated_velocity_being_corrected: bool,
     ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
-    """Return the reckoning one sample after `before`, by the equations in the module docstring."""
-    estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - before.t_s
+    """Return the reckoning one sample after `previous_imu`, by the equations in the module
+    docstring."""
+    estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
     if not dt_s > 0.0:
         return old
     velocity, bias, lateral_velocity_unseen_by_imu_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
     remembers = (
-        math.exp(-dt_s / IMU_ONLY_VELOCITY_TIME_CONSTANT_S)
+        math.exp(-dt_s / VELOCITY_UNSEEN_BY_ESTIMATE_TIME_CONSTANT_S)
         if is_estimated_velocity_being_corrected
         else 1.0
     )
-    keeps = math.exp(-dt_s / ESTIMATE_ONLY_VELOCITY_TIME_CONSTANT_S)
-    calm = is_estimate_believed and imu.t_s - imu.last_push_at_s > MAX_PUSH_TO_ESTIMATE_DELAY_S
+    keeps = math.exp(-dt_s / VELOCITY_UNSEEN_BY_IMU_TIME_CONSTANT_S)
+    calm = (
+        is_estimate_trusted
+        and imu.t_s - imu.last_lateral_push_at_s > MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
+    )
     cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
-    ahead_g, left_g = imu.mean_lateral_g
+    ahead_g, left_g = imu.mean_lateral_specific_force_g
     reads_mps2 = (
         GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
         GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
     )
     mean_specific_force_world_xy_mps2 = [*old.mean_specific_force_world_xy_mps2]
     for i in range(3):
-        gained = imu.velocity_mps[i] - before.velocity_mps[i]
-        if i == 2 and is_estimate_believed and old.gear_below_target_m < MAX_BOUNCE_DISTANCE_M:
+        gained = imu.velocity_mps[i] - previous_imu.velocity_mps[i]
+        if (
+            i == 2
+            and is_estimate_trusted
+            and old.gear_below_target_m < MAX_BOUNCE_DISTANCE_BELOW_TARGET_M
+        ):
             gained = (
-                estimated_velocity_mps[2] - old.estimated_velocity_mps[2] + old.bias_mps2[2] * dt_s
+                estimated_velocity_mps[2]
+                - old.estimated_velocity_mps[2]
+                + old.acceleration_bias_mps2[2] * dt_s
             )
-        v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
+        v, b = (
+            old.velocity_mps[i] + gained - old.acceleration_bias_mps2[i] * dt_s,
+            old.acceleration_bias_mps2[i],
+        )
         if i < 2:
             alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
             missed[i] = remembers * old.lateral_velocity_unseen_by_estimate_mps[i] + alone
-        if is_estimate_believed and (i == 2 or not ignores_lateral_estimate):
+        if is_estimate_trusted and (i == 2 or not ignores_lateral_estimate):
             v += (estimated_velocity_mps[i] - v) * min(
                 1.0, dt_s / RECKONED_VELOCITY_TIME_CONSTANT_S
             )
@@ -293,9 +312,12 @@ def _integrate_sample(
                 lateral_velocity_unseen_by_imu_mps[i] = (
                     keeps * old.lateral_velocity_unseen_by_imu_mps[i] + more
                 )
-            if abs(wrong) <= MAX_BIAS_INNOVATION_MPS2:
-                share = min(1.0, dt_s / BIAS_TIME_CONSTANT_S)
-                b = max(-MAX_BIAS_MPS2, min(MAX_BIAS_MPS2, b + share * (wrong - b)))
+            if abs(wrong) <= MAX_ACCELERATION_BIAS_INNOVATION_MPS2:
+                share = min(1.0, dt_s / ACCELERATION_BIAS_TIME_CONSTANT_S)
+                b = max(
+                    -MAX_ACCELERATION_BIAS_MPS2,
+                    min(MAX_ACCELERATION_BIAS_MPS2, b + share * (wrong - b)),
+                )
                 if i < 2:
                     mean_specific_force_world_xy_mps2[i] += share * (
                         reads_mps2[i] - mean_specific_force_world_xy_mps2[i]
@@ -304,17 +326,17 @@ def _integrate_sample(
         bias.append(b)
     vx, vy, vz = velocity
     unseen_s = max(0.0, imu.t_s - old.last_sighting_at_s)
-    fell = imu.last_fall_at_s > max(before.last_fall_at_s, old.last_sighting_at_s)
+    fell = imu.last_fall_at_s > max(previous_imu.last_fall_at_s, old.last_sighting_at_s)
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
-        VELOCITY_SIGMA_AT_SIGHTING_MPS + BIAS_SIGMA_MPS2 * unseen_s
+        VELOCITY_SIGMA_AT_SIGHTING_MPS + ACCELERATION_BIAS_SIGMA_MPS2 * unseen_s
     ) * dt_s + SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
-    ex, ey = old.lateral_offset_m
+    ex, ey = old.gear_to_target_world_xy_m
     return replace(
         old,
         imu=imu,
         velocity_mps=(vx, vy, vz),
-        bias_mps2=(bias[0], bias[1], bias[2]),
+        acceleration_bias_mps2=(bias[0], bias[1], bias[2]),
         mean_specific_force_world_xy_mps2=(
             mean_specific_force_world_xy_mps2[0],
             mean_specific_force_world_xy_mps2[1],
@@ -327,10 +349,10 @@ def _integrate_sample(
         lateral_velocity_unseen_by_estimate_mps=(missed[0], missed[1]),
         gear_below_target_m=math.inf
         if fell
-        else old.gear_below_target_m - (vz + CLIMB_UNCERTAINTY_MPS) * dt_s,
+        else old.gear_below_target_m - (vz + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS) * dt_s,
         min_gear_below_target_m=old.min_gear_below_target_m - vz * dt_s,
-        lateral_offset_m=(ex - vx * dt_s, ey - vy * dt_s),
-        lateral_sigma_m=old.lateral_sigma_m + growth_m,
+        gear_to_target_world_xy_m=(ex - vx * dt_s, ey - vy * dt_s),
+        gear_to_target_sigma_m=old.gear_to_target_sigma_m + growth_m,
     )
 
 
@@ -369,25 +391,25 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
     )
 
 
-def learn_bias_at_rest(
-    old: DeadReckoning, before: ImuMotion | None, now: ImuMotion
+def learn_acceleration_bias_at_rest(
+    old: DeadReckoning, previous_imu: ImuMotion | None, imu: ImuMotion
 ) -> DeadReckoning:
     """Return the reckoning of a vehicle that is held still, so that the whole lateral acceleration
-    between `before` and `now` is the combined bias of accelerometer and attitude. The bias must be
-    learned anew: in wind, the estimated attitude has an error, which disappears within a second
-    after the contact."""
+    between `previous_imu` and `imu` is the combined bias of accelerometer and attitude. The bias
+    must be learned anew: in wind, the estimated attitude has an error, which disappears within a
+    second after the contact."""
     if (
-        before is None
-        or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
-        or now.last_telemetry_gap_ended_at_s > before.t_s
+        previous_imu is None
+        or not 0.0 < imu.t_s - previous_imu.t_s <= MAX_TELEMETRY_GAP_S
+        or imu.last_telemetry_gap_ended_at_s > previous_imu.t_s
     ):
         return old
-    dt_s = now.t_s - before.t_s
+    dt_s = imu.t_s - previous_imu.t_s
     share = 1.0 - math.exp(-dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
-    x_mps2, y_mps2 = ((now.velocity_mps[i] - before.velocity_mps[i]) / dt_s for i in range(2))
-    bx, by, bz = old.bias_mps2
+    x_mps2, y_mps2 = ((imu.velocity_mps[i] - previous_imu.velocity_mps[i]) / dt_s for i in range(2))
+    bx, by, bz = old.acceleration_bias_mps2
     bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
-    return replace(old, bias_mps2=(*bias, bz))
+    return replace(old, acceleration_bias_mps2=(*bias, bz))
 
 
 def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
@@ -400,14 +422,17 @@ def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
     )
 
 
-def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
+def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning with its acceleration bias corrected after positions in wrong axes. They
     have given the state estimate a velocity that the accelerometer has not measured and, in
     proportion to it, a wrong tilt, which was learned as a bias."""
-    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.lateral_velocity_unseen_by_imu_mps
+    (bx, by, bz), (x_mps, y_mps) = (
+        old.acceleration_bias_mps2,
+        old.lateral_velocity_unseen_by_imu_mps,
+    )
     return replace(
         old,
-        bias_mps2=(
+        acceleration_bias_mps2=(
             bx + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * x_mps,
             by + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * y_mps,
             bz,
@@ -415,14 +440,14 @@ def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     )
 
 
-def accumulate_position_step(
+def accumulate_unexplained_position_step(
     old: DeadReckoning, last: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
     """Return the reckoning with one more step of the estimated position added to their sum, which
     makes the offset at a contact less certain. A step is the motion between two samples beyond what
     the estimated velocity explains. After a gap in the samples, no step is added."""
     dt_s = _position_time_s(sample) - _position_time_s(last)
-    if not 0.0 < dt_s <= MAX_POSITION_STEP_INTERVAL_S:
+    if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
     x_m, y_m = (
         sample.position_m[i]
@@ -430,37 +455,42 @@ def accumulate_position_step(
         - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
         for i in range(2)
     )
-    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s:
+    if (
+        math.hypot(x_m, y_m)
+        <= MIN_UNEXPLAINED_POSITION_STEP_M + UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s
+    ):
         return old
-    sx_m, sy_m = old.position_step_sum_xy_m
+    sx_m, sy_m = old.unexplained_position_step_sum_xy_m
     return replace(
-        old, position_step_sum_xy_m=(sx_m + x_m, sy_m + y_m), last_position_step_s=sample.t_s
+        old,
+        unexplained_position_step_sum_xy_m=(sx_m + x_m, sy_m + y_m),
+        last_unexplained_position_step_at_s=sample.t_s,
     )
 
 
 def _position_time_s(sample: Telemetry) -> float:
     """Return the time of the sample's position, s, which is older than its attitude by the sample's
-    `behind_s`. A difference of at most `MAX_UP_TO_DATE_POSITION_LAG_S` counts as none."""
-    return sample.t_s - max(0.0, sample.behind_s - MAX_UP_TO_DATE_POSITION_LAG_S)
+    `behind_s`. A difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` counts as none."""
+    return sample.t_s - max(0.0, sample.behind_s - MAX_NEGLIGIBLE_POSITION_LAG_S)
 
 
 def add_sighting(
     old: DeadReckoning,
     t_s: float,
-    lateral_offset_m: tuple[float, float],
+    gear_to_target_world_xy_m: tuple[float, float],
     gear_below_target_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
     """Return the reckoning restarted at a sighting.
 
-    `lateral_offset_m` is the vector from the gear to the target (world x, y), with the standard
-    deviation `sigma_m`; `gear_below_target_m` is how far the gear is below the target.
+    `gear_to_target_world_xy_m` is the vector from the gear to the target (world x, y), with the
+    standard deviation `sigma_m`; `gear_below_target_m` is how far the gear is below the target.
     """
     return replace(
         old,
         last_sighting_at_s=t_s,
-        lateral_offset_m=lateral_offset_m,
+        gear_to_target_world_xy_m=gear_to_target_world_xy_m,
         gear_below_target_m=gear_below_target_m,
         min_gear_below_target_m=gear_below_target_m,
-        lateral_sigma_m=sigma_m,
+        gear_to_target_sigma_m=sigma_m,
     )

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 from perchctl.geometry import Array
-from perchctl.mission.belief.motion import ZERO, Vector
+from perchctl.mission.belief.motion import ZERO_VECTOR, Vector
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vision import TargetEstimate
 
-MIN_FAR_ABOVE_M = 0.5
+MIN_TARGET_FAR_ABOVE_GEAR_M = 0.5
 """Height above the gear beyond which the target cannot hold the vehicle, m. Larger: a vehicle that
 has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
 hold."""
@@ -21,10 +21,10 @@ that velocity oscillates. Smaller: the noise of single detections moves the vehi
 MAX_DETECTION_GAP_S = 1.0
 """Longest time between two detections from which a velocity is computed, s. Larger: a motion that
 has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
-MIN_DETECTED_S = 0.3
+MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S = 0.3
 """Time for which the target must be detected before the velocity is used, s. Smaller: the low-pass
 filter has not settled."""
-MAX_CAMERA_VELOCITY_MPS = 1.5
+MAX_PLAUSIBLE_CAMERA_VELOCITY_MPS = 1.5
 """Largest velocity between two detections, m/s; a larger one is a step of the pose. Larger: a step
 counts as motion. Smaller: a fast motion is ignored."""
 
@@ -64,7 +64,10 @@ class TargetBelief:
     def is_far_above(self) -> bool:
         """True if the target is so far above the gear that its magnet cannot be holding the
         vehicle."""
-        return self.world_position_m is not None and self.gear_to_target_z_m > MIN_FAR_ABOVE_M
+        return (
+            self.world_position_m is not None
+            and self.gear_to_target_z_m > MIN_TARGET_FAR_ABOVE_GEAR_M
+        )
 
     @classmethod
     def from_estimate(
@@ -106,19 +109,19 @@ class VisualMotion:
     Attributes:
         t_s: exposure of the newest detection.
         detected_since_s: exposure of the first detection after the last gap.
-        target_from_gear_m: newest position of the target from the gear (ahead, left, up), m.
+        gear_to_target_vector_m: newest position of the target from the gear (ahead, left, up), m.
         vehicle_velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf
     detected_since_s: float = -math.inf
-    target_from_gear_m: Vector = ZERO
-    vehicle_velocity_mps: Vector = ZERO
+    gear_to_target_vector_m: Vector = ZERO_VECTOR
+    vehicle_velocity_mps: Vector = ZERO_VECTOR
 
     @property
     def is_known(self) -> bool:
         """True if the target was detected for long enough to determine the velocity."""
-        return self.t_s - self.detected_since_s >= MIN_DETECTED_S
+        return self.t_s - self.detected_since_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
 
     def with_detection(self, target: TargetEstimate) -> VisualMotion:
         """Return the motion after a frame that measured the target."""
@@ -130,10 +133,11 @@ class VisualMotion:
         if dt_s > MAX_DETECTION_GAP_S:
             return VisualMotion(t_s, t_s, e_m)
         moved_mps = [
-            (before - now) / dt_s for before, now in zip(self.target_from_gear_m, e_m, strict=True)
+            (before - now) / dt_s
+            for before, now in zip(self.gear_to_target_vector_m, e_m, strict=True)
         ]
-        if math.hypot(*moved_mps) > MAX_CAMERA_VELOCITY_MPS:
-            return replace(self, t_s=t_s, target_from_gear_m=e_m)
+        if math.hypot(*moved_mps) > MAX_PLAUSIBLE_CAMERA_VELOCITY_MPS:
+            return replace(self, t_s=t_s, gear_to_target_vector_m=e_m)
         share = 1.0 - math.exp(-dt_s / CAMERA_VELOCITY_TIME_CONSTANT_S)
         ahead, left, up = (
             old + share * (new - old)

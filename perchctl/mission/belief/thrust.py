@@ -15,19 +15,19 @@ from dataclasses import dataclass
 
 from perchctl.values import replace
 
-MIN_POSITION_MODE_THRUST = 20000
+MIN_FIRMWARE_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-THRUST_MEASUREMENT_SIGMA_FRACTION = 0.02
+HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION = 0.02
 """Standard deviation of a hover-thrust measurement averaged over one second, as a share of the
 thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter follows
 a sagging battery late. Smaller: the filter learns these variations."""
-HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S = 0.01
+HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT = 0.01
 """Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
 the filter learns a lasting push. Smaller: it follows a sagging battery late."""
-ACCELEROMETER_HOVER_THRUST_SIGMA = 0.03
+ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION = 0.03
 """Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
 error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
-MAX_PRECISE_THRUST_SIGMA = 0.05
+MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION = 0.05
 """Standard deviation, as a share, above which the estimate is too rough for a descent without
 telemetry. Larger: the vehicle descends too fast. Smaller: it waits in the air for longer."""
 
@@ -50,18 +50,20 @@ class HoverThrust:
     @property
     def is_imprecise(self) -> bool:
         """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
-        return self.sigma > MAX_PRECISE_THRUST_SIGMA
+        return self.sigma > MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION
 
     def propagate(self, dt_s: float, drift_per_sqrt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later; its standard deviation has grown by a random walk of
         `drift_per_sqrt_s`, a share of the thrust per square root of a second."""
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift_per_sqrt_s**2 * dt_s))
 
-    def propagate_unmeasured(self, dt_s: float) -> HoverThrust:
+    def propagate_without_measurement(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
-        sigma = self.propagate(dt_s, HOVER_THRUST_QUIET_DRIFT_PER_SQRT_S).sigma
-        return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA)))
+        sigma = self.propagate(dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT).sigma
+        return replace(
+            self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION))
+        )
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
         """Return the estimate after a measurement: the mean thrust over `dt_s`. A longer time gives
@@ -70,9 +72,9 @@ class HoverThrust:
             return self
         if math.isinf(self.sigma):
             return replace(
-                self, thrust=thrust, sigma=THRUST_MEASUREMENT_SIGMA_FRACTION / math.sqrt(dt_s)
+                self, thrust=thrust, sigma=HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION / math.sqrt(dt_s)
             )
         variance = self.sigma**2
-        gain = variance / (variance + THRUST_MEASUREMENT_SIGMA_FRACTION**2 / dt_s)
+        gain = variance / (variance + HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
         return replace(self, thrust=corrected, sigma=math.sqrt((1.0 - gain) * variance))

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 
 from perchctl.mission.belief import hover
-from perchctl.mission.belief.battery import update_from_telemetry
+from perchctl.mission.belief.battery import update_battery_fit_from_telemetry
 from perchctl.mission.belief.belief import POSITION_SETTLING_AFTER_GAP_S, Belief
 from perchctl.mission.belief.contact import (
-    HANGING_DWELL_S,
+    HANGING_CONFIRMATION_DWELL_S,
+    IMU_SHOWS_SUPPORT,
+    MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M,
     MAX_RAW_THRUST,
-    MAX_STANDING_HEIGHT_M,
     MOTORS_STOPPED,
     SUPPORT_CONDITIONS,
-    SUPPORT_SHOWN_BY_IMU,
     is_evidence_fresh,
     is_flying_at_hover_thrust,
     is_thrust_too_low_to_fly,
@@ -36,22 +36,26 @@ from perchctl.mission.belief.contact import (
 from perchctl.mission.belief.evidence import (
     Condition,
     keep_persistent_start_times,
-    update_start_times,
+    update_condition_start_times,
 )
 from perchctl.mission.belief.lateral_offset import MotionSample
-from perchctl.mission.belief.maneuver import SentOrders
-from perchctl.mission.belief.motion import ZERO, Vector
-from perchctl.mission.belief.mounting import MountingMonitor, make_mounting_sample, update_monitor
+from perchctl.mission.belief.maneuver import CommandHistory
+from perchctl.mission.belief.motion import ZERO_VECTOR, Vector
+from perchctl.mission.belief.mounting import (
+    MountingMonitor,
+    make_mounting_sample,
+    update_mounting_monitor,
+)
 from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
     MAX_HEIGHT_INTEGRATION_STEP_S,
-    MAX_POSITION_STEP_INTERVAL_S,
+    MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S,
     DeadReckoning,
-    accumulate_position_step,
+    accumulate_unexplained_position_step,
     add_sighting,
-    advance_reckoning,
-    learn_bias_at_rest,
+    advance_dead_reckoning,
+    learn_acceleration_bias_at_rest,
     learn_velocity_bias,
     reset_velocity_bias_means,
 )
@@ -62,45 +66,57 @@ from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawTh
 
 BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions of the belief."""
-MAX_GEAR_BELOW_TARGET_IF_HELD_M = 0.3
+MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M = 0.3
 """Distance of the gear below the target within which whatever holds the vehicle is the target,
 m."""
-REST_DWELL_S = 0.3
+STILL_AT_CONTACT_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
-MAX_SAMPLE_DURATION_S = 0.1
+MAX_FILTER_STEP_S = 0.1
 """Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
 single sample has the weight of many."""
-MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION = 0.12
+MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
 """Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
-KEEPALIVE_THRUST = 1000
+KEEPALIVE_RAW_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
-LEAN_TIME_CONSTANT_S = 0.5
+MEAN_LEAN_TIME_CONSTANT_S = 0.5
 """Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
 TARGET_SCATTER_DECAY_PER_FRAME = 0.9
 """Share of the target's spread that remains after each frame."""
 
 
-def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: Profile) -> Belief:
-    """Return the belief after one more observation; `sent` holds the planner's orders so far.
+def update_belief(
+    belief: Belief, obs: Observation, command_history: CommandHistory, profile: Profile
+) -> Belief:
+    """Return the belief after one more observation; `command_history` holds the planner's commands
+    so far.
 
     A wrong observation makes the belief wrong for up to some seconds, until the filters forget it.
     """
-    b = replace(belief, obs=obs, profile=profile, sent=sent, world_frame_shift_m=ZERO)
+    b = replace(
+        belief,
+        obs=obs,
+        profile=profile,
+        command_history=command_history,
+        world_frame_shift_in_tick_m=ZERO_VECTOR,
+    )
     sample = MotionSample(obs.telemetry.t_s, b.lean_acceleration_world_xy_mps2, b.velocity_mps[:2])
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
     if has_tick_gap(belief, obs, profile):
-        b = _reset_after_gap(b)
+        b = _reset_after_tick_gap(b)
     if b.is_position_stale:
         b = replace(b, position_last_stale_at_s=obs.t_s)
     if obs.has_estimated_position_jumped:
-        b = _shift_belief_frame(b)
+        b = _shift_remembered_positions(b)
     if obs.heading_jump_rad > math.radians(profile.safety.heading_lost_deg):
-        b = replace(b, heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
-    b = _compare_ordered_thrust(b)
+        b = replace(b, is_heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
+    b = _compare_thrust_with_command(b)
     b = _update_dead_reckoning(b)
-    comes_down = sent.maneuver.descends and sent.is_under_power
+    comes_down = (
+        command_history.maneuver.descends_to_floor
+        and command_history.is_before_release_and_motor_stop
+    )
     if comes_down and b.dead_reckoning_since_s is None and b.has_only_imu_for_descent:
         b = start_dead_reckoning(b)
     return _update_estimators(b)
@@ -117,12 +133,12 @@ def start_dead_reckoning(b: Belief) -> Belief:
     return replace(
         b,
         dead_reckoning_since_s=b.obs.t_s,
-        reckoned_height_m=b.height_m,
+        dead_reckoned_height_m=b.height_m,
         hover_thrust_estimate=hover.estimate_hover_thrust(b),
     )
 
 
-def reset_evidence(b: Belief) -> Belief:
+def reset_conditions(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: all conditions restart, except for those that
     are independent of the phase."""
     return replace(
@@ -135,7 +151,7 @@ def update_after_command(b: Belief, command: Command) -> Belief:
     that the reported thrust follows the ordered raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
-    return replace(b, thrust_differs_from_order_since_s=None)
+    return replace(b, thrust_differs_from_command_since_s=None)
 
 
 # --- Direct consequences of the observation ---
@@ -150,7 +166,7 @@ def _update_target(b: Belief) -> Belief:
     b = replace(b, visual_motion=b.visual_motion.with_detection(target))
     if target.measured_offset_m is not None and math.isfinite(target.measured_offset_sigma_m):
         x_m, y_m, _ = target.measured_offset_m.tolist()
-        filtered = b.lateral_offset_filter.with_picture(
+        filtered = b.lateral_offset_filter.with_picture_measurement(
             target.measured_s, (x_m, y_m), target.measured_offset_sigma_m
         )
         b = replace(b, lateral_offset_filter=filtered)
@@ -163,7 +179,7 @@ def _update_target(b: Belief) -> Belief:
     return replace(b, last_target_world_m=target.world_m, target_position_scatter_m=spread_m)
 
 
-def _reset_after_gap(b: Belief) -> Belief:
+def _reset_after_tick_gap(b: Belief) -> Belief:
     """Return the belief after a gap in which the planner did not run: all conditions restart."""
     imu = b.obs.imu
     kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
@@ -181,7 +197,7 @@ def _reset_after_gap(b: Belief) -> Belief:
     )
 
 
-def _shift_belief_frame(b: Belief) -> Belief:
+def _shift_remembered_positions(b: Belief) -> Belief:
     """Return the belief after a jump of the estimate's world frame, which has not moved the
     vehicle. Ground, contact and all other remembered positions move with the frame. They stay if
     samples are missing before the jump, since the vehicle may have moved, or if external positions
@@ -202,49 +218,49 @@ def _shift_belief_frame(b: Belief) -> Belief:
         b.position_last_stale_at_s is not None
         and obs.t_s - b.position_last_stale_at_s <= POSITION_SETTLING_AFTER_GAP_S
     )
-    if dt_s > MAX_POSITION_STEP_INTERVAL_S or returns:
+    if dt_s > MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S or returns:
         moved_m = (0.0, 0.0, 0.0)
-    setpoint = b.sent.setpoint
+    setpoint = b.command_history.setpoint
     if setpoint is not None:
         z_m = z if b.vehicle_world_z_at_last_contact_m is None else setpoint.z_m + moved_m[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
     return replace(
         b,
-        reckoning=reset_velocity_bias_means(b.reckoning),
+        dead_reckoning=reset_velocity_bias_means(b.dead_reckoning),
         takeoff_position_m=None
         if b.takeoff_position_m is None
         else _translate(b.takeoff_position_m, moved_m),
         vehicle_world_z_at_last_contact_m=None
         if b.vehicle_world_z_at_last_contact_m is None
         else b.vehicle_world_z_at_last_contact_m + moved_m[2],
-        sent=b.sent.with_frame_shift(setpoint, moved_m),
-        world_frame_shift_m=moved_m,
+        command_history=b.command_history.with_frame_shift(setpoint, moved_m),
+        world_frame_shift_in_tick_m=moved_m,
         first_estimate_jump_at_s=first_estimate_jump_at_s,
     )
 
 
-def _translate(place_m: Vector, by_m: Vector) -> Vector:
-    return (place_m[0] + by_m[0], place_m[1] + by_m[1], place_m[2] + by_m[2])
+def _translate(position_m: Vector, shift_m: Vector) -> Vector:
+    return (position_m[0] + shift_m[0], position_m[1] + shift_m[1], position_m[2] + shift_m[2])
 
 
-def _compare_ordered_thrust(b: Belief) -> Belief:
+def _compare_thrust_with_command(b: Belief) -> Belief:
     """Return the belief with the loop time since when the reported thrust has differed from the
-    ordered raw thrust by more than `MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION`; None while they
+    ordered raw thrust by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`; None while they
     agree."""
-    order = b.sent.raw_thrust
+    order = b.command_history.raw_thrust
     if order is None:
         return b
-    wanted = 0.0 if order < KEEPALIVE_THRUST else min(MAX_RAW_THRUST, order)
+    wanted = 0.0 if order < KEEPALIVE_RAW_THRUST else min(MAX_RAW_THRUST, order)
     apart = (
-        abs(b.telemetry.thrust - wanted) > MAX_THRUST_DEVIATION_FROM_ORDER_FRACTION * FULL_THRUST
+        abs(b.telemetry.thrust - wanted) > MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION * FULL_THRUST
     )
     since_s = (
         b.obs.t_s
-        if b.thrust_differs_from_order_since_s is None
-        else b.thrust_differs_from_order_since_s
+        if b.thrust_differs_from_command_since_s is None
+        else b.thrust_differs_from_command_since_s
     )
-    b = replace(b, thrust_differs_from_order_since_s=since_s if apart else None)
-    return b if b.is_thrust_known else replace(b, thrust_last_differed_from_order_at_s=b.obs.t_s)
+    b = replace(b, thrust_differs_from_command_since_s=since_s if apart else None)
+    return b if b.is_thrust_known else replace(b, thrust_last_differed_from_command_at_s=b.obs.t_s)
 
 
 # --- Dead reckoning ---
@@ -253,77 +269,82 @@ def _compare_ordered_thrust(b: Belief) -> Belief:
 def _update_dead_reckoning(b: Belief) -> Belief:
     """Return the belief with the reckoning one tick later, the time within the magnet's reach, and
     the height of a vehicle without a position."""
-    new = _integrate_reckoning(b)
-    new = _stop_reckoning_at_contact(b, new)
+    new = _integrate_dead_reckoning(b)
+    new = _stop_dead_reckoning_at_contact(b, new)
     new = _adopt_camera_velocity(b, new)
     new = _restart_at_sighting(b, new)
-    new = _correct_supported_height(b, new)
+    new = _correct_height_of_supported_vehicle(b, new)
     return replace(
         b,
-        reckoning=new,
+        dead_reckoning=new,
         in_magnet_reach_since_s=_find_in_magnet_reach_since_s(b, new),
-        reckoned_height_m=b.reckoned_height_m + _climb_since_last_tick_m(b, new),
+        dead_reckoned_height_m=b.dead_reckoned_height_m + _climb_since_last_tick_m(b, new),
     )
 
 
-def _integrate_reckoning(b: Belief) -> DeadReckoning:
+def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     """Integrate accelerometer and estimate, and learn biases from positions in free air."""
     obs, source = b.obs, b.profile.positioning.source
-    is_estimate_believed = (
+    is_estimate_trusted = (
         b.is_position_valid
         and b.is_telemetry_fresh
         and b.dead_reckoning_since_s is None
         and b.first_estimate_jump_at_s is None
     )
-    new = advance_reckoning(
-        b.reckoning,
+    new = advance_dead_reckoning(
+        b.dead_reckoning,
         obs.imu,
         obs.telemetry,
-        is_estimate_believed=is_estimate_believed,
+        is_estimate_trusted=is_estimate_trusted,
         is_position_diverged=b.is_position_diverged and not source.is_target,
         is_estimated_velocity_being_corrected=b.is_estimated_velocity_being_corrected,
         # A motion that no sighting has corrected yet is not a bias of the accelerometer.
         ignores_lateral_estimate=source.is_target and not b.is_estimated_velocity_being_corrected,
     )
-    in_free_air = b.sent.maneuver.in_free_air and b.height_m > MAX_STANDING_HEIGHT_M
+    is_in_free_air = (
+        b.command_history.maneuver.is_in_free_air
+        and b.height_m > MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M
+    )
     if (
-        is_estimate_believed
+        is_estimate_trusted
         and b.is_estimated_velocity_being_corrected
-        and in_free_air
+        and is_in_free_air
         and b.last_telemetry
     ):
         new = learn_velocity_bias(new, b.last_telemetry, obs.telemetry)
     else:
         new = reset_velocity_bias_means(new)
     if b.is_position_trusted and not source.is_target and b.last_telemetry is not None:
-        new = accumulate_position_step(new, b.last_telemetry, obs.telemetry)
+        new = accumulate_unexplained_position_step(new, b.last_telemetry, obs.telemetry)
     return new
 
 
-def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Set the velocity to zero for a vehicle that has been steady at its contact, or within the
     magnet's reach at a thrust too small to support it: otherwise the accelerometer's bias would
     carry a hanging vehicle out of the reach within ten seconds."""
     obs = b.obs
     rests = (
-        obs.t_s - obs.imu.climb_steady_since_s >= REST_DWELL_S
-        and obs.t_s - obs.imu.last_fall_at_s > HANGING_DWELL_S
+        obs.t_s - obs.imu.climb_steady_since_s >= STILL_AT_CONTACT_DWELL_S
+        and obs.t_s - obs.imu.last_fall_at_s > HANGING_CONFIRMATION_DWELL_S
     )
     hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
     touched = b.vehicle_world_z_at_last_contact_m is not None or hangs
     if not touched or not new.gear_below_target_m < MAGNET_REACH_M or not rests:
         return new
-    is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < REST_DWELL_S
+    is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < STILL_AT_CONTACT_DWELL_S
     x_mps, y_mps, _ = new.velocity_mps
     new = replace(
         new, velocity_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
     )
     if not is_laterally_unsteady:
-        new = learn_bias_at_rest(new, b.reckoning.imu, obs.imu)
+        new = learn_acceleration_bias_at_rest(new, b.dead_reckoning.imu, obs.imu)
     if obs.telemetry.thrust < 1:  # a hanging vehicle stays in place
-        old = b.reckoning
+        old = b.dead_reckoning
         new = replace(
-            new, lateral_offset_m=old.lateral_offset_m, lateral_sigma_m=old.lateral_sigma_m
+            new,
+            gear_to_target_world_xy_m=old.gear_to_target_world_xy_m,
+            gear_to_target_sigma_m=old.gear_to_target_sigma_m,
         )
     return new
 
@@ -331,7 +352,7 @@ def _stop_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
 def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Adopt the velocity on which pictures and accelerometer agree, each time the visual-inertial
     estimate (`VisualInertialMotion`) has a new one."""
-    motion, before = b.obs.visual_inertial_motion, b.reckoning.imu
+    motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
     # Late pictures make the estimated height diverge, too.
@@ -339,8 +360,8 @@ def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
         new,
-        velocity_mps=(*motion.velocity_mps, climb_mps),
-        bias_mps2=(*motion.bias_mps2, new.bias_mps2[2]),
+        velocity_mps=(*motion.lateral_velocity_mps, climb_mps),
+        acceleration_bias_mps2=(*motion.acceleration_bias_mps2, new.acceleration_bias_mps2[2]),
     )
 
 
@@ -356,20 +377,23 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     sigma_m = float(max(target.sigma_m[:2]))
-    lateral_offset_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
+    gear_to_target_world_xy_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
     if (
         not seen
         and b.position_last_stale_at_s is not None
         and b.position_last_stale_at_s >= target.measured_s
     ):
-        lateral_offset_m, sigma_m = new.lateral_offset_m, new.lateral_sigma_m
-    new = add_sighting(new, target.measured_s, lateral_offset_m, float(ez), sigma_m)
-    if seen and target.measured_s > new.last_position_step_s:
-        new = replace(new, position_step_sum_xy_m=(0.0, 0.0))
+        gear_to_target_world_xy_m, sigma_m = (
+            new.gear_to_target_world_xy_m,
+            new.gear_to_target_sigma_m,
+        )
+    new = add_sighting(new, target.measured_s, gear_to_target_world_xy_m, float(ez), sigma_m)
+    if seen and target.measured_s > new.last_unexplained_position_step_at_s:
+        new = replace(new, unexplained_position_step_sum_xy_m=(0.0, 0.0))
     return new
 
 
-def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Correct the reckoned height of a supported vehicle, with the target as the only position
     source.
 
@@ -378,10 +402,10 @@ def _correct_supported_height(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """
     near = (
         b.is_positioned_by_target
-        and not b.sent.maneuver.descends
-        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_HELD_M
+        and not b.command_history.maneuver.descends_to_floor
+        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M
     )
-    if not near or b.held_s(SUPPORT_SHOWN_BY_IMU) < b.profile.planner.perch.contact_dwell_s:
+    if not near or b.true_for_s(IMU_SHOWS_SUPPORT) < b.profile.planner.perch.contact_dwell_s:
         return new
     return replace(
         new,
@@ -395,10 +419,12 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
     """Return the time since which the magnet may hold the vehicle."""
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     # a released or stopped vehicle does not move into or out of reach
-    if not b.sent.is_under_power:
+    if not b.command_history.is_before_release_and_motor_stop:
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the reckoning says.
-    near = new.gear_below_target_m < MAGNET_REACH_M and b.sent.floor_detected_at_s is None
+    near = (
+        new.gear_below_target_m < MAGNET_REACH_M and b.command_history.floor_detected_at_s is None
+    )
     if b.vehicle_world_z_at_last_contact_m is None and not near:
         return None
     # A vehicle caught below the magnet may be drawn to it again, so an earlier fall proves nothing.
@@ -413,7 +439,7 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     """Return the climb since the previous tick of a vehicle without a position, m; 0 with a
     position."""
-    obs, before, last = b.obs, b.reckoning.imu, b.last_telemetry
+    obs, before, last = b.obs, b.dead_reckoning.imu, b.last_telemetry
     if b.dead_reckoning_since_s is None or before is None:
         return 0.0
     dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
@@ -433,10 +459,10 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
 
 def _update_estimators(b: Belief) -> Belief:
     """Return the belief with its conditions, hover thrust, battery and mounting after the tick."""
-    obs, maneuver = b.obs, b.sent.maneuver
+    obs, maneuver = b.obs, b.command_history.maneuver
     held = bool(hold_reason(b, maneuver))
     fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]
-    condition_start_times_s: dict[Condition[Any], float] = update_start_times(
+    condition_start_times_s: dict[Condition[Any], float] = update_condition_start_times(
         b.condition_start_times_s, fresh, b, obs.t_s
     )
     if held:
@@ -445,19 +471,19 @@ def _update_estimators(b: Belief) -> Belief:
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     # 0: no new sample
-    sample_dt_s = max(0.0, min(MAX_SAMPLE_DURATION_S, obs.telemetry.t_s - last_s))
+    sample_dt_s = max(0.0, min(MAX_FILTER_STEP_S, obs.telemetry.t_s - last_s))
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.climbs_to_target or b.target.gear_to_target_z_m > near_m
     b = replace(
         b,
-        hover_thrust_estimate=b.hover_thrust_estimate.propagate_unmeasured(dt_s),
+        hover_thrust_estimate=b.hover_thrust_estimate.propagate_without_measurement(dt_s),
         rotor_thrust=hover.rotor_thrust(b, sample_dt_s),
     )
     found = b.hover_thrust_estimate
     if away and maneuver.learns_hover_thrust and is_flying_at_hover_thrust(b):
-        found = hover.learn_in_quiet_flight(b, sample_dt_s)
-    elif b.sent.is_level_descent:
-        found = hover.learn_in_descent(b, sample_dt_s)
+        found = hover.learn_hover_thrust_in_quiet_flight(b, sample_dt_s)
+    elif b.command_history.is_descending_by_raw_thrust:
+        found = hover.learn_hover_thrust_in_descent(b, sample_dt_s)
     mah = b.profile.vehicle.battery_mah
     return replace(
         b,
@@ -465,7 +491,7 @@ def _update_estimators(b: Belief) -> Belief:
         last_telemetry=obs.telemetry,
         condition_start_times_s=condition_start_times_s,
         hover_thrust_estimate=found,
-        battery_fit=update_from_telemetry(
+        battery_fit=update_battery_fit_from_telemetry(
             b.battery_fit, obs.telemetry, obs.battery_reading_age_s, dt_s, mah
         ),
         mounting=b.mounting if held else _update_mounting(b),
@@ -475,7 +501,7 @@ def _update_estimators(b: Belief) -> Belief:
 
 def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
     """Return the mean lean after a sample that covers `sample_dt_s`."""
-    gain = 1.0 - math.exp(-sample_dt_s / LEAN_TIME_CONSTANT_S)
+    gain = 1.0 - math.exp(-sample_dt_s / MEAN_LEAN_TIME_CONSTANT_S)
     (x, y), (mean_x, mean_y) = b.lean_sine_world_xy, b.mean_lean_sine_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)
 
@@ -484,10 +510,13 @@ def _update_mounting(b: Belief) -> MountingMonitor:
     obs, target = b.obs, b.obs.target
     measured = target is not None and target.measured and target.world_m is not None
     if not (
-        obs.has_new_frame and measured and b.is_telemetry_fresh and b.sent.maneuver.in_free_air
+        obs.has_new_frame
+        and measured
+        and b.is_telemetry_fresh
+        and b.command_history.maneuver.is_in_free_air
     ):
         return b.mounting
     assert b.last_target_world_m is not None
-    return update_monitor(
+    return update_mounting_monitor(
         b.mounting, make_mounting_sample(obs.t_s, obs.telemetry, b.last_target_world_m)
     )

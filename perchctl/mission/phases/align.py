@@ -17,10 +17,10 @@ from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
 from perchctl.mission.phases.recover import has_recovered
 from perchctl.mission.setpoints import (
-    MIN_HOLD_HEIGHT_M,
+    MIN_HELD_SETPOINT_HEIGHT_M,
     Action,
     fly_under_target,
-    hold_here,
+    make_setpoint_at_vehicle,
 )
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
@@ -46,12 +46,12 @@ CLIMB_WITHHELD = Condition[Context](
 
 def act(c: Context) -> Action:
     """Move under the target at the setpoint's height."""
-    return fly_under_target(c, (c.state.setpoint or hold_here(c)).z_m)
+    return fly_under_target(c, (c.state.setpoint or make_setpoint_at_vehicle(c)).z_m)
 
 
 def is_aligned(c: Context) -> bool:
     """True once the vehicle has been aligned for `align.dwell_s`."""
-    return c.held_s(ALIGNED) >= c.planner.align.dwell_s
+    return c.true_for_s(ALIGNED) >= c.planner.align.dwell_s
 
 
 def is_charge_too_low_for_attempt(c: Context) -> bool:
@@ -80,7 +80,7 @@ def is_hover_height_unsafe(c: Context) -> bool:
     if height_m is None or not is_aligned(c):
         return False
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
-    return not MIN_HOLD_HEIGHT_M <= height_m <= highest_m
+    return not MIN_HELD_SETPOINT_HEIGHT_M <= height_m <= highest_m
 
 
 def unsafe_hover_reason(c: Context) -> str:
@@ -91,15 +91,15 @@ def unsafe_hover_reason(c: Context) -> str:
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
     return (
         f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground; the vehicle "
-        f"hovers {MIN_HOLD_HEIGHT_M:g} to {highest_m:g} m above the ground: change the distance "
-        f"below the target"
+        f"hovers {MIN_HELD_SETPOINT_HEIGHT_M:g} to {highest_m:g} m above the ground: "
+        f"change the distance below the target"
     )
 
 
 ALIGN = PhaseDefinition(
     phase=Phase.ALIGN,
     maneuver=Maneuver(
-        in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
+        is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
     act=act,
     conditions=(ALIGNED, CLIMB_WITHHELD),
@@ -115,7 +115,7 @@ ALIGN = PhaseDefinition(
         back_off_row(
             "align-timeout",
             {Phase.ALIGN},
-            lambda c: c.in_phase_s - c.state.waited_in_phase_s > c.planner.align.timeout_s,
+            lambda c: c.time_in_phase_s - c.state.total_wait_in_phase_s > c.planner.align.timeout_s,
             "the alignment took too long",
         ),
         land_row(
@@ -133,7 +133,7 @@ ALIGN = PhaseDefinition(
         land_row(
             "climb-not-permitted",
             {Phase.ALIGN},
-            lambda c: c.held_s(CLIMB_WITHHELD) > MAX_CLIMB_WAIT_S,
+            lambda c: c.true_for_s(CLIMB_WITHHELD) > MAX_CLIMB_WAIT_S,
             lambda c: (
                 f"no permission to climb for {MAX_CLIMB_WAIT_S:g} s: {c.obs.climb_withheld_reason}"
             ),

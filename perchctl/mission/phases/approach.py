@@ -11,23 +11,23 @@ from perchctl.mission.setpoints import Action, fly_to, step_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_CONTROLLED_HEIGHT_M = 0.1
+MIN_HEIGHT_TO_CORRECT_HEIGHT_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
 stands jumps up."""
-LATERAL_APPROACH_HEIGHT_FRACTION = 0.7
+MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
 """Share of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
-REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8
+MIN_REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8
 """Share of the take-off height that counts as reached."""
 MAX_TAKEOFF_END_SPEED_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
 TAKEOFF_END_DWELL_S = 0.3
 """Time for which the vehicle must hover, s."""
 
-AT_TAKEOFF_HEIGHT = Condition[Context](
+TAKEOFF_HEIGHT_REACHED = Condition[Context](
     "at take-off height",
     lambda c: (
-        c.belief.height_m >= REACHED_TAKEOFF_HEIGHT_FRACTION * c.planner.takeoff_height_m
+        c.belief.height_m >= MIN_REACHED_TAKEOFF_HEIGHT_FRACTION * c.planner.takeoff_height_m
         and c.belief.speed_mps <= MAX_TAKEOFF_END_SPEED_MPS
         and c.state.setpoint is not None
     ),
@@ -44,31 +44,31 @@ def act(c: Context) -> Action:
     start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
     if (
         planner.approach_xy_m is not None
-        and b.height_m > LATERAL_APPROACH_HEIGHT_FRACTION * planner.takeoff_height_m
+        and b.height_m > MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH * planner.takeoff_height_m
     ):
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
-    setpoint = step_towards(c, start, goal, up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_CONTROLLED_HEIGHT_M)
+    setpoint = step_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_M)
 
 
 APPROACH = PhaseDefinition(
     phase=Phase.APPROACH,
-    maneuver=Maneuver(in_free_air=True),
+    maneuver=Maneuver(is_in_free_air=True),
     act=act,
-    conditions=(AT_TAKEOFF_HEIGHT,),
+    conditions=(TAKEOFF_HEIGHT_REACHED,),
     exits=(
         Transition(
             "approached",
             {Phase.APPROACH},
-            lambda c: c.held_s(AT_TAKEOFF_HEIGHT) >= TAKEOFF_END_DWELL_S,
+            lambda c: c.true_for_s(TAKEOFF_HEIGHT_REACHED) >= TAKEOFF_END_DWELL_S,
             Phase.SEARCH,
             "hovering in the perching area",
         ),
         land_row(
             "approach-timeout",
             {Phase.APPROACH},
-            lambda c: c.in_phase_s > c.planner.approach_timeout_s,
+            lambda c: c.time_in_phase_s > c.planner.approach_timeout_s,
             lambda c: f"the take-off reached only {c.belief.height_m:.2f} m",
         ),
     ),

@@ -9,24 +9,24 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Phase, Severity, VehicleClaim
+from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.setpoints import (
-    MAX_IN_PLACE_SPEED_MPS,
+    MAX_SPEED_HOVERING_IN_PLACE_MPS,
     Action,
     fly_under_target,
-    hold_here,
+    make_setpoint_at_vehicle,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
-MAX_CONE_RADIUS_FRACTION_TO_CLIMB = 0.7
+MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB = 0.7
 """Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
 returns to ALIGN."""
-MAX_SETPOINT_LEAD_M = 0.15
+MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M = 0.15
 """Largest height of the setpoint above the vehicle during the climb, m. Larger: the setpoint runs
 far ahead of a weak vehicle."""
-MIN_CLIMB_MPS = 0.02
+MIN_ASCENT_CLIMB_RATE_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
 HOVER_HEIGHT_TOLERANCE_M = 0.05
 """Largest vertical distance from the hover's place at which the vehicle has reached it, m. Larger:
@@ -58,7 +58,7 @@ def is_near_standoff(c: Context) -> bool:
     return c.belief.target.gear_to_target_z_m <= standoff_m(c) + c.planner.ascend.settle_z_m
 
 
-def _is_settled(c: Context) -> bool:
+def _is_settled_at_standoff(c: Context) -> bool:
     """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
     the small marker recently."""
     ascend, target, offset = c.planner.ascend, c.belief.target, c.belief.lateral_offset
@@ -75,7 +75,7 @@ def _is_settled(c: Context) -> bool:
     )
 
 
-def _is_at_hover_place(c: Context) -> bool:
+def _is_at_hover_position(c: Context) -> bool:
     """True if the vehicle is slow, with the gear aligned below a fresh target where the mission
     hovers. The tolerances are those of ALIGN, since the small marker may be too far away to be
     seen."""
@@ -88,13 +88,16 @@ def _is_at_hover_place(c: Context) -> bool:
         and abs(target.gear_to_target_z_m - standoff_m(c)) <= HOVER_HEIGHT_TOLERANCE_M
         and target.gear_to_target_distance_xy_m <= align.xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
-        and c.belief.speed_mps <= MAX_IN_PLACE_SPEED_MPS
+        and c.belief.speed_mps <= MAX_SPEED_HOVERING_IN_PLACE_MPS
     )
 
 
-def is_climbing_back(state: PlannerState) -> bool:
+def is_returning_to_hover_height(state: PlannerState) -> bool:
     """True if this ascent returns a vehicle that has sunk during its hover to the hover's place."""
-    return state.phase is Phase.ASCEND and VehicleClaim.RESUMES_HOVER in state.entry.claims
+    return (
+        state.phase is Phase.ASCEND
+        and VehicleDiagnosis.RETURNING_TO_HOVER_HEIGHT in state.entry.diagnosis
+    )
 
 
 def is_target_lost(c: Context) -> bool:
@@ -105,55 +108,59 @@ def is_target_lost(c: Context) -> bool:
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 
-NEAR_STANDOFF = Condition[Context](
+NEAR_STANDOFF_HEIGHT = Condition[Context](
     "near the stand-off", lambda c: c.belief.target.is_tracked and is_near_standoff(c)
 )
 """The gear is at the stand-off below a tracked target."""
-SETTLED = Condition[Context]("settled", _is_settled)
+SETTLED_AT_STANDOFF = Condition[Context]("settled", _is_settled_at_standoff)
 """The vehicle is slow and aligned at the stand-off."""
-AT_HOVER_PLACE = Condition[Context](
-    "at the hover's place", lambda c: c.planner.hover is not None and _is_at_hover_place(c)
+AT_HOVER_POSITION = Condition[Context](
+    "at the hover's place", lambda c: c.planner.hover is not None and _is_at_hover_position(c)
 )
 """The mission hovers, and the vehicle is slow and aligned where it does."""
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Reset the search: if the aligned target is lost later, the search starts from the
     beginning."""
-    del before
-    return replace(state, searched_positions=0)
+    del previous_context
+    return replace(state, searched_position_count=0)
 
 
 def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
-    setpoint = c.state.setpoint or hold_here(c)
+    setpoint = c.state.setpoint or make_setpoint_at_vehicle(c)
     goal_z = target.vehicle_world_z_when_touching_m - standoff_m(c)
     may_climb = (
         target.is_fresh
         and target.gear_to_target_distance_xy_m
-        < MAX_CONE_RADIUS_FRACTION_TO_CLIMB * cone_radius_m(c)
+        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * cone_radius_m(c)
     )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.gear_to_target_z_m < ascend.near_m else ascend.speed_mps
-    speed = min(speed, max(MIN_CLIMB_MPS, goal_z - setpoint.z_m))
+    speed = min(speed, max(MIN_ASCENT_CLIMB_RATE_MPS, goal_z - setpoint.z_m))
     return fly_under_target(
-        c, goal_z, up_mps=speed if may_climb and lag_m < MAX_SETPOINT_LEAD_M else 0.0
+        c,
+        goal_z,
+        max_up_mps=speed
+        if may_climb and lag_m < MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M
+        else 0.0,
     )
 
 
 ASCEND = PhaseDefinition(
     phase=Phase.ASCEND,
     maneuver=Maneuver(
-        in_free_air=True,
+        is_in_free_air=True,
         is_camera_guided=True,
-        needs_pictures=True,
+        requires_pictures=True,
         learns_hover_thrust=True,
         climbs_to_target=True,
     ),
     enter=enter,
     act=act,
-    conditions=(NEAR_STANDOFF, SETTLED, AT_HOVER_PLACE),
+    conditions=(NEAR_STANDOFF_HEIGHT, SETTLED_AT_STANDOFF, AT_HOVER_POSITION),
     exits=(
         back_off_row(
             "ascend-lost",
@@ -173,15 +180,15 @@ ASCEND = PhaseDefinition(
             "ascend-timeout",
             {Phase.ASCEND},
             lambda c: (
-                c.in_phase_s > c.planner.ascend.timeout_s
-                or c.held_s(NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
+                c.time_in_phase_s > c.planner.ascend.timeout_s
+                or c.true_for_s(NEAR_STANDOFF_HEIGHT) > c.planner.ascend.settle_timeout_s
             ),
             "did not settle under the target",
         ),
         Transition(
             "at-hover-place",
             {Phase.ASCEND},
-            lambda c: c.held_s(AT_HOVER_PLACE) >= c.planner.ascend.settle_dwell_s,
+            lambda c: c.true_for_s(AT_HOVER_POSITION) >= c.planner.ascend.settle_dwell_s,
             Phase.HOVER,
             lambda c: f"steady {standoff_m(c):g} m below the target",
         ),
@@ -189,7 +196,8 @@ ASCEND = PhaseDefinition(
             "settled",
             {Phase.ASCEND},
             lambda c: (
-                c.planner.hover is None and c.held_s(SETTLED) >= c.planner.ascend.settle_dwell_s
+                c.planner.hover is None
+                and c.true_for_s(SETTLED_AT_STANDOFF) >= c.planner.ascend.settle_dwell_s
             ),
             Phase.PERCH,
             "settled at the stand-off",

@@ -4,7 +4,7 @@ vehicle."""
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import (
-    MAGNET_HOLDS,
+    MAGNET_HOLDS_VEHICLE,
     MOTORS_OFF_DWELL_S,
     MOTORS_STOPPED,
     gear_offset_at_last_touch_or_now,
@@ -13,7 +13,7 @@ from perchctl.mission.belief.contact import (
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Outcome, Phase, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.release import lower_thrust, release_by_thrust, stop_motors
 from perchctl.mission.rest import is_still_hanging
 from perchctl.mission.setpoints import Action
@@ -25,37 +25,41 @@ MOTOR_STOP_TIMEOUT_S = 10.0
 """Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
     belief = replace(
         state.belief,
-        vehicle_world_z_at_last_contact_m=before.telemetry.position_m[2],
-        last_contact_offset=gear_offset_at_last_touch_or_now(before.belief),
+        vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],
+        last_contact_offset=gear_offset_at_last_touch_or_now(previous_context.belief),
     )
-    return replace(state, belief=belief, release_began_s=None)
+    return replace(state, belief=belief, release_began_at_s=None)
 
 
 def act(c: Context) -> Action:
     """Transfer the weight from the rotors to the magnet in two stages (the release), stop the
     motors once the whole weight hangs, and monitor the vehicle."""
-    if c.state.motor_stop_ordered_at_s is not None:
+    if c.state.motor_stop_commanded_at_s is not None:
         return stop_motors(c)
-    holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
-    return release_by_thrust(c) if holds or c.state.release_began_s is not None else lower_thrust(c)
+    holds = c.true_for_s(MAGNET_HOLDS_VEHICLE) >= c.planner.complete.hold_dwell_s
+    return (
+        release_by_thrust(c) if holds or c.state.release_began_at_s is not None else lower_thrust(c)
+    )
 
 
-def time_since_motor_stop_order_s(c: Context) -> float:
+def time_since_motor_stop_command_s(c: Context) -> float:
     """Seconds since the first order to stop the motors; -1 before it."""
     return (
-        -1.0 if c.state.motor_stop_ordered_at_s is None else c.t_s - c.state.motor_stop_ordered_at_s
+        -1.0
+        if c.state.motor_stop_commanded_at_s is None
+        else c.t_s - c.state.motor_stop_commanded_at_s
     )
 
 
 def is_release_monitoring_over(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return (
-        time_since_motor_stop_order_s(c) >= c.planner.complete.watch_s
-        and c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S
+        time_since_motor_stop_command_s(c) >= c.planner.complete.watch_s
+        and c.true_for_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S
     )
 
 
@@ -71,20 +75,20 @@ COMPLETE = PhaseDefinition(
             lambda c: has_slipped(c.belief),
             lambda c: (
                 "slipped while hanging"
-                if c.state.motor_stop_ordered_at_s
+                if c.state.motor_stop_commanded_at_s
                 else "the magnet does not hold"
             ),
-            claims=VehicleClaim.SLIPPED,
+            diagnosis=VehicleDiagnosis.SLIPPED_OFF_CONTACT,
         ),
         back_off_row(
             "not-released",
             {Phase.COMPLETE},
             lambda c: (
-                c.state.motor_stop_ordered_at_s is None
-                and c.in_phase_s > c.planner.complete.release_timeout_s
+                c.state.motor_stop_commanded_at_s is None
+                and c.time_in_phase_s > c.planner.complete.release_timeout_s
             ),
             "the release was not completed in time",
-            claims=VehicleClaim.STILL_ATTACHED,
+            diagnosis=VehicleDiagnosis.STILL_AT_PROVEN_CONTACT,
         ),
         Transition(
             "perched",
@@ -104,7 +108,8 @@ COMPLETE = PhaseDefinition(
             "not-stopped",
             {Phase.COMPLETE},
             lambda c: (
-                time_since_motor_stop_order_s(c) > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S
+                time_since_motor_stop_command_s(c)
+                > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S
             ),
             lambda c: (
                 f"motors stopped, but telemetry still reports a thrust of {c.telemetry.thrust:.0f}"

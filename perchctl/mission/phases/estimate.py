@@ -7,13 +7,13 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.setpoints import Action, fly_to, hold_here
+from perchctl.mission.setpoints import Action, fly_to, make_setpoint_at_vehicle
 from perchctl.mission.transition import Transition
 
-UNTRACKED_TIMEOUT_S = 1.0
+TARGET_UNTRACKED_TIMEOUT_S = 1.0
 """Time without the target after which the search restarts, s."""
 
-UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
+TARGET_UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
 """The target is not tracked."""
 TARGET_POSITION_STEADY = Condition[Context](
     "estimated",
@@ -27,23 +27,23 @@ TARGET_POSITION_STEADY = Condition[Context](
 
 def act(c: Context) -> Action:
     """Hold the setpoint while several frames confirm the target's position."""
-    return fly_to(c, c.state.setpoint or hold_here(c))
+    return fly_to(c, c.state.setpoint or make_setpoint_at_vehicle(c))
 
 
 ESTIMATE = PhaseDefinition(
     phase=Phase.ESTIMATE,
     maneuver=Maneuver(
-        in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
+        is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
     act=act,
-    conditions=(UNTRACKED, TARGET_POSITION_STEADY),
+    conditions=(TARGET_UNTRACKED, TARGET_POSITION_STEADY),
     exits=(
         Transition(
             "estimate-lost",
             {Phase.ESTIMATE},
             lambda c: (
-                c.held_s(UNTRACKED) > UNTRACKED_TIMEOUT_S
-                or c.in_phase_s > c.planner.estimate.timeout_s
+                c.true_for_s(TARGET_UNTRACKED) > TARGET_UNTRACKED_TIMEOUT_S
+                or c.time_in_phase_s > c.planner.estimate.timeout_s
             ),
             Phase.SEARCH,
             "target lost, or its pose did not settle",
@@ -52,7 +52,7 @@ ESTIMATE = PhaseDefinition(
         Transition(
             "estimated",
             {Phase.ESTIMATE},
-            lambda c: c.held_s(TARGET_POSITION_STEADY) >= c.planner.estimate.dwell_s,
+            lambda c: c.true_for_s(TARGET_POSITION_STEADY) >= c.planner.estimate.dwell_s,
             Phase.ALIGN,
             "pose is steady",
         ),

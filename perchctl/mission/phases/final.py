@@ -5,7 +5,7 @@ from __future__ import annotations
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.descent import is_landing_over
+from perchctl.mission.descent import has_landing_command_reached_end
 from perchctl.mission.phase import Phase
 from perchctl.mission.release import has_thrust_ramped_down
 from perchctl.mission.setpoints import Action
@@ -21,11 +21,13 @@ def rest(c: Context) -> Action:
 def abort(c: Context) -> Action:
     """Stop the motors once; without a stop, the firmware would lock a vehicle that hangs with still
     motors."""
-    if c.state.stop_or_land_order_count:
+    if c.state.stop_or_land_command_count:
         return c.state, Idle()
-    ends = StopMotors() if has_thrust_ramped_down(c) or is_landing_over(c) else Idle()
+    ends = (
+        StopMotors() if has_thrust_ramped_down(c) or has_landing_command_reached_end(c) else Idle()
+    )
     return replace(
-        c.state, stop_or_land_order_count=1, last_stop_or_land_order_at_s=c.t_s
+        c.state, stop_or_land_command_count=1, last_stop_or_land_command_at_s=c.t_s
     ), c.state.entry.stop or ends
 
 

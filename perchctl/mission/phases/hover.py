@@ -3,8 +3,8 @@
 The mission is that of a perch up to ASCEND, which ends at the hover's place instead of the
 stand-off. HOVER itself never climbs. A vehicle that sinks below its place, for example because the
 estimated height drifts, climbs back in ASCEND; its time goes on if that takes at most
-`MAX_CLIMB_BACK_S`. A vehicle that leaves its place returns to ALIGN, and its time starts anew. So a
-completed hover has kept its place for the whole time, apart from such climbs.
+`MAX_RETURN_TO_HOVER_HEIGHT_S`. A vehicle that leaves its place returns to ALIGN, and its time
+starts anew. So a completed hover has kept its place for the whole time, apart from such climbs.
 """
 
 from __future__ import annotations
@@ -13,32 +13,38 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Outcome, Phase, Severity, VehicleClaim
-from perchctl.mission.phases.ascend import cone_radius_m, is_climbing_back, is_target_lost
-from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
+from perchctl.mission.phases.ascend import (
+    cone_radius_m,
+    is_returning_to_hover_height,
+    is_target_lost,
+)
+from perchctl.mission.setpoints import Action, fly_under_target, make_setpoint_at_vehicle
 from perchctl.mission.state import HoverErrors, PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.profile import HoverConfig
 from perchctl.values import replace
 
-MAX_HOVER_RISE_M = 0.02
+MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M = 0.02
 """Height of the setpoint above the hover's place from which it sinks, m. Larger: a drift of the
 estimated height brings the vehicle closer to the ceiling. Smaller: the noise of the target's height
 lowers it step by step."""
-MAX_HOVER_SINK_M = 0.06
+MAX_SINK_BELOW_HOVER_HEIGHT_M = 0.06
 """Distance below the hover's place from which the vehicle climbs back, m. Larger: a drift of the
 estimated height moves the vehicle further. Smaller: the noise of the target's height makes it climb
 back needlessly."""
-HOVER_SINK_DWELL_S = 0.3
+SUNK_BELOW_HOVER_HEIGHT_DWELL_S = 0.3
 """Time for which the vehicle must be so low, s."""
-MAX_CLIMB_BACK_S = 5.0
+MAX_RETURN_TO_HOVER_HEIGHT_S = 5.0
 """Longest time of a climb back after which the hover's time goes on, s. Larger: a weak vehicle
 counts as hovering although it is too low. Smaller: a windy climb starts the time anew."""
 MAX_HOVER_HEIGHT_ERROR_M = 0.15
 """Vertical distance from its place at which the vehicle has left it, m. Larger: a hover that sinks
 or rises still counts. Smaller: a gust starts the time anew."""
 
-SUNK = Condition[Context]("sunk", lambda c: distance_below_hover_height_m(c) > MAX_HOVER_SINK_M)
+SUNK_BELOW_HOVER_HEIGHT = Condition[Context](
+    "sunk", lambda c: distance_below_hover_height_m(c) > MAX_SINK_BELOW_HOVER_HEIGHT_M
+)
 """The vehicle is too low for a hover."""
 
 
@@ -49,18 +55,21 @@ def hover_config(c: Context) -> HoverConfig:
 
 def is_hovering(state: PlannerState) -> bool:
     """True while the hover's time runs."""
-    return state.phase is Phase.HOVER or is_climbing_back(state)
+    return state.phase is Phase.HOVER or is_returning_to_hover_height(state)
 
 
-def hover_duration_s(c: Context) -> float:
+def time_since_hover_began_s(c: Context) -> float:
     """Return the time since the hover began, s."""
-    return c.t_s - c.state.hover_errors.began_s
+    return c.t_s - c.state.hover_errors.hover_began_at_s
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Start the hover's time and its position errors. They continue if the vehicle only climbed
-    back to its place within `MAX_CLIMB_BACK_S`."""
-    if is_climbing_back(before.state) and before.in_phase_s <= MAX_CLIMB_BACK_S:
+    back to its place within `MAX_RETURN_TO_HOVER_HEIGHT_S`."""
+    if (
+        is_returning_to_hover_height(previous_context.state)
+        and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_S
+    ):
         return state
     return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
 
@@ -68,9 +77,9 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 def act(c: Context) -> Action:
     """Stay under the target at the setpoint's height; sink if the target is nearer than it should
     be."""
-    old = c.state.setpoint or hold_here(c)
+    old = c.state.setpoint or make_setpoint_at_vehicle(c)
     goal_z_m = c.belief.target.vehicle_world_z_when_touching_m - hover_config(c).below_m
-    return fly_under_target(c, min(old.z_m, goal_z_m + MAX_HOVER_RISE_M))
+    return fly_under_target(c, min(old.z_m, goal_z_m + MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M))
 
 
 def distance_below_hover_height_m(c: Context) -> float:
@@ -78,7 +87,7 @@ def distance_below_hover_height_m(c: Context) -> float:
     return c.belief.target.gear_to_target_z_m - hover_config(c).below_m
 
 
-def has_left_place(c: Context) -> bool:
+def has_left_hover_position(c: Context) -> bool:
     """True if the gear's offset from the target's axis exceeds the radius of the approach cone
     (`cone_radius_m`), or its height differs from that of the hover by more than
     `MAX_HOVER_HEIGHT_ERROR_M`."""
@@ -89,7 +98,7 @@ def has_left_place(c: Context) -> bool:
     )
 
 
-def left_place_reason(c: Context) -> str:
+def left_hover_position_reason(c: Context) -> str:
     """Return how far the vehicle is from its place."""
     aside_m, below_m = (
         c.belief.target.gear_to_target_distance_xy_m,
@@ -104,15 +113,15 @@ def left_place_reason(c: Context) -> str:
 HOVER = PhaseDefinition(
     phase=Phase.HOVER,
     maneuver=Maneuver(
-        in_free_air=True,
+        is_in_free_air=True,
         is_camera_guided=True,
-        needs_pictures=True,
+        requires_pictures=True,
         learns_hover_thrust=True,
         climbs_to_target=True,
     ),
     enter=enter,
     act=act,
-    conditions=(SUNK,),
+    conditions=(SUNK_BELOW_HOVER_HEIGHT,),
     exits=(
         back_off_row(
             "hover-lost",
@@ -123,16 +132,17 @@ HOVER = PhaseDefinition(
         Transition(
             "left-place",
             {Phase.HOVER},
-            has_left_place,
+            has_left_hover_position,
             Phase.ALIGN,
-            left_place_reason,
+            left_hover_position_reason,
             Severity.HOLD,
         ),
         land_row(
             "hovered",
             {Phase.HOVER},
             lambda c: (
-                hover_duration_s(c) >= hover_config(c).duration_s and c.belief.target.is_fresh
+                time_since_hover_began_s(c) >= hover_config(c).duration_s
+                and c.belief.target.is_fresh
             ),
             lambda c: (
                 f"hovered for {hover_config(c).duration_s:g} s, {hover_config(c).below_m:g} m "
@@ -143,10 +153,10 @@ HOVER = PhaseDefinition(
         Transition(
             "sunk",
             {Phase.HOVER},
-            lambda c: c.held_s(SUNK) >= HOVER_SINK_DWELL_S,
+            lambda c: c.true_for_s(SUNK_BELOW_HOVER_HEIGHT) >= SUNK_BELOW_HOVER_HEIGHT_DWELL_S,
             Phase.ASCEND,
             lambda c: f"{distance_below_hover_height_m(c):.2f} m too low: climbing back",
-            claims=VehicleClaim.RESUMES_HOVER,
+            diagnosis=VehicleDiagnosis.RETURNING_TO_HOVER_HEIGHT,
         ),
     ),
 )

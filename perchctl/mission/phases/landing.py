@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, MOTORS_STOPPED
-from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
+from perchctl.mission.belief.reckoning import correct_acceleration_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.descent import DESCENT_MANEUVER, act, enter_descent
-from perchctl.mission.phase import Outcome, Phase, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Predicate, Transition, abort_during_landing_row
@@ -18,31 +18,39 @@ TARGET_RECHECK_DURATION_S = 2.0
 """Time after the motors are off in which the camera may still show the target far above, s."""
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Start the descent. Where the row that ordered it claims that external positions or the
-    mounting are wrong, the descent does not use them, and without a claim that the vehicle hangs,
-    the last contact is forgotten."""
-    claims, b = state.entry.claims, state.belief
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+    """Start the descent. If the row that started it asserts that external positions or the mounting
+    are wrong, the descent does not use them. Unless the row asserts that the vehicle hangs, the
+    last contact is forgotten."""
+    diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.
     capture = b.profile.positioning.source.is_mocap and b.mounting.is_camera_mounting_wrong
-    if VehicleClaim.EXTERNAL_POSITIONS_WRONG in claims or (
-        VehicleClaim.MOUNTING_WRONG in claims and capture
+    if VehicleDiagnosis.EXTERNAL_POSITIONS_WRONG in diagnosis or (
+        VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis and capture
     ):
-        reckoning = (
-            b.reckoning if b.is_position_diverged else correct_bias_for_wrong_positions(b.reckoning)
+        dead_reckoning = (
+            b.dead_reckoning
+            if b.is_position_diverged
+            else correct_acceleration_bias_for_wrong_positions(b.dead_reckoning)
         )
-        b = replace(b, is_position_diverged=True, reckoning=reckoning)
-    if before.state.phase is Phase.RECOVER and VehicleClaim.HANGS not in claims:
+        b = replace(b, is_position_diverged=True, dead_reckoning=dead_reckoning)
+    if (
+        previous_context.state.phase is Phase.RECOVER
+        and VehicleDiagnosis.HANGING_AT_LAST_TOUCH not in diagnosis
+    ):
         b = replace(b, last_contact_offset=None)  # no evidence of a support at that position
     # With a wrong mounting, the setpoint leads in a wrong direction.
-    setpoint = None if VehicleClaim.MOUNTING_WRONG in claims else state.setpoint
-    return enter_descent(replace(state, belief=b, setpoint=setpoint), before.state)
+    setpoint = None if VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis else state.setpoint
+    return enter_descent(replace(state, belief=b, setpoint=setpoint), previous_context.state)
 
 
-def make_rest_predicate(rest: RestState) -> Predicate:
-    """Return the predicate that the motors are off and the vehicle is in the rest state `rest`."""
-    return lambda c: c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S and find_rest_state(c) is rest
+def make_rest_state_predicate(rest_state: RestState) -> Predicate:
+    """Return the predicate that the motors are off and the vehicle is in the rest state
+    `rest_state`."""
+    return lambda c: (
+        c.true_for_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S and find_rest_state(c) is rest_state
+    )
 
 
 def unconfirmed_landing_reason(c: Context) -> str:
@@ -62,13 +70,17 @@ def unconfirmed_landing_reason(c: Context) -> str:
     return f"the landing was not confirmed in time: {cause}"
 
 
-def _outcome_after_hanging(before: Outcome | None) -> Outcome | None:
+def _outcome_after_hanging(previous_outcome: Outcome | None) -> Outcome | None:
     """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
     ATTEMPTS_USED_UP, since it hangs on a target; HOVERED becomes SAFETY, since a hover must not end
     on the magnet; others stay."""
-    if before is Outcome.HOVERED:
+    if previous_outcome is Outcome.HOVERED:
         return Outcome.SAFETY
-    return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before
+    return (
+        Outcome.ATTEMPTS_USED_UP
+        if previous_outcome is Outcome.TARGET_NOT_FOUND
+        else previous_outcome
+    )
 
 
 LANDING = PhaseDefinition(
@@ -80,7 +92,7 @@ LANDING = PhaseDefinition(
         Transition(
             "hung",
             {Phase.LANDING},
-            make_rest_predicate(RestState.HANGS),
+            make_rest_state_predicate(RestState.HANGS),
             Phase.PERCHED,
             "hanging with the motors off",
             outcome=_outcome_after_hanging,
@@ -88,7 +100,7 @@ LANDING = PhaseDefinition(
         Transition(
             "landed",
             {Phase.LANDING},
-            make_rest_predicate(RestState.STANDS),
+            make_rest_state_predicate(RestState.STANDS),
             Phase.LANDED,
             lambda c: (
                 "motors off"
@@ -101,21 +113,21 @@ LANDING = PhaseDefinition(
         ),
         abort_during_landing_row(
             "held-elsewhere",
-            make_rest_predicate(RestState.HELD),
+            make_rest_state_predicate(RestState.HELD),
             "motors off; something holds the vehicle away from the target: look before you touch "
             "it",
         ),
         abort_during_landing_row(
             "hangs-or-stands",
-            lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_RECHECK_DURATION_S,
+            lambda c: c.true_for_s(MOTORS_STOPPED) >= TARGET_RECHECK_DURATION_S,
             "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
             "whether the vehicle hangs or stands: look before you touch it",
         ),
         abort_during_landing_row(
             "landing-timeout",
-            lambda c: c.in_phase_s > c.planner.landing.timeout_s,
+            lambda c: c.time_in_phase_s > c.planner.landing.timeout_s,
             unconfirmed_landing_reason,
-            claims=VehicleClaim.LANDING_UNCONFIRMED,
+            diagnosis=VehicleDiagnosis.LANDING_UNCONFIRMED,
         ),
     ),
 )

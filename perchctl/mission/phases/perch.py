@@ -15,23 +15,23 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import CONTACT, current_gear_offset
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.quality import LATERAL_SPEED_BEYOND_DRAUGHT, position_loss_text
+from perchctl.mission.belief.quality import LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT, position_loss_text
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase
 from perchctl.mission.setpoints import (
     Action,
     fly_to,
-    hold_here,
-    setpoint_under_target,
+    make_setpoint_at_vehicle,
+    make_setpoint_under_target,
     step_towards,
 )
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
-LATERAL_SPEED_BEYOND_DRAUGHT_DWELL_S = 0.04
+LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
-MAX_BLIND_PRESS_S = 1.25
+MAX_PRESS_DURATION_WITHOUT_SIGHTING_S = 1.25
 """Longest press after the last sighting, s, since the last centimetres are flown without the target
 in view; with the target alone, by dead reckoning. Larger: the vehicle presses outside the magnet's
 radius. Smaller: a covered marker ends attempts that would succeed."""
@@ -47,17 +47,17 @@ def act(c: Context) -> Action:
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":
         return c.state, RawThrust(perch.thrust)
-    old = c.state.setpoint or hold_here(c)
+    old = c.state.setpoint or make_setpoint_at_vehicle(c)
     if target.world_position_m is None:
         return fly_to(c, old, corrects_height=False)
-    goal = setpoint_under_target(c, target.vehicle_world_z_when_touching_m + perch.press_m)
-    setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
+    goal = make_setpoint_under_target(c, target.vehicle_world_z_when_touching_m + perch.press_m)
+    setpoint = step_towards(c, old, goal, max_up_mps=perch.climb_mps, max_down_mps=0.0)
     return fly_to(c, setpoint, corrects_height=False)
 
 
 def is_in_contact(c: Context) -> bool:
     """True once a contact is proven."""
-    return c.held_s(CONTACT) >= c.planner.perch.contact_dwell_s
+    return c.true_for_s(CONTACT) >= c.planner.perch.contact_dwell_s
 
 
 def contact_evidence_text(c: Context) -> str:
@@ -70,7 +70,7 @@ def contact_evidence_text(c: Context) -> str:
 
 PERCH = PhaseDefinition(
     phase=Phase.PERCH,
-    maneuver=Maneuver(presses=True),
+    maneuver=Maneuver(presses_against_target=True),
     act=act,
     exits=(
         back_off_row(
@@ -87,7 +87,8 @@ PERCH = PhaseDefinition(
             "pressed-blindly",
             {Phase.PERCH},
             lambda c: (
-                c.belief.is_positioned_by_target and c.belief.position_age_s > MAX_BLIND_PRESS_S
+                c.belief.is_positioned_by_target
+                and c.belief.position_age_s > MAX_PRESS_DURATION_WITHOUT_SIGHTING_S
             ),
             lambda c: (
                 f"no contact {c.belief.position_age_s:.1f} s after the last sighting of the target"
@@ -97,7 +98,8 @@ PERCH = PhaseDefinition(
             "knocked-aside",
             {Phase.PERCH},
             lambda c: (
-                c.held_s(LATERAL_SPEED_BEYOND_DRAUGHT) >= LATERAL_SPEED_BEYOND_DRAUGHT_DWELL_S
+                c.true_for_s(LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT)
+                >= LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT_DWELL_S
             ),
             "pushed sideways under the target",
         ),
@@ -106,7 +108,7 @@ PERCH = PhaseDefinition(
             # one.
             "no-contact",
             {Phase.PERCH},
-            lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,
+            lambda c: c.time_in_phase_s + c.obs.tick_start_delay_s > c.planner.perch.timeout_s,
             "contact not proven in time",
         ),
     ),

@@ -7,7 +7,7 @@ import math
 from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import (
     CONTACT,
-    SUPPORT_SHOWN_BY_IMU,
+    IMU_SHOWS_SUPPORT,
     current_gear_offset,
     is_at_contact_height,
 )
@@ -15,7 +15,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import Outcome, Phase, VehicleClaim
+from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_slip,
     choose_catch_setpoint_above_vehicle_m,
@@ -26,7 +26,7 @@ from perchctl.mission.setpoints import (
     Action,
     body_world_xy_under_target,
     fly_to,
-    hold_here,
+    make_setpoint_at_vehicle,
     step_towards,
 )
 from perchctl.mission.state import PlannerState
@@ -34,61 +34,67 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_THRUST_TO_HOVER_WITHOUT_CATCH = 0.85
+MIN_THRUST_TO_HOVER_RATIO_WITHOUT_CATCH = 0.85
 """Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
-CONTACT_CLEARANCE_M = 0.05
+MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
 """Distance below the contact at which the vehicle has left it, m; at most half of the descent."""
-MAX_FOLLOWED_SIGHTING_AGE_S = 3.0
+MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
-RECOVERY_BEFORE_GIVING_UP_S = 0.5
+RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time that the vehicle recovers before the last failed attempt ends the flight, s."""
 UNLIMITED_SETPOINT_DESCENT_MPS = 10.0
 """Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
-STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
+STEADY_AFTER_ATTEMPT = Condition[Context](
+    "steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps
+)
 """The vehicle is slower than `recover.steady_mps`."""
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Record the last touch, and prepare a catch if the vehicle falls."""
-    old, b, claims = before.state, before.belief, state.entry.claims
+    old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
-    touched = old.phase is Phase.PERCH or VehicleClaim.BLOCKED in claims
+    touched = old.phase is Phase.PERCH or VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis
     # A vehicle whose motors carry most of its weight hardly falls.
     falls = (
-        VehicleClaim.SLIPPED in claims
-        and thrust < MIN_THRUST_TO_HOVER_WITHOUT_CATCH * b.hover_thrust
+        VehicleDiagnosis.SLIPPED_OFF_CONTACT in diagnosis
+        and thrust < MIN_THRUST_TO_HOVER_RATIO_WITHOUT_CATCH * b.hover_thrust
     )
     belief = replace(
         state.belief,
-        last_contact_offset=_find_touch_offset(before, claims),
+        last_contact_offset=_find_touch_offset(previous_context, diagnosis),
         # The vehicle counts as within the magnet's reach until its position is below.
         vehicle_world_z_at_last_contact_m=z_m if touched else b.vehicle_world_z_at_last_contact_m,
     )
     return replace(
         state,
         belief=belief,
-        motor_stop_ordered_at_s=None,
-        release_began_s=None,
+        motor_stop_commanded_at_s=None,
+        release_began_at_s=None,
         catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(b.hover_thrust, thrust)
         if falls
         else None,
-        blocked_z_m=z_m if VehicleClaim.BLOCKED in claims else old.blocked_z_m,
+        obstacle_blocked_at_z_m=z_m
+        if VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis
+        else old.obstacle_blocked_at_z_m,
     )
 
 
-def _find_touch_offset(before: Context, claims: VehicleClaim) -> ContactOffset | None:
+def _find_touch_offset(
+    previous_context: Context, diagnosis: VehicleDiagnosis
+) -> ContactOffset | None:
     """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
-    old, b = before.state, before.belief
+    old, b = previous_context.state, previous_context.belief
     # the contact was proven, and the vehicle has not come off
-    if VehicleClaim.STILL_ATTACHED in claims:
+    if VehicleDiagnosis.STILL_AT_PROVEN_CONTACT in diagnosis:
         return b.last_contact_offset
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
         return b.last_contact_offset if b.vehicle_world_z_at_last_contact_m is not None else None
-    proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
-    # `SUPPORT_SHOWN_BY_IMU` includes that dwell time
-    carried = proven or b.held_s(SUPPORT_SHOWN_BY_IMU) >= 0.0
+    proven = b.true_for_s(CONTACT) >= previous_context.planner.perch.contact_dwell_s
+    # `IMU_SHOWS_SUPPORT` includes that dwell time
+    carried = proven or b.true_for_s(IMU_SHOWS_SUPPORT) >= 0.0
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
         return current_gear_offset(b)
     return None
@@ -100,7 +106,9 @@ def act(c: Context) -> Action:
         return caught
     recover = c.planner.recover
     c = Context(
-        forget_contact_when_below(c.state, min(CONTACT_CLEARANCE_M, 0.5 * recover.descend_m))
+        forget_contact_when_below(
+            c.state, min(MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M, 0.5 * recover.descend_m)
+        )
     )
     state, away = end_press(c)
     if away is not None:
@@ -110,23 +118,23 @@ def act(c: Context) -> Action:
         entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
         state = replace(state, catch_setpoint_above_vehicle_m=None, setpoint=None, entry=entry)
     z = state.entry.position_m[2] - recover.descend_m
-    setpoint = state.setpoint or hold_here(c)
+    setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
     target = c.belief.target
-    if target.world_position_m is not None and target.age_s < MAX_FOLLOWED_SIGHTING_AGE_S:
+    if target.world_position_m is not None and target.age_s < MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S:
         x, y = body_world_xy_under_target(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
-    return fly_to(c, step_towards(c, setpoint, goal, down_mps=UNLIMITED_SETPOINT_DESCENT_MPS))
+    return fly_to(c, step_towards(c, setpoint, goal, max_down_mps=UNLIMITED_SETPOINT_DESCENT_MPS))
 
 
 def has_recovered(c: Context) -> bool:
     """True if the vehicle has been steady for `recover.dwell_s`, away from its contact."""
     dwell_s = c.planner.recover.dwell_s
-    steady = c.held_s(STEADY) >= dwell_s and c.in_phase_s >= dwell_s
+    steady = c.true_for_s(STEADY_AFTER_ATTEMPT) >= dwell_s and c.time_in_phase_s >= dwell_s
     return steady and c.belief.vehicle_world_z_at_last_contact_m is None
 
 
@@ -146,17 +154,17 @@ def unsteady_reason(c: Context) -> str:
 
 RECOVER = PhaseDefinition(
     phase=Phase.RECOVER,
-    maneuver=Maneuver(in_free_air=True, is_camera_guided=True, retreats=True),
+    maneuver=Maneuver(is_in_free_air=True, is_camera_guided=True, retreats_after_attempt=True),
     enter=enter,
     act=act,
-    conditions=(STEADY,),
+    conditions=(STEADY_AFTER_ATTEMPT,),
     exits=(
         land_row(
             "attempts-used",
             {Phase.RECOVER},
             lambda c: (
                 c.state.failed_attempts >= c.planner.attempts
-                and c.in_phase_s > RECOVERY_BEFORE_GIVING_UP_S
+                and c.time_in_phase_s > RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S
             ),
             lambda c: (
                 "all perching attempts are used up"
@@ -175,7 +183,7 @@ RECOVER = PhaseDefinition(
         land_row(
             "recover-timeout",
             {Phase.RECOVER},
-            lambda c: c.in_phase_s > c.planner.recover.timeout_s,
+            lambda c: c.time_in_phase_s > c.planner.recover.timeout_s,
             unsteady_reason,
         ),
     ),

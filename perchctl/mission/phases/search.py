@@ -13,7 +13,7 @@ from perchctl.mission.setpoints import (
     Action,
     body_world_xy_under_target,
     fly_to,
-    hold_here,
+    make_setpoint_at_vehicle,
     step_towards,
 )
 from perchctl.mission.state import PlannerState
@@ -23,14 +23,14 @@ from perchctl.vehicle import PositionSetpoint
 
 OBSTACLE_CLEARANCE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
-MAX_MOVE_BEFORE_MOUNTING_CHECK_M = 0.2
+MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M = 0.2
 """Largest lateral distance flown to a target seen before, while the camera's mounting is
 unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
 
-def enter(state: PlannerState, before: Context) -> PlannerState:
+def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Start the search at the vehicle's last setpoint."""
-    setpoint = before.state.setpoint
+    setpoint = previous_context.state.setpoint
     if setpoint is None:
         return state
     place_m = (setpoint.x_m, setpoint.y_m, setpoint.z_m)
@@ -43,43 +43,48 @@ def act(c: Context) -> Action:
     search, state, b = c.planner.search, c.state, c.belief
     takeoff_position_m = b.takeoff_position_m
     assert takeoff_position_m is not None
-    if c.t_s - state.search_step_began_s > search.wait_s:
+    if c.t_s - state.search_step_began_at_s > search.wait_s:
         state = replace(
-            state, searched_positions=state.searched_positions + 1, search_step_began_s=c.t_s
+            state,
+            searched_position_count=state.searched_position_count + 1,
+            search_step_began_at_s=c.t_s,
         )
         c = Context(state)
     x, y, z = state.entry.position_m
     if b.target.world_position_m is not None:
         there = body_world_xy_under_target(c, state.entry.yaw_rad)
-        unconfirmed = b.mounting.is_awaiting_evidence
+        unconfirmed = b.mounting.is_target_motion_undetermined
         x, y = (
             _limit_move_before_mounting_check(b.mounting, (x, y), there) if unconfirmed else there
         )
         height = min(z, b.target.vehicle_world_z_when_touching_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
-        if state.blocked_z_m is not None:
-            top = min(top, state.blocked_z_m - OBSTACLE_CLEARANCE_M)
-        height = min(z + search.step_m * state.searched_positions, top)
-    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_positions
+        if state.obstacle_blocked_at_z_m is not None:
+            top = min(top, state.obstacle_blocked_at_z_m - OBSTACLE_CLEARANCE_M)
+        height = min(z + search.step_m * state.searched_position_count, top)
+    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_position_count
     goal = PositionSetpoint(x, y, height, yaw)
-    old = state.setpoint or hold_here(c)
-    return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
+    old = state.setpoint or make_setpoint_at_vehicle(c)
+    return fly_to(c, step_towards(c, old, goal, max_up_mps=c.planner.ascend.speed_mps))
 
 
 def _limit_move_before_mounting_check(
-    mounting: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
+    mounting: MountingMonitor,
+    start_world_xy_m: tuple[float, float],
+    goal_world_xy_m: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), limited to `MAX_MOVE_BEFORE_MOUNTING_CHECK_M` from the
-    vehicle's position at the last sighting of the target, or from `start` if there was none."""
+    """Return the goal, world x and y (m), limited to `MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M`
+    from the vehicle's position at the last sighting of the target, or from `start_world_xy_m` if
+    there was none."""
     if mounting.sightings:
-        start = (
+        start_world_xy_m = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
             mounting.sightings[-1].vehicle_world_xy_m.imag,
         )
-    dx, dy = goal[0] - start[0], goal[1] - start[1]
-    part = min(1.0, MAX_MOVE_BEFORE_MOUNTING_CHECK_M / max(math.hypot(dx, dy), 1e-6))
-    return start[0] + part * dx, start[1] + part * dy
+    dx, dy = goal_world_xy_m[0] - start_world_xy_m[0], goal_world_xy_m[1] - start_world_xy_m[1]
+    part = min(1.0, MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M / max(math.hypot(dx, dy), 1e-6))
+    return start_world_xy_m[0] + part * dx, start_world_xy_m[1] + part * dy
 
 
 def not_found_reason(c: Context) -> str:
@@ -91,7 +96,7 @@ def not_found_reason(c: Context) -> str:
 
 SEARCH = PhaseDefinition(
     phase=Phase.SEARCH,
-    maneuver=Maneuver(in_free_air=True, is_camera_guided=True, needs_pictures=True),
+    maneuver=Maneuver(is_in_free_air=True, is_camera_guided=True, requires_pictures=True),
     enter=enter,
     act=act,
     exits=(
@@ -105,7 +110,7 @@ SEARCH = PhaseDefinition(
         land_row(
             "searched-out",
             {Phase.SEARCH},
-            lambda c: c.state.searched_positions >= c.planner.search.attempts,
+            lambda c: c.state.searched_position_count >= c.planner.search.attempts,
             not_found_reason,
             Outcome.TARGET_NOT_FOUND,
         ),
