@@ -42,8 +42,8 @@ class Context:
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick. For how long, ask `true_for_s` of the
-        condition."""
+        """What supports the vehicle in this tick. `true_for_s` of the condition says how long it
+        has done so."""
         return find_support(self.belief)
 
     def true_for_s(self, condition: Condition[Any]) -> float:

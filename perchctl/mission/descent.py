@@ -13,7 +13,7 @@ and fresh, and by whether the magnet may hold the vehicle (see the table in docs
   transferred to it.
 
 Only a catch climbs. The firmware's own landing follows a trajectory on its own clock and then stops
-the motors, wherever the vehicle is by then. It is therefore ordered only if a position shows the
+the motors, wherever the vehicle is by then. It is therefore commanded only if a position shows the
 vehicle away from the ceiling.
 """
 
@@ -92,12 +92,12 @@ ON_FLOOR_DWELL_S = 0.5
 
 # --- by the firmware's own landing ---
 LANDING_COMMAND_PERIOD_S = 0.3
-"""Time between landing orders, s. Without its notify message, the firmware does not execute an
-order (docs/firmware.md, "Order without notify")."""
+"""Time between landing commands, s. Without its notify message, the firmware does not execute a
+command (docs/firmware.md, "Order without notify")."""
 MIN_LANDING_COMMANDS = 3
-"""Number of landing orders before the telemetry can confirm that the vehicle lands."""
+"""Number of landing commands before the telemetry can confirm that the vehicle lands."""
 MAX_LANDING_COMMANDS = 6
-"""Largest number of landing orders."""
+"""Largest number of landing commands."""
 ONBOARD_LANDING_MEAN_SPEED_MPS = 0.35
 """Mean speed of the quintic landing trajectory, m/s."""
 ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
@@ -117,9 +117,9 @@ MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the descent without the mission's transition table: for the watchdog, which
-    takes over from a silent loop, and for the rescue after an exception. The first call begins the
-    landing. `state` is None if the planner has not run yet."""
+    """Fly one tick of the descent without the mission's transition table. The watchdog calls it
+    when the loop has stopped responding, and the rescue after an exception. The first call begins
+    the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
@@ -172,7 +172,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
             last_stop_or_land_command_at_s=b.obs.t_s,
         )
     elif heard and tel.thrust < 1 and previous_state.motor_stop_commanded_at_s is None:
-        # The motors were stopped or never ran; no order may start them again.
+        # The motors were stopped or never ran; no command may start them again.
         state = replace(state, motor_stop_commanded_at_s=b.obs.t_s)
     vehicle_world_z_at_last_contact_m = old.vehicle_world_z_at_last_contact_m
     pressed_unseen = state.must_end_press and b.is_positioned_by_target
@@ -380,7 +380,7 @@ def _descend_by_thrust(c: Context) -> Action:
 def make_onboard_landing_command(
     planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, z_m: float
 ) -> Land:
-    """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
+    """Return the command for the firmware's own landing from height `z_m`, a quintic from rest to
     rest.
 
     The motors stop at the end of the trajectory. Its goal is therefore below the ground by more
@@ -400,7 +400,8 @@ def make_onboard_landing_command(
 
 
 def _command_onboard_landing(c: Context) -> Action:
-    """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
+    """Send the command for the firmware's own landing until the telemetry shows that the vehicle
+    executes it."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (
@@ -421,7 +422,7 @@ def _command_onboard_landing(c: Context) -> Action:
         and carried
         and (state.stop_or_land_command_count or not tel.has_bit(FLYING))
     ):
-        return state, Idle()  # on the floor, another order would start the motors again
+        return state, Idle()  # on the floor, another command would start the motors again
     waited = (
         math.inf
         if state.last_stop_or_land_command_at_s is None
@@ -457,9 +458,9 @@ def _transfer_weight_to_magnet(c: Context) -> Action:
 
 
 def _complete_transfer_to_magnet(c: Context) -> Action:
-    """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, order a
-    thrust that carries most of the weight: a hanging vehicle stays, and a fallen one does not
-    climb."""
+    """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, command
+    a thrust that carries most of the weight: a hanging vehicle then stays in place, and a fallen
+    one does not climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust

@@ -71,8 +71,8 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
 def predict_hover_time_s(
     state: BatteryFit, profile: Profile, thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
-    """Return the hover time, s, at `thrust_fraction` (share of full thrust) until `battery-low`
-    fires; None if unknown."""
+    """Return the hover time, s, at `thrust_fraction` (share of full thrust) until the row
+    `battery-low` applies; None if unknown."""
     if (
         state.rest_v is None
         or state.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
@@ -145,8 +145,8 @@ def is_charge_too_low_to_continue(c: Context) -> bool:
 
 
 def battery_shortfall_text(c: Context) -> str:
-    """Return the remaining time, and the times that an attempt, the landing and the reserve
-    take."""
+    """Return a text with the remaining time and the times that an attempt, the landing and the
+    reserve need."""
     seconds, predicted = c.state.battery.hover_time_left_s, predict_durations(c)
     has = "the remaining battery time is unknown"
     if seconds is not None:

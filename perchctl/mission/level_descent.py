@@ -1,7 +1,7 @@
 """Descend level by raw thrust, controlled by the vertical speed alone, without a position.
 
 Let T_h be the hover thrust, v the climb rate (from the accelerometer if no position measures it), u
-the climb rate that recent orders have caused but no sample shows yet, and s the sink rate
+the climb rate that recent commands have caused but no sample shows yet, and s the sink rate
 setpoint. Then
 
     T = T_h (1 - k (v + u + s)) / cos(tilt)
@@ -65,7 +65,7 @@ the vehicle falls at first. Smaller: it stands on the floor for longer with runn
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 """Sink rate below which the vehicle does not sink, m/s."""
 MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
-"""Smallest ordered thrust, as a share of the hover thrust."""
+"""Smallest commanded thrust, as a share of the hover thrust."""
 MIN_TILT_COSINE_TO_COMPENSATE_THRUST = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_GAIN_RAD_PER_MPS = 0.25
@@ -76,7 +76,7 @@ keeps leaning against a speed that is gone. Smaller: a few lost pictures end the
 MAX_BRAKE_TILT_RAD = 0.22
 """Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
 MAX_WIND_COMPENSATION_TILT_RAD = 0.2
-"""Largest lean against the wind, rad: a wind of 6 m/s. Larger: a blow or a wrong bias moves the
+"""Largest lean against the wind, rad: a wind of 6 m/s. Larger: an impact or a wrong bias moves the
 vehicle far off."""
 MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S = 0.2
 """Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
@@ -98,9 +98,9 @@ MAX_SPECIFIC_FORCE_IF_AIRBORNE_G = 0.85
 TOUCHDOWN_TO_HOVER_THRUST_RATIO = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
 TOUCHDOWN_DURATION_S = 0.25
-"""Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
+"""Time for which that thrust lasts, s; an impact within this time belongs to the touchdown."""
 MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
-"""Height below which a blow from below is the floor's, m."""
+"""Height below which an impact from below is the floor's, m."""
 TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration after which the vehicle has landed or hangs, s."""
 TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
@@ -185,7 +185,7 @@ def descend_level(c: Context) -> Action:
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_PER_S,
     )
-    if _fresh_visual_motion(c) is not None:  # a vehicle on the floor ignores orders
+    if _fresh_visual_motion(c) is not None:  # a vehicle on the floor ignores commands
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
             THRUST_RAMP_DOWN_BY_CAMERA_PER_S,
@@ -220,7 +220,7 @@ def descend_level(c: Context) -> Action:
     elif floor_detected_at_s is not None or carried or not is_sinking or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(MIN_COMMANDED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
-    # Speed that the orders since the newest sample have caused.
+    # Speed that the commands since the newest sample have caused.
     shown_s = (
         0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_at_s)
     )
@@ -261,10 +261,10 @@ def _last_measured_climb_mps(c: Context) -> float:
 def _find_floor_detection_time_s(
     c: Context, hover_thrust: float, height_m: float, *, is_sinking: bool
 ) -> float | None:
-    """Return when the floor was first detected; None if it was not.
+    """Return the time at which the floor was first detected; None if it was not.
 
-    The floor is detected by an impact from below while the vehicle came down, or by pictures that
-    show no motion at a thrust too low to carry it. `is_sinking`: the measured speed shows a
+    The floor is detected by an impact from below during the descent, or by pictures that show no
+    motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed shows a
     descent.
     """
     descent, b, seen = c.state.descent, c.belief, _fresh_visual_motion(c)

@@ -35,7 +35,7 @@ def observe(
 
 def _apply_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
-    trajectory in the old frame, so the vehicle is caught and the landing ordered again."""
+    trajectory in the old frame, so the vehicle is caught and the landing is commanded again."""
     b, obstacle_blocked_at_z_m = state.belief, state.obstacle_blocked_at_z_m
     if (
         state.phase is Phase.LANDING

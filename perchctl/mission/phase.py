@@ -14,7 +14,8 @@ from perchctl.errors import (
 
 
 class Phase(Enum):
-    """The paper's seven phases, recovery, hover, landing, and the three final phases."""
+    """The seven phases of the published method, recovery, hover, landing, and the three final
+    phases."""
 
     __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks phases up
 
@@ -79,7 +80,7 @@ PUBLISHED_METHOD_PHASES = (
 
 
 class Severity(IntEnum):
-    """Severity of a transition. From `LAND` on, a flight's severity never falls."""
+    """Severity of a transition. Once a flight has reached `LAND`, its severity never decreases."""
 
     CONTINUE = 0
     HOLD = 1
@@ -107,7 +108,7 @@ class Outcome(Enum):
     @property
     def exit_code(self) -> int:
         """Exit code of the command after a flight with this outcome. A flight whose log is
-        incomplete has another one."""
+        incomplete has a different exit code."""
         return _EXIT_CODES[self]
 
 

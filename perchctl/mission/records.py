@@ -48,9 +48,9 @@ class Event:
     def make_rescue_note(
         cls, t_s: float, error: BaseException, rest_state: RestState, rest_text: str
     ) -> Event:
-        """Return the event in which the rescue, the emergency landing after an exception in the
-        loop, notes the exception `error` and the vehicle's rest state; `rest_text` says in words
-        where the vehicle rests."""
+        """Return the event that the rescue writes: the emergency landing after an exception in the
+        loop. `error` is that exception, `rest_state` the vehicle's rest state, and `rest_text` the
+        same state in words."""
         reason = f"{type(error).__name__} in flight: {rest_text}"
         return cls(t_s, EventKind.NOTE, reason, rest_state=rest_state)
 
@@ -92,11 +92,11 @@ class Event:
 
 @dataclass(frozen=True)
 class SentCommand:
-    """A command that no tick of the loop decided, handed to the link at `t_s` on the loop's clock.
+    """A command that was handed to the link outside the loop's ticks, at `t_s` on the loop's clock.
     Whether it arrived is unknown.
 
-    `sender` is ``watchdog`` while the loop is silent, also for the operator's stop;
-    ``rescue`` after an error; ``reconnect`` for an order repeated after a lost link; ``preflight``
+    `sender` is ``watchdog`` while the loop does not respond, also for the operator's stop;
+    ``rescue`` after an error; ``reconnect`` for a command repeated after a lost link; ``preflight``
     for arming a vehicle that does not arm itself; ``farewell`` for disarming it, and for the zero
     setpoint that closes the link.
     """

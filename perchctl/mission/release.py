@@ -40,15 +40,15 @@ MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
 """Share of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down to
 which the raw thrust of a press is lowered."""
 EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
-"""Additional hang time if the reported thrust does not follow the ordered one, s."""
+"""Additional hang time if the reported thrust does not follow the commanded one, s."""
 
 # --- stop ---
 STOP_COMMAND_COUNT = 5
-"""Number of stop orders: a single lost notify message would lock a hanging vehicle."""
+"""Number of stop commands: a single lost notify message would lock a hanging vehicle."""
 STOP_COMMAND_PERIOD_S = 0.1
-"""Time between stop orders, s."""
+"""Time between stop commands, s."""
 LATE_STOP_COMMAND_PERIOD_S = 0.5
-"""Time after which one more stop order is sent while the telemetry shows thrust, s."""
+"""Time after which one more stop command is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
 CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M = 1.0
@@ -65,7 +65,7 @@ MAX_CATCH_DURATION_S = 2.0
 MIN_CLIMB_RATE_TO_END_CATCH_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
 MAX_BRAKED_LATERAL_SPEED_MPS = 1.0
-"""Largest lateral speed that is braked, m/s; no blow that the vehicle survives leaves more."""
+"""Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves more."""
 ONBOARD_POSITION_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
@@ -100,9 +100,13 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def lower_thrust(c: Context) -> Action:
-    """First stage of the transfer of the weight from the rotors to the magnet: lower, in steps, the
-    setpoint to `complete.release_drop_m` below the contact or, in a press by raw thrust, the thrust
-    to just below the holding thrust, until the magnet is seen to carry the vehicle."""
+    """Perform the first stage of the release, which transfers the weight from the rotors to the
+    magnet.
+
+    Lower the setpoint in steps to `complete.release_drop_m` below the contact until the magnet is
+    seen to carry the vehicle. In a press by raw thrust, lower the thrust to just below the holding
+    thrust instead.
+    """
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -126,11 +130,11 @@ def lower_thrust(c: Context) -> Action:
 
 
 def release_by_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
-    """Second stage of the release: reduce raw thrust until the motors stand still, and stop them
-    once the whole weight has hung for long enough.
+    """Perform the second stage of the release: reduce raw thrust until the motors stand still, and
+    stop them once the whole weight has hung for long enough.
 
-    The stage starts again while the telemetry is too old as evidence and also older than
-    `max_telemetry_age_s`.
+    The stage restarts while the telemetry is older than `max_telemetry_age_s` and too old to count
+    as evidence.
     """
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > max_telemetry_age_s:
@@ -231,7 +235,8 @@ def catch_slip(c: Context) -> Action | None:
 
 
 def _braking_setpoint_m(c: Context) -> tuple[float, float]:
-    """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
+    """Return x and y of a setpoint that brakes a lateral velocity that the state estimate has not
+    measured."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (

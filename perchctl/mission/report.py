@@ -23,9 +23,10 @@ from perchctl.vision import CameraErrors
 MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
 MAX_TOUCHDOWN_AGE_S = 5.0
-"""Longest time from a touchdown to the stop of the motors, s; an earlier blow was not the floor."""
+"""Longest time from a touchdown to the stop of the motors, s; an earlier impact was not the
+floor."""
 MAX_TOUCHDOWN_HEIGHT_M = 0.3
-"""Largest height of a blow above the final position for it to be a touchdown, m."""
+"""Largest height of an impact above the final position for it to be a touchdown, m."""
 SIGMAS_FOR_95_PERCENT_INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 MIN_REPORTED_LATENCY_ERROR_S = 0.02
@@ -44,8 +45,8 @@ def find_row_diagnosis(row_name: str) -> VehicleDiagnosis:
 
 @dataclass(frozen=True)
 class Touchdown:
-    """Downward speed at the touchdown, and the largest specific force in it. Samples come every 10
-    ms, so the true peak may be higher."""
+    """Downward speed at the touchdown, and the largest specific force during it. Samples come every
+    10 ms, so the true peak may be higher."""
 
     speed_mps: float
     peak_g: float
@@ -255,9 +256,9 @@ def report_rest(
 
 
 def find_touchdown(c: Context) -> Touchdown | None:
-    """Return the newest blow from below if it may be a touchdown, else None.
+    """Return the newest impact from below if it may be a touchdown, else None.
 
-    The speed is from the state estimate if it is believed, otherwise from dead reckoning.
+    The speed is that of the state estimate if it is trusted, otherwise that of the dead reckoning.
     """
     b = c.belief
     tel, imu, dead_reckoning = c.telemetry, b.imu, b.dead_reckoning

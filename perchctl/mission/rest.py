@@ -80,8 +80,8 @@ def _is_held_by_other_object(c: Context) -> bool:
 
 def _find_rest_state_from_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured since the vehicle
-    came within the magnet's reach. It is UNKNOWN after a silence that was long enough to hide a
-    fall or a catch."""
+    came within the magnet's reach. The state is UNKNOWN after a gap in the telemetry that was long
+    enough to hide a fall or an attachment to the magnet."""
     b, dead_reckoning, since_s = c.belief, c.belief.dead_reckoning, c.belief.in_magnet_reach_since_s
     floor_s = c.state.descent.floor_detected_at_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)

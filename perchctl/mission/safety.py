@@ -163,7 +163,8 @@ def _setpoint_deviation_m(c: Context) -> float:
 
 
 def divergence_reason(c: Context) -> str:
-    """Return what shows that the positions are wrong, and the possible causes."""
+    """Return a text that says which evidence shows that the positions are wrong, and the possible
+    causes."""
     b = c.belief
     if _is_oscillating(c):
         return (
@@ -186,8 +187,8 @@ def divergence_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position has arrived for `positioning.land_s`, or if the estimate is useless
-    earlier: after a blow or gust that no sighting has corrected, because of its variance, or
+    """True if no position has arrived for `positioning.land_s`. True earlier if the estimate is
+    useless: after an impact or gust that no sighting has corrected, because of its variance, or
     because sightings contradict it."""
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
@@ -213,14 +214,14 @@ def is_outside_fence(c: Context) -> bool:
 
 
 def is_outside_fleet_corridor(c: Context) -> bool:
-    """True if a vehicle of a fleet is where another one may fly, or if nothing says where it is.
-    A vehicle without a corridor is never outside."""
+    """True if a vehicle of a fleet is where another one may fly, or if its position is unknown. A
+    vehicle without a corridor is never outside."""
     corridor, (x_m, y_m, _) = c.safety.corridor, c.telemetry.position_m
     return corridor is not None and not corridor.contains(x_m, y_m, c.belief.height_m)
 
 
 def wrong_camera_latency_reason(c: Context) -> str:
-    """Return how old the pictures are, and how old they should be."""
+    """Return a text with the measured age of the pictures and the age that was expected."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s
@@ -253,7 +254,7 @@ def is_camera_mounting_contradicted(c: Context) -> bool:
 
 
 def wrong_camera_mounting_reason(c: Context) -> str:
-    """Return how the camera seems to be mounted, and what to do."""
+    """Return a text that says how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
     if turn_rad or b.mounting.is_camera_mounting_wrong:

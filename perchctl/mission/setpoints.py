@@ -6,8 +6,7 @@ reference r, the vehicle's position x (height z), its velocity v, and the accele
 leans into:
 
     p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
-                                     - LEAN_ACCELERATION_DAMPING_S2 a))
-                                     lateral
+                                     - LEAN_ACCELERATION_DAMPING_S2 a))                    lateral
     p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                        vertical
 
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
@@ -72,7 +71,7 @@ MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS = 0.25
 """Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
 vehicle further off."""
 HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
-"""Sink rate ordered during a hold while the camera does not see the target, m/s."""
+"""Sink rate commanded during a hold while the camera does not see the target, m/s."""
 MIN_HELD_SETPOINT_HEIGHT_M = 0.3
 """Height above the ground at which that sink ends, m."""
 
@@ -110,9 +109,10 @@ def step_towards(
     is_slow_until_mounting_confirmed: bool = False,
     changes_heading: bool = True,
 ) -> PositionSetpoint:
-    """Return the setpoint one tick after `old`: towards `goal`, with at most `max_up_mps` upwards
-    and `max_down_mps` downwards. `is_slow_until_mounting_confirmed` limits the lateral speed while
-    the camera's mounting is unconfirmed; without `changes_heading`, the heading stays."""
+    """Return the setpoint of the next tick: `old`, moved towards `goal` with a speed of at most
+    `max_up_mps` upwards and `max_down_mps` downwards. `is_slow_until_mounting_confirmed` limits the
+    lateral speed while the camera's mounting is unconfirmed. If `changes_heading` is False, the
+    heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
@@ -261,9 +261,9 @@ def _lateral_error_and_velocity(
     c: Context, reference: PositionSetpoint
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
-    (x, y) in world axes: from pictures and lean while recent pictures show the target, otherwise
-    from the state estimate. A take-off and a landing go by the state estimate, too: they do not
-    follow the target."""
+    (x, y) in world axes. They come from pictures and lean while recent pictures show the target,
+    otherwise from the state estimate. During take-off and landing, which do not follow the target,
+    they always come from the state estimate."""
     offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.command_history.maneuver
     follows_target = maneuver.is_camera_guided or maneuver.presses_against_target
     if offset is None or not follows_target or c.belief.target.world_position_m is None:
@@ -280,7 +280,7 @@ def _lateral_error_and_velocity(
 
 def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the held setpoint one tick later. If the target is the position source and out of
-    view, it sinks slowly, to bring the target back into view."""
+    view, the setpoint sinks slowly to bring the target back into view."""
     b = c.belief
     if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint

@@ -17,7 +17,7 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """Prediction of the energy model: remaining time and attempts; None means unknown."""
+    """Predicted remaining time and attempts; None means unknown."""
 
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # including the landing after the last one; None before the first sighting
@@ -28,11 +28,11 @@ class BatteryOutlook:
 
 @dataclass(frozen=True)
 class LevelDescentState:
-    """Memory of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
+    """State of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
-    thrust: float = 0.0  # last ordered thrust
+    thrust: float = 0.0  # last commanded thrust
     climb_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
-    # climb rate that recent orders cause and no sample shows yet
+    # climb rate that recent commands cause and no sample shows yet
     climb_change_not_yet_measured_mps: float = 0.0
     floor_detected_at_s: float | None = None  # time at which the floor was detected
 
@@ -41,10 +41,10 @@ class LevelDescentState:
 class HoverErrors:
     """Position errors of the gear during a hover, from all frames that measured the target.
 
-    The errors are those of the filtered pose in the level frame: the place of the hover relative to
-    the gear along x (forward), y (left) and z (up), m, and the heading error, rad. The camera
-    measures them, so an error of its calibration or mounting, which shifts the vehicle and the
-    measurement alike, is not in them.
+    An error is the hover position relative to the gear along x (forward), y (left) and z (up), m,
+    in the level frame, and the heading error, rad, both from the filtered pose. The camera measures
+    them. An error of its calibration or mounting shifts the vehicle and the measurement alike, and
+    is therefore not included.
     """
 
     hover_began_at_s: float = 0.0  # start of the hover
@@ -120,7 +120,7 @@ class PlannerState:
     motor_stop_commanded_at_s: float | None = None  #: first order to stop the motors
     last_stop_or_land_command_at_s: float | None = None  #: last order to land or to stop the motors
     stop_or_land_command_count: int = 0
-    commanded_raw_thrust: int | None = None  #: last ordered raw thrust; None in position mode
+    commanded_raw_thrust: int | None = None  #: last commanded raw thrust; None in position mode
     descent: LevelDescentState = LevelDescentState()
     hold_reason: str = ""  #: why the vehicle holds its position; empty without a hold
     waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
@@ -150,7 +150,7 @@ class PlannerState:
         return self.release_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:
-        """Return the orders so far, in the form that the belief uses."""
+        """Return the commands sent so far, in the form that the belief uses."""
         return CommandHistory(
             maneuver=maneuver,
             maneuver_start_position_m=self.entry.position_m,

@@ -167,7 +167,8 @@ brushless motors are designed to be more efficient."""
 
 
 def identify_power_train(telemetry: Telemetry) -> PowerTrain:
-    """Return the vehicle's drive: motors that start only after an arming request are brushless."""
+    """Return the vehicle's power train. Motors that start only after an arming request are
+    brushless."""
     return BRUSHED_POWER_TRAIN if telemetry.has_bit(AUTO_ARM) else BRUSHLESS_POWER_TRAIN
 
 
@@ -198,11 +199,11 @@ def update_battery_fit(
     battery_capacity_mah: float,
     power_train: PowerTrain,
 ) -> BatteryFit:
-    """Return the state `dt_s` later, with the commanded thrust (0..65535) and the battery's full
+    """Return the fit `dt_s` later, with the commanded thrust (0..65535) and the battery's full
     charge `battery_capacity_mah`.
 
-    A `battery_v` that is NaN or that no cell can have counts as missing. The estimate then falls
-    with the charge that the thrust consumes.
+    A `battery_v` that is NaN or outside the range of a cell counts as missing. The charge that the
+    thrust consumes is then subtracted from the estimate.
     """
     thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
@@ -313,8 +314,8 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
 def _add_voltage_reading_to_sums(
     state: BatteryFit, dt_s: float, battery_v: float
 ) -> NormalEquationSums:
-    """Return the sums after one more reading. The fit solves for the deviations from the typical
-    sag and the typical discharge rate factor."""
+    """Return the sums after one more voltage reading. The unknowns of the fit are the deviations
+    from the typical sag and from the typical discharge ratio."""
     assert state.takeoff_rest_v is not None
     begun = charge_fraction_from_rest_v(state.takeoff_rest_v)
     counted = max(min(begun, MIN_COUNTED_CHARGE_FRACTION), begun - state.counted_discharge_fraction)

@@ -1,6 +1,6 @@
 """The planner's belief about the vehicle: one frozen value per tick.
 
-`update_belief` computes it once per tick from the previous belief, the observation, the orders
+`update_belief` computes it once per tick from the previous belief, the observation, the commands
 sent so far, and the profile. The belief makes no decisions and knows no phases. Quantities that
 follow from its fields are properties, computed on first access. Every claim has a variance or an
 age; an unknown one is infinite.
@@ -33,23 +33,24 @@ trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """How much older than the camera's latency the newest external position may be while it still
 corrects the estimated velocity, s: three pictures at 30 per second. Larger: `has_uncorrected_gust`
-reacts to a blow later."""
+reacts to an impact later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
-"""Lateral speed that the vehicle gains without a sighting in a blow or gust, m/s; flights without a
-fault show 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
+"""Lateral speed that the vehicle gains without a sighting in an impact or gust, m/s; flights
+without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error counts
+as an impact."""
 GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
 """Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
 deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
-uncertain latency, blows go unnoticed."""
+uncertain latency, impacts go unnoticed."""
 MAX_THRUST_REPORT_DELAY_S = 0.2
-"""Time within which the telemetry reports an ordered raw thrust, s. Smaller: late telemetry looks
+"""Time within which the telemetry reports a commanded raw thrust, s. Smaller: late telemetry looks
 like a thrust that the vehicle does not follow."""
 
 
 @dataclass(frozen=True)
 class ContactOffset:
-    """Distance of the gear from the target's axis at a touch, m, and its standard deviation, m,
-    which is infinite if unknown."""
+    """Horizontal distance between the gear and the target's axis at a touch, m, and its standard
+    deviation, m, which is infinite if unknown."""
 
     lateral_offset_m: float
     sigma_m: float
@@ -120,7 +121,7 @@ class Belief:
     hover_thrust_estimate: HoverThrust = field(default_factory=HoverThrust)
     #: thrust that the rotors produce, 0..65535; None before a sample
     rotor_thrust: float | None = None
-    #: time since which the reported thrust differs from the ordered one
+    #: time since which the reported thrust differs from the commanded one
     thrust_differs_from_command_since_s: float | None = None
     #: last tick in which that difference was older than `MAX_THRUST_REPORT_DELAY_S`
     thrust_last_differed_from_command_at_s: float = -math.inf
@@ -168,8 +169,8 @@ class Belief:
 
     @cached_property
     def telemetry_age_s(self) -> float:
-        """Age of the oldest part of the telemetry, s. A reading that keeps repeating exactly, as no
-        real one does, is as old as the first sample with that value."""
+        """Age of the oldest part of the telemetry, s. Real readings never repeat exactly, so the
+        age of a repeated reading counts from its first sample."""
         tel, imu = self.obs.telemetry, self.obs.imu
         oldest_s = max(tel.behind_s, imu.only_attitude_frozen_for_s, imu.only_position_frozen_for_s)
         return self.obs.t_s - tel.t_s + oldest_s
@@ -253,7 +254,7 @@ class Belief:
 
     @cached_property
     def camera_latency_s(self) -> float:
-        """Age of a frame on arrival, s: the camera latency in use."""
+        """Assumed age of a frame when it arrives, s."""
         return self.profile.camera.start_latency_s + self.obs.camera_latency_above_profile_s
 
     @cached_property
@@ -266,7 +267,7 @@ class Belief:
 
     @cached_property
     def has_uncorrected_gust(self) -> bool:
-        """True after a blow or gust that only the accelerometer has measured, until a sighting
+        """True after an impact or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
         is_reckoned = self.dead_reckoning.imu is not None
         if not (
@@ -349,8 +350,8 @@ class Belief:
 
     @cached_property
     def is_accelerometer_reading_one_g(self) -> bool:
-        """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as in hover, or at rest
-        on the floor, at the ceiling or on the magnet."""
+        """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as it does in hover and
+        while the vehicle rests on the floor, at the ceiling or on the magnet."""
         return abs(self.obs.telemetry.acc_z_g - 1.0) <= self.profile.planner.perch.contact_acc_g
 
     @cached_property
@@ -375,10 +376,10 @@ class Belief:
 
     @cached_property
     def lean_acceleration_world_xy_mps2(self) -> tuple[float, float]:
-        """Lateral acceleration (x, y), m/s^2, world axes, that follows from the difference between
-        the present lean and its mean (low-passed with `MEAN_LEAN_TIME_CONSTANT_S`). The mean lean
-        itself causes none: it balances the wind, an unbalanced vehicle, or an error of the
-        estimated attitude. Wrong after a change of the wind, until the mean has followed."""
+        """Lateral acceleration (x, y) in world axes, m/s^2, from the lean minus its mean (low-pass
+        filter with `MEAN_LEAN_TIME_CONSTANT_S`). The mean lean is assumed not to accelerate the
+        vehicle: it balances the wind, an uneven mass distribution, or an error of the estimated
+        attitude. Wrong after a change of the wind, until the mean has followed."""
         (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
@@ -413,8 +414,8 @@ class Belief:
 
     @cached_property
     def is_thrust_known(self) -> bool:
-        """True if the reported thrust can be used: it agrees with the ordered raw thrust if there
-        is one, or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
+        """True if the reported thrust can be used: no raw thrust is commanded, or the reported
+        thrust agrees with it or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
         return (
             self.thrust_differs_from_command_since_s is None
             or self.obs.t_s - self.thrust_differs_from_command_since_s <= MAX_THRUST_REPORT_DELAY_S

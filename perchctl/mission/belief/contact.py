@@ -42,9 +42,9 @@ much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
 MIN_PRESS_TO_COMMANDED_THRUST_RATIO = 0.99
-"""Reported thrust over the ordered thrust of a raw press from which the vehicle always counts as
-pressing. Larger: a reading just below the ordered thrust goes undetected. Smaller: a heavy vehicle
-seems to press while it hovers."""
+"""Reported thrust over the commanded thrust of a raw press from which the vehicle always counts as
+pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
+vehicle seems to press while it hovers."""
 MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS = 0.93
 """Hover thrust, as a share of full thrust, above which the thrust left for a press is too small to
 prove one. Smaller: a press is never detected on a heavy vehicle."""
@@ -105,7 +105,7 @@ falls."""
 
 # --- time ---
 MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S = 5.0
-"""Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
+"""Time after a stop command from which the motors count as off, s: the flying bit stays set for 2
 s."""
 MOTORS_OFF_DWELL_S = 0.1
 """Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
@@ -118,21 +118,21 @@ HANGING_CONFIRMATION_DWELL_S = 1.0
 
 
 def current_gear_offset(b: Belief) -> ContactOffset:
-    """Return the gear's offset from the target's axis, with its standard deviation: from an image
-    exposed during the present contact, otherwise by dead reckoning from the last sighting. With
-    decks, the deviation then grows because the estimate drifts and the impact on the ceiling
-    disturbs it."""
+    """Return the distance between the gear and the target's axis, with its standard deviation: from
+    an image exposed during the present contact, otherwise by dead reckoning from the last sighting.
+    With decks, the standard deviation then grows, because the estimated position drifts and the
+    impact on the ceiling disturbs it."""
     return _gear_offset_seen_in_contact(b) or _reckoned_gear_offset(b)
 
 
 def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
-    """Return the gear's offset in the newest image that shows the target, if it was exposed during
-    the present contact; otherwise None.
+    """Return the distance between the gear and the target's axis in the newest image that shows the
+    target, if that image was exposed during the present contact; otherwise None.
 
-    Friction holds the gear while it is pressed, so the offset in an image remains true until the
+    Friction holds the gear while it is pressed, so the distance in an image remains true until the
     contact ends, and the state estimate, which wanders by millimetres, has no part in it. Images
-    that contradict the vehicle's motion are not used: they may be older than they seem. The offset
-    is wrong if the vehicle slides after the exposure.
+    that contradict the vehicle's motion are not used: they may be older than they seem. The
+    distance is wrong if the vehicle slides after the exposure.
     """
     target = b.obs.target
     if (
@@ -193,12 +193,13 @@ def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
 
 
 def contact_height_tolerance_m(b: Belief) -> float:
-    """Return the largest height difference between gear and target, m, at which whatever holds the
-    vehicle may be the target.
+    """Return the largest height difference between gear and target, m, at which the object that
+    holds the vehicle may be the target.
 
-    It grows with the time since the last sighting, because the estimated height drifts, up to twice
-    `perch.contact_z_m`, so that an obstacle further below the target is not taken for it. The
-    condition `CONTACT`, which proves a touch of the target, has tolerances of its own.
+    The tolerance grows with the time since the last sighting, because the estimated height drifts.
+    It is at most twice `perch.contact_z_m`, so that an obstacle further below is not mistaken for
+    the target. The condition `CONTACT`, which proves a touch of the target, uses its own
+    tolerances.
     """
     planner = b.profile.planner
     drift_mps = (
@@ -254,9 +255,9 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
 def is_thrust_too_low_to_fly(b: Belief) -> bool:
     """True if the thrust is too small to support the vehicle.
 
-    The limit is `complete.hold_ratio` times hover thrust. It is `MIN_FIRMWARE_POSITION_MODE_THRUST`
-    if that is larger and still too small to lift the vehicle, since position mode does not order
-    less.
+    The limit is `complete.hold_ratio` times hover thrust. Position mode never commands less than
+    `MIN_FIRMWARE_POSITION_MODE_THRUST`, so that value is the limit if it is larger and still too
+    small to lift the vehicle.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
     if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_FIRMWARE_POSITION_MODE_THRUST:
@@ -265,9 +266,9 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 
 
 def is_above_hover_thrust(b: Belief) -> bool:
-    """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If its
-    maximum leaves less room than that, a thrust close to the maximum is enough. The maximum is the
-    ordered thrust during a press by raw thrust, otherwise full thrust."""
+    """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If the
+    vehicle cannot produce that much, a thrust close to the largest possible one is enough: close to
+    the commanded thrust during a press by raw thrust, otherwise close to full thrust."""
     most = MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
     if (
         b.command_history.maneuver.presses_against_target
@@ -343,7 +344,7 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
 
 
 def _is_hanging_with_motors_stopped(b: Belief) -> bool:
-    """True if the motors stand still and the vehicle hangs where it made contact."""
+    """True if the motors have stopped and the vehicle hangs where it made contact."""
     return (
         b.command_history.release_began_at_s is not None
         and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
@@ -383,8 +384,8 @@ def _is_hanging(b: Belief) -> bool:
 
 
 def _are_motors_off(b: Belief) -> bool:
-    """True if the thrust is zero and the supervisor reports that the vehicle does not fly, or has
-    had `MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S` to do so."""
+    """True if the thrust is zero and the supervisor no longer reports the vehicle as flying.
+    `MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S` after a stop command, zero thrust is enough."""
     motor_stop_commanded_at_s = b.command_history.motor_stop_commanded_at_s
     long_off = (
         motor_stop_commanded_at_s is not None
@@ -406,8 +407,9 @@ def _are_motors_off_despite_thrust_command(b: Belief) -> bool:
 
 
 def _is_on_floor(b: Belief) -> bool:
-    """True if the vehicle is motionless at a thrust too small to support it, and is low or has come
-    down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
+    """True if the vehicle is motionless, at a thrust too small to support it, and is near the
+    ground or has descended. The height alone does not decide, because the estimate may have
+    drifted."""
     near_target = (
         b.obs.target is not None
         and abs(b.target.gear_to_target_z_m) <= MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M
@@ -438,9 +440,13 @@ def _is_pressing_against_obstacle(b: Belief) -> bool:
 
 
 def _does_imu_show_support(b: Belief) -> bool:
-    """True if accelerometer and thrust alone show that something supports or presses the vehicle:
-    in the air, a thrust that differs from hover thrust by as much as
-    `MIN_PRESS_TO_HOVER_THRUST_RATIO` says, upwards or downwards, would make it climb or sink."""
+    """True if accelerometer and thrust alone show that something supports the vehicle or that it
+    presses against something.
+
+    The thrust is above or below hover thrust by at least the margin in
+    `MIN_PRESS_TO_HOVER_THRUST_RATIO`, which would accelerate a vehicle in the air. Nevertheless,
+    the accelerometer reads 1 g and the vertical speed stays constant.
+    """
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
         0 < hover < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
@@ -479,14 +485,14 @@ HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
 MOTORS_STOPPED = Condition(
     "motors stopped", _have_motors_stopped, required_data=RequiredData.TELEMETRY
 )
-"""The motors are off, and the last order does not let them turn."""
+"""The motors are off, and the last command does not let them turn."""
 MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
     "motors off despite an order",
     _are_motors_off_despite_thrust_command,
     required_data=RequiredData.TELEMETRY,
 )
-"""The motors are off although the last order was raw thrust: the supervisor has ended the flight.
-It soon lets them turn by that order again (docs/firmware.md, "Supervisor")."""
+"""The motors are off although the last command was raw thrust: the supervisor has ended the flight.
+It soon lets them turn by that command again (docs/firmware.md, "Supervisor")."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, required_data=RequiredData.POSITION)
 """The vehicle stands on the floor."""
 CLIMB_BLOCKED = Condition("blocked", _is_pressing_against_obstacle)
@@ -536,12 +542,13 @@ def find_support(b: Belief) -> Support:
     """Return what supports the vehicle, from the conditions that are true in this tick.
 
     A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
-    is on something else only if the gear is certainly outside, or certainly below the target. An
-    estimate that places the gear above the target, where the ceiling is, is wrong and does not
-    count as another height. If neither is certain, the support is UNKNOWN, and a row of the
-    transition table must assume the more dangerous of the two: the magnet or something else. The
-    support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates, and
-    in the first tick of a maneuver.
+    is on another object only if the gear is certainly outside that radius or certainly below the
+    target. (The gear cannot be above the target, because the ceiling is there: such an estimate is
+    wrong and proves nothing.) In all other cases, the support is UNKNOWN, and a row of the
+    transition table must assume the more dangerous of the two.
+
+    The support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates,
+    and in the first tick of a maneuver.
     """
     if HANGING in b.condition_start_times_s:
         return _find_what_vehicle_hangs_on(b)
@@ -569,13 +576,13 @@ def _find_what_vehicle_hangs_on(b: Belief) -> Support:
 
 
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
-    """True if the data that the condition depends on is fresh in this tick.
+    """True if the data that the condition requires is fresh in this tick.
 
     There are two exceptions. With the target as the only position source, `CONTACT` needs no valid
-    position during a press: the last sighting is good enough for a while. In a descent, `HANGING`
-    accepts telemetry as old as `safety.telemetry_hold_s` and needs no position: otherwise a vehicle
-    with poor telemetry would hang on the magnet with its motors running. The release that it starts
-    still needs fresh telemetry.
+    position during a press, because the last sighting is accurate enough for a while. During a
+    descent, `HANGING` needs no position and accepts telemetry as old as `safety.telemetry_hold_s`.
+    Otherwise, a vehicle with poor telemetry would hang on the magnet with its motors running. The
+    release that then begins still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
@@ -595,8 +602,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 def has_slipped(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: `is_slipping` has been true for
-    `complete.slip_dwell_s` or, once raw thrust transfers the weight, at the first sign of free
-    fall."""
+    `complete.slip_dwell_s`. During the release by raw thrust, the first sign of free fall is
+    enough."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = b.command_history.release_began_at_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_OF_FALL_AFTER_RELEASE_MPS:

@@ -16,7 +16,7 @@ ConditionInput = TypeVar("ConditionInput", contravariant=True)
 
 
 class RequiredData(Enum):
-    """Data that a condition depends on. The condition does not count while that data is old or
+    """Data that a condition requires. The condition does not count while that data is old or
     unknown."""
 
     NOTHING = "nothing that could be old"

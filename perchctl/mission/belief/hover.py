@@ -39,8 +39,8 @@ MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION = 0.2
 means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
 Smaller: a real change is rejected."""
 ROTOR_THRUST_TIME_CONSTANT_S = 0.06
-"""Time constant with which the rotors follow an ordered thrust, s (docs/firmware.md; 50 to 80 ms in
-real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
+"""Time constant with which the rotors follow a commanded thrust, s (docs/firmware.md; 50 to 80 ms
+in real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
 MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S = 1.0
 """Age beyond which telemetry says nothing about the present thrust, s."""
 MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 0.7
@@ -48,7 +48,7 @@ MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 0.7
 Smaller: a fall corrupts the estimate."""
 MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
-Larger: a blow corrupts the estimate."""
+Larger: an impact corrupts the estimate."""
 MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST = 0.5
 """Share of the hover thrust at the start of the descent below which thrust is not proportional to
 force, so that nothing is learned from it."""
@@ -84,7 +84,7 @@ def rotor_thrust(b: Belief, dt_s: float) -> float:
 
 def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     """Return the estimate after a tick in which the thrust equals hover thrust. `dt_s` is the time
-    since the previous sample, 0 if the telemetry has no new one."""
+    since the previous telemetry sample, 0 if this tick has no new sample."""
     thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
     if old.thrust == 0.0:
         return HoverThrust(

@@ -53,8 +53,8 @@ larger one, `predict` returns None. Larger: the vehicle is steered by the first 
 
 @dataclass(frozen=True)
 class LateralOffset:
-    """Offset from the gear to the target and velocity of the vehicle, world axes, with the standard
-    deviations of each axis."""
+    """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, both
+    (x, y) in world axes, with their standard deviations per axis."""
 
     offset_m: LateralVector
     velocity_mps: LateralVector
@@ -63,8 +63,8 @@ class LateralOffset:
 
 
 class MotionSample(NamedTuple):
-    """Lateral acceleration that the vehicle's lean causes, m/s^2, and estimated lateral velocity,
-    m/s, of the telemetry sample at `t_s`; world axes (x, y)."""
+    """Lateral motion of the vehicle at `t_s`, the time of a telemetry sample: the acceleration that
+    its lean causes and its estimated velocity, both (x, y) in world axes."""
 
     t_s: float
     acceleration_mps2: LateralVector
@@ -72,8 +72,8 @@ class MotionSample(NamedTuple):
 
 
 class OffsetVelocityCovariance(NamedTuple):
-    """Covariance of lateral offset and lateral velocity along one axis; that along x and that along
-    y are equal."""
+    """Covariance matrix of lateral offset and lateral velocity along one axis. It is the same for x
+    and y."""
 
     offset_variance_m2: float = 0.0  # variance of the offset
     offset_velocity_covariance_m2ps: float = 0.0  # covariance of offset and velocity
@@ -86,11 +86,12 @@ UNKNOWN_COVARIANCE = OffsetVelocityCovariance()
 
 @dataclass(frozen=True)
 class LateralOffsetFilter:
-    """Kalman filter of the lateral offset from gear to target and of the vehicle's lateral
-    velocity, world axes (x, y): pictures measure the offset, and the lean gives the acceleration.
+    """Kalman filter of the horizontal vector from gear to target and of the vehicle's horizontal
+    velocity, both (x, y) in world axes. Pictures measure the offset, and the lean of the vehicle
+    gives its acceleration.
 
-    The state is that at `t_s`, the exposure of the newest picture; -inf before the first one.
-    `samples` holds the telemetry since then, and some from before.
+    The state is valid at `t_s`, the exposure time of the newest picture; -inf before the first one.
+    `samples` holds the telemetry since then and a few earlier samples.
     """
 
     t_s: float = -math.inf
@@ -100,8 +101,8 @@ class LateralOffsetFilter:
     samples: tuple[MotionSample, ...] = ()
 
     def with_sample(self, sample: MotionSample) -> LateralOffsetFilter:
-        """Return the filter with a telemetry sample. One that is not newer than the newest is
-        ignored; those that no picture can need are dropped."""
+        """Return the filter with one more telemetry sample. A sample that is not newer than the
+        last one is ignored. Samples too old for any later picture are dropped."""
         kept = self.samples
         if kept and sample.t_s <= kept[-1].t_s:
             return self
@@ -167,8 +168,8 @@ class LateralOffsetFilter:
         )
 
     def _predict(self, t_s: float) -> LateralOffsetFilter:
-        """Return the filter at the later time `t_s`, through the samples until then. Between two
-        samples, the acceleration is their mean; after the newest, it stays."""
+        """Return the filter propagated to the later time `t_s` with all samples up to it. Between
+        two samples, the acceleration is their mean; after the last sample, it stays constant."""
         predicted, before = self, self.samples[0] if self.samples else None
         for sample in self.samples:
             if sample.t_s > predicted.t_s:

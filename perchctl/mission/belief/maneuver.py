@@ -51,7 +51,7 @@ class Maneuver:
 
 @dataclass(frozen=True, kw_only=True)
 class CommandHistory:
-    """The orders that the planner has sent so far; the belief knows no other state of the
+    """The commands that the planner has sent so far. The belief knows nothing else about the
     planner.
 
     Times are on the loop's clock; positions are in the world frame of the state estimate.
@@ -60,7 +60,7 @@ class CommandHistory:
     maneuver: Maneuver
     maneuver_start_position_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
-    raw_thrust: int | None = None  # last order; None in position mode
+    raw_thrust: int | None = None  # last command; None in position mode
     release_began_at_s: float | None = None  # start of the release by raw thrust
     motor_stop_commanded_at_s: float | None = None  # first order to stop the motors
     # time at which a descent by raw thrust detected the floor
@@ -77,16 +77,16 @@ class CommandHistory:
 
     @property
     def is_before_release_and_motor_stop(self) -> bool:
-        """True until raw thrust begins to transfer the vehicle's weight to the magnet (the
-        release), or the motors are ordered to stop."""
+        """True until raw thrust begins to transfer the vehicle's weight to the magnet (the release)
+        or the motors are commanded to stop."""
         return self.release_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def with_frame_shift(
         self, setpoint_in_new_frame: PositionSetpoint | None, shift_m: Vector
     ) -> CommandHistory:
-        """Return the same orders after the estimate's world frame has moved by `shift_m`: the
-        position at which the maneuver began is shifted by it, and the setpoint is
-        `setpoint_in_new_frame`, which is in the new frame."""
+        """Return the same commands after the world frame of the estimate has moved by `shift_m`.
+        The start position of the maneuver is shifted, and the setpoint becomes
+        `setpoint_in_new_frame`."""
         x, y, z = self.maneuver_start_position_m
         return replace(
             self,

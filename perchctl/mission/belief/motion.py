@@ -8,7 +8,7 @@ axes is
 
 and the velocity since the first sample is its integral by the trapezoid rule:
 
-    sample ──> freeze ──> silence? ──yes──> start over: the gap may hide a fall
+    sample ──> freeze ──> gap? ──────yes──> start over: the gap may hide a fall
                             │ no
                             v
        offset at rest, tilt due to corrections ──> a, v
@@ -37,20 +37,20 @@ Vector = tuple[float, float, float]
 ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 MAX_TELEMETRY_GAP_S = 0.2
-"""Time without telemetry that counts as a silence, s. In this time a vehicle falls 20 cm, more than
-is possible for one that still hangs. Larger: a silence can hide a fall. Smaller: two lost packets
-count as a silence."""
+"""Time without telemetry that counts as a gap, s. In this time a vehicle falls 20 cm, more than
+is possible for one that still hangs. Larger: a gap can hide a fall. Smaller: two lost packets
+count as a gap."""
 MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
-"""Largest speed that noise of the estimate can add to a hanging vehicle across a silence, m/s.
+"""Largest speed that noise of the estimate can add to a hanging vehicle across a gap, m/s.
 Larger: a short fall goes undetected."""
 MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
-"""Largest distance across a silence that the speed before it does not explain, m. Larger: a short
+"""Largest distance across a gap that the speed before it does not explain, m. Larger: a short
 fall goes undetected."""
 MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS = -0.3
 """Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging one
 never reaches it, a fall reaches it after 5 cm. Closer to 0: noise counts as a fall."""
 MAX_FROZEN_READING_S = 0.2
-"""Time of identical readings that counts as a silence, s. Smaller: coarse readings freeze by
+"""Time of identical readings that counts as a gap, s. Smaller: coarse readings freeze by
 chance."""
 MAX_FREE_FALL_READING_G = 0.6
 """Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
@@ -78,13 +78,13 @@ MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
 """Upward speed gained within `FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S` that only the floor can
 cause, m/s. Smaller: an increase of thrust counts as the floor."""
 FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S = 0.1
-"""Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to a
-blow."""
+"""Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to an
+impact."""
 MAX_IMPACT_DETECTION_DELAY_S = 0.05
-"""Longest delay between the start of a blow and its detection, s; the speed before the blow is
+"""Longest delay between the start of an impact and its detection, s; the speed before the impact is
 taken from this far back."""
 BOUNCE_WINDOW_S = 0.5
-"""Time after a blow within which a further one is a bounce, s."""
+"""Time after an impact within which a further one is a bounce, s."""
 MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
 counts as standing still."""
@@ -127,8 +127,8 @@ between two range measurements counts."""
 
 @dataclass(frozen=True)
 class FusionAge:
-    """Time since the last correction of the state estimate, from its variance of vertical speed:
-    without measurements, the variance only grows."""
+    """Time since the state estimate was last corrected by a measurement, derived from the variance
+    of the vertical speed: without measurements, the variance only grows."""
 
     variance_m2ps2: float | None = None  # newest variance
     variance_changed_at_s: float = -math.inf  # time at which that variance arrived
@@ -156,15 +156,15 @@ class FusionAge:
 
 @dataclass(frozen=True)
 class Impact:
-    """A blow from below, for example at a touchdown."""
+    """An impact on the vehicle from below, for example at a touchdown."""
 
     t_s: float = -math.inf  # -inf: no impact yet
-    # vertical speed just before the blow, from the state estimate
+    # vertical speed just before the impact, from the state estimate
     estimated_climb_before_impact_mps: float = 0.0
-    # vertical speed just before the blow, from `ImuMotion.velocity_mps`
+    # vertical speed just before the impact, from `ImuMotion.velocity_mps`
     imu_climb_before_impact_mps: float = 0.0
-    peak_g: float = 0.0  # largest specific force during the blow along the body's z axis
-    z_m: float = 0.0  # height in the state estimate at the blow
+    peak_g: float = 0.0  # largest specific force during the impact along the body's z axis
+    z_m: float = 0.0  # height in the state estimate at the impact
 
 
 # --- Detectors: small values with one law each (tests/mission/test_detectors.py) ---
@@ -262,13 +262,13 @@ class FallDetector:
 
 @dataclass(frozen=True)
 class ImpactDetector:
-    """The newest blow from below, for example at a touchdown: in a short time it adds more upward
-    speed than any thrust can. The peak force is the hardest of the blow and its bounces."""
+    """Detector of impacts from below, for example at a touchdown. An impact adds more upward speed
+    in a short time than any thrust can. Its peak force includes that of its bounces."""
 
     speed_gained_in_impact_mps: float = 0.0
     last_impact_at_s: float = -math.inf
-    recent_samples: tuple[Impact, ...] = ()  # states just before a blow that begins now
-    newest_impact: Impact = Impact()  # newest blow from below
+    recent_samples: tuple[Impact, ...] = ()  # states just before an impact that begins now
+    newest_impact: Impact = Impact()  # newest impact from below
 
     def update_impact(
         self, newest_sample: Impact, z_m: float, up_acceleration_mps2: float, dt_s: float
@@ -341,8 +341,8 @@ def _newest_impact(
 
 @dataclass(frozen=True)
 class SteadySpeedDetector:
-    """Loop times since when the vertical speed has been constant, and since when the lateral
-    velocity has been close to its mean."""
+    """Loop times at which the vertical speed became constant, and at which the lateral velocity
+    came close to its mean."""
 
     climb_steady_since_s: float = math.inf  # time since which the vertical speed has been constant
     steady_climb_mps: float = 0.0
@@ -352,7 +352,7 @@ class SteadySpeedDetector:
     mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
 
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
-        """The detector after `dt_s`, at a velocity in world axes."""
+        """Return the detector after `dt_s`; `velocity_mps` is the newest velocity in world axes."""
         x, y, z = velocity_mps
         climb_steady_since_s, steady_climb_mps = self.climb_steady_since_s, self.steady_climb_mps
         if abs(z - steady_climb_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
@@ -376,9 +376,9 @@ class SteadySpeedDetector:
 
 @dataclass(frozen=True)
 class LateralPushDetector:
-    """Time of the last lateral push: the specific force perpendicular to the body's z axis,
-    averaged with the time constant `LATERAL_PUSH_TIME_CONSTANT_S`, exceeded `MIN_LATERAL_PUSH_G`,
-    more than drag in flight causes."""
+    """Detector of lateral pushes. A push is a specific force perpendicular to the body's z axis
+    that exceeds `MIN_LATERAL_PUSH_G`, more than drag in flight causes, on average over
+    `LATERAL_PUSH_TIME_CONSTANT_S`."""
 
     mean_lateral_specific_force_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     last_lateral_push_at_s: float = -math.inf  # time of the last lateral push
@@ -416,8 +416,8 @@ class ImuMotion(
     t_s: float = -math.inf  # time of the newest sample
     velocity_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
     accelerometer_offset_g: Vector = ZERO_VECTOR  # offset of the accelerometer at rest, body axes
-    last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest silence
-    # end of the newest silence that may hide a fall
+    last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest gap
+    # end of the newest gap that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
     integration_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
     descent_while_frozen_m: float = (
@@ -496,9 +496,9 @@ class ImuMotion(
 
 
 def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """Return the motion after its first sample, or after a gap in the telemetry: the detectors
-    start again, and the learned offsets of the accelerometer stay. Record when the gap ended, and
-    whether a fall may have happened in it."""
+    """Return the motion after its first sample, or after a gap in the telemetry. The detectors
+    restart, and the learned offsets of the accelerometer are kept. The end of the gap is recorded,
+    and whether the vehicle may have fallen during it."""
     motion = replace(
         motion,
         climb_steady_since_s=new.t_s,

@@ -104,13 +104,13 @@ class MountingMonitor:
 
     @property
     def is_target_motion_undetermined(self) -> bool:
-        """True until the vehicle has moved far enough to show that the target stands still, as it
-        does if the mounting is right."""
+        """True until the vehicle has moved far enough to show whether the target stands still in
+        the world, as it does if the mounting is right."""
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 
 def update_mounting_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
-    """Return the monitor after one more sighting of a measured target."""
+    """Return the monitor after one more frame that measured the target."""
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
     kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_CHECK_WINDOW_S)

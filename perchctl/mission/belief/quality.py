@@ -11,7 +11,7 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
 MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
-"""Lateral speed that no draught causes, m/s. Larger: a blow during the press is noticed late."""
+"""Lateral speed that no draught causes, m/s. Larger: an impact during the press is noticed late."""
 MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS = 0.15
 """Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
@@ -103,7 +103,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Return for how long no external position was sent, and why."""
+    """Return a text that says how long no external position has been sent, and why."""
     if b.has_uncorrected_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_age_s, b.obs.position_problem
@@ -119,7 +119,7 @@ def position_loss_text(b: Belief) -> str:
 
 
 def excessive_variance_text(b: Belief) -> str:
-    """Return which variance is too large, and the limit."""
+    """Return a text that names the variance that is too large, and its limit."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.worst_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2
@@ -132,5 +132,5 @@ def excessive_variance_text(b: Belief) -> str:
 
 
 def no_picture_reason(b: Belief) -> str:
-    """Return why there is no picture, or for how long there was none."""
+    """Return why there is no picture, or how long there has been none."""
     return b.obs.camera_problem or f"no picture for {b.obs.last_good_frame_age_s:.1f} s"

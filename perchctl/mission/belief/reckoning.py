@@ -3,15 +3,15 @@
 While positions correct the state estimate, the reckoned velocity v is drawn to the estimated
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
-    v += (dv_imu - b dt)                                each sample
-    v += (e - v) dt / RECKONED_VELOCITY_TIME_CONSTANT_S          while e is believed
-    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S    while e is believed
+    v += (dv_imu - b dt)                                            each sample
+    v += (e - v) dt / RECKONED_VELOCITY_TIME_CONSTANT_S             while e is trusted
+    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S   while e is trusted
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
 distance flown. All results are wrong by the change of the bias since the position was lost: 0.1
 m/s^2 becomes 0.45 m after 3 s. The gains are fixed. A Kalman filter of velocity, bias and the
-positions from pictures is no better (`benchmarks/dead_reckoning.py`) because the same change limits
+positions from pictures is no better (`benchmarks/reckoning.py`) because the same change limits
 both.
 """
 
@@ -34,7 +34,7 @@ from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
-"""Time constant with which the reckoned velocity approaches a believed estimate, s. Larger: an old
+"""Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
 """Time constant with which the bias is learned, s. Larger: a change of the wind is followed late.
@@ -43,8 +43,9 @@ MAX_ACCELERATION_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware takes for a tilt, causes 1.2. Larger:
 wrong positions can add a bias that no attitude error has."""
 MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
-"""Largest difference in one sample from which the bias is learned, m/s^2; a larger one is a blow or
-a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not learned."""
+"""Largest difference in one sample from which the bias is learned, m/s^2; a larger one is an impact
+or a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not
+learned."""
 CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
@@ -60,8 +61,8 @@ Larger: errors of the estimate due to late pictures are adopted. Smaller: a boun
 to 0.3 m/s."""
 VELOCITY_UNSEEN_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
-velocity that a wrong attitude accumulates over seconds looks like a blow. Smaller: a blow just
-before the last sighting is forgotten."""
+velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
+just before the last sighting is forgotten."""
 MAX_VELOCITY_BIAS_MPS = 0.6
 """Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
 counts as still while its position creeps. Smaller: the vehicle is never steady in wind."""
@@ -94,7 +95,7 @@ WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
 `lateral_velocity_unseen_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
-"""Longest integration step of the reckoned height, s; a longer one is a silence."""
+"""Longest integration step of the reckoned height, s; a longer one is a gap."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class DeadReckoning:
     gear_below_target_m: float = math.inf
     # lower bound of `gear_below_target_m`: allows for climbs in silences, and falls only add to it
     min_gear_below_target_m: float = math.inf
-    # end of the newest silence after which the magnet may hold the vehicle
+    # end of the newest gap after which the magnet may hold the vehicle
     last_gap_in_which_magnet_may_attach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
     gear_to_target_world_xy_m: tuple[float, float] = (0.0, 0.0)
@@ -198,11 +199,11 @@ def _restart(
     is_estimate_trusted: bool,
     is_position_diverged: bool,
 ) -> DeadReckoning:
-    """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
+    """Return the dead reckoning at the first sample, after a gap in the telemetry, or while the
+    attitude is frozen.
 
-    The velocity becomes the estimated one if that is believed. If not, it changes by as much as the
-    estimated velocity did during the silence. With diverged positions, it does not use the
-    estimate.
+    If the state estimate is trusted, its velocity is adopted. If not, the velocity changes by as
+    much as the estimated one did during the gap. With diverged positions, the estimate is not used.
     """
     velocity_mps = estimated_velocity_mps if is_estimate_trusted else ZERO_VECTOR
     if is_position_diverged:
@@ -229,7 +230,7 @@ def _restart(
     if old.imu is None:
         return unknown
     if imu.last_telemetry_gap_ended_at_s > old.imu.t_s:
-        # Motors that were off on both sides of the silence, or a restarted vehicle, cannot have
+        # Motors that were off on both sides of the gap, or a restarted vehicle, cannot have
         # climbed under power.
         off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
         flew = not (off or imu.integration_restarted_at_s > old.imu.t_s)
@@ -357,11 +358,11 @@ def _integrate_sample(
 
 
 def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> DeadReckoning:
-    """Return the reckoning with the bias of the estimated velocity learned from two samples, during
-    a flight in free air under position control.
+    """Return the dead reckoning with the bias of the estimated velocity learned from two samples,
+    during a flight in free air under position control.
 
-    In a steady wind, the firmware takes the drag of the air for a tilt, and its estimate reads up
-    to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
+    In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
+    by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both through the same low-pass filter. It is wrong for about
     `VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
     """
@@ -394,10 +395,10 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
 def learn_acceleration_bias_at_rest(
     old: DeadReckoning, previous_imu: ImuMotion | None, imu: ImuMotion
 ) -> DeadReckoning:
-    """Return the reckoning of a vehicle that is held still, so that the whole lateral acceleration
-    between `previous_imu` and `imu` is the combined bias of accelerometer and attitude. The bias
-    must be learned anew: in wind, the estimated attitude has an error, which disappears within a
-    second after the contact."""
+    """Return the dead reckoning of a vehicle that is held still, so that the whole lateral
+    acceleration between `previous_imu` and `imu` is the combined bias of accelerometer and
+    attitude. The bias learned in flight does not apply: in wind, the estimated attitude has an
+    error that disappears within a second after the contact."""
     if (
         previous_imu is None
         or not 0.0 < imu.t_s - previous_imu.t_s <= MAX_TELEMETRY_GAP_S
@@ -469,8 +470,9 @@ def accumulate_unexplained_position_step(
 
 
 def _position_time_s(sample: Telemetry) -> float:
-    """Return the time of the sample's position, s, which is older than its attitude by the sample's
-    `behind_s`. A difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` counts as none."""
+    """Return the time, s, at which the sample's position was valid. It is older than the attitude
+    by the sample's `behind_s`; a difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` is
+    ignored."""
     return sample.t_s - max(0.0, sample.behind_s - MAX_NEGLIGIBLE_POSITION_LAG_S)
 
 

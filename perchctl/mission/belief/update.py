@@ -75,7 +75,8 @@ MAX_FILTER_STEP_S = 0.1
 """Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
 single sample has the weight of many."""
 MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
-"""Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
+"""Difference between commanded and reported thrust that no ramp causes, as a share of full
+thrust."""
 KEEPALIVE_RAW_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
 MEAN_LEAN_TIME_CONSTANT_S = 0.5
@@ -91,7 +92,7 @@ def update_belief(
     """Return the belief after one more observation; `command_history` holds the planner's commands
     so far.
 
-    A wrong observation makes the belief wrong for up to some seconds, until the filters forget it.
+    A wrong observation makes the belief wrong for up to a few seconds, until the filters forget it.
     """
     b = replace(
         belief,
@@ -129,7 +130,7 @@ def has_tick_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
 
 
 def start_dead_reckoning(b: Belief) -> Belief:
-    """Return the belief that, permanently, uses only accelerometer and attitude."""
+    """Return the belief switched permanently to dead reckoning from accelerometer and attitude."""
     return replace(
         b,
         dead_reckoning_since_s=b.obs.t_s,
@@ -147,8 +148,8 @@ def reset_conditions(b: Belief) -> Belief:
 
 
 def update_after_command(b: Belief, command: Command) -> Belief:
-    """Return the belief after a command was sent. Any command but raw thrust or idle ends the check
-    that the reported thrust follows the ordered raw thrust."""
+    """Return the belief after a command was sent. Any command other than raw thrust or idle ends
+    the check that the reported thrust follows the commanded raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
     return replace(b, thrust_differs_from_command_since_s=None)
@@ -244,8 +245,8 @@ def _translate(position_m: Vector, shift_m: Vector) -> Vector:
 
 
 def _compare_thrust_with_command(b: Belief) -> Belief:
-    """Return the belief with the loop time since when the reported thrust has differed from the
-    ordered raw thrust by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`; None while they
+    """Return the belief with the loop time at which the reported thrust began to differ from the
+    commanded raw thrust by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`; None while they
     agree."""
     order = b.command_history.raw_thrust
     if order is None:
@@ -320,9 +321,10 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
 
 
 def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Set the velocity to zero for a vehicle that has been steady at its contact, or within the
-    magnet's reach at a thrust too small to support it: otherwise the accelerometer's bias would
-    carry a hanging vehicle out of the reach within ten seconds."""
+    """Return the dead reckoning with zero velocity if the vehicle has been steady at its contact,
+    or is within the magnet's reach at a thrust too small to support it. Otherwise, the
+    accelerometer's bias would move the estimate of a hanging vehicle out of the magnet's reach
+    within ten seconds."""
     obs = b.obs
     rests = (
         obs.t_s - obs.imu.climb_steady_since_s >= STILL_AT_CONTACT_DWELL_S

@@ -84,7 +84,8 @@ def is_hover_height_unsafe(c: Context) -> bool:
 
 
 def unsafe_hover_reason(c: Context) -> str:
-    """Return at which height the vehicle would hover, and which heights are allowed."""
+    """Return a text with the height at which the vehicle would hover and the range of allowed
+    heights."""
     hover, height_m = c.planner.hover, hover_height_m(c)
     assert hover is not None
     assert height_m is not None

@@ -76,9 +76,9 @@ def _is_settled_at_standoff(c: Context) -> bool:
 
 
 def _is_at_hover_position(c: Context) -> bool:
-    """True if the vehicle is slow, with the gear aligned below a fresh target where the mission
-    hovers. The tolerances are those of ALIGN, since the small marker may be too far away to be
-    seen."""
+    """True if the vehicle is slow, and its gear is aligned below a fresh target at the distance at
+    which the mission hovers. The tolerances are those of ALIGN, since the small marker may be too
+    far away to be seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
     goal_z_m = target.vehicle_world_z_when_touching_m - standoff_m(c)
     return (
@@ -93,7 +93,8 @@ def _is_at_hover_position(c: Context) -> bool:
 
 
 def is_returning_to_hover_height(state: PlannerState) -> bool:
-    """True if this ascent returns a vehicle that has sunk during its hover to the hover's place."""
+    """True if the vehicle has sunk during its hover and this ascent returns it to the hover
+    position."""
     return (
         state.phase is Phase.ASCEND
         and VehicleDiagnosis.RETURNING_TO_HOVER_HEIGHT in state.entry.diagnosis

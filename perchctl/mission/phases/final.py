@@ -14,7 +14,7 @@ from perchctl.vehicle import Idle, StopMotors
 
 
 def rest(c: Context) -> Action:
-    """Send nothing."""
+    """Stay at rest without sending a command."""
     return c.state, Idle()
 
 

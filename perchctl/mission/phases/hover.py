@@ -54,7 +54,7 @@ def hover_config(c: Context) -> HoverConfig:
 
 
 def is_hovering(state: PlannerState) -> bool:
-    """True while the hover's time runs."""
+    """True during a hover, including a climb back to its position."""
     return state.phase is Phase.HOVER or is_returning_to_hover_height(state)
 
 
@@ -64,8 +64,8 @@ def time_since_hover_began_s(c: Context) -> float:
 
 
 def enter(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the hover's time and its position errors. They continue if the vehicle only climbed
-    back to its place within `MAX_RETURN_TO_HOVER_HEIGHT_S`."""
+    """Restart the hover timer and the position errors. Both continue if the vehicle has only
+    climbed back to its hover position within `MAX_RETURN_TO_HOVER_HEIGHT_S`."""
     if (
         is_returning_to_hover_height(previous_context.state)
         and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_S
@@ -75,15 +75,15 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """Stay under the target at the setpoint's height; sink if the target is nearer than it should
-    be."""
+    """Stay under the target at the setpoint's height. Lower the setpoint if the target is nearer
+    than intended."""
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     goal_z_m = c.belief.target.vehicle_world_z_when_touching_m - hover_config(c).below_m
     return fly_under_target(c, min(old.z_m, goal_z_m + MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M))
 
 
 def distance_below_hover_height_m(c: Context) -> float:
-    """Return how far the vehicle is below its hover place, m; negative above it."""
+    """Return how far the vehicle is below its hover height, m; negative if it is above."""
     return c.belief.target.gear_to_target_z_m - hover_config(c).below_m
 
 
@@ -99,7 +99,7 @@ def has_left_hover_position(c: Context) -> bool:
 
 
 def left_hover_position_reason(c: Context) -> str:
-    """Return how far the vehicle is from its place."""
+    """Return a text that says how far the vehicle is from its hover position."""
     aside_m, below_m = (
         c.belief.target.gear_to_target_distance_xy_m,
         distance_below_hover_height_m(c),

@@ -42,7 +42,7 @@ def act(c: Context) -> Action:
 
     The integral of the lateral error is frozen, and the height is not corrected
     (`corrects_height=False`), because both would wind up against the ceiling. If the profile
-    presses by raw thrust, order that thrust instead of a setpoint.
+    presses by raw thrust, command that thrust instead of a setpoint.
     """
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":

@@ -139,7 +139,8 @@ def has_recovered(c: Context) -> bool:
 
 
 def unsteady_reason(c: Context) -> str:
-    """Return which observations kept the vehicle from being steady; their cause is unknown."""
+    """Return a text that names the observations that kept the vehicle from being steady; their
+    cause is unknown."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:

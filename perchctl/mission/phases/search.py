@@ -88,7 +88,7 @@ def _limit_move_before_mounting_check(
 
 
 def not_found_reason(c: Context) -> str:
-    """Return that the target was not found, and why if known."""
+    """Return a text that says that the target was not found, and why if known."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refusal_reason
     return f"{text}: {why}" if why else text
