@@ -72,7 +72,7 @@ class FlightPage:
                 self.page.show(make_sketch(frame, tick.output, self._side_m))
             self._remember(tick)
             describe = partial(flight_state, tick, self._drawn, tuple(self._past))
-            self.page.set_state(describe, live=not tick.state.phase.is_over)
+            self.page.set_state(describe, live=not tick.state.phase.is_final)
         except Exception as error:
             self.page.store_error(error)
 
@@ -131,7 +131,7 @@ def flight_state(
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "rows": [list(row) for row in status_rows(tick) if row[0] != "phase"],
         "note": f"held: {state.pause_reason}" if state.pause_reason else "",
-        "over": state.phase.is_over,
+        "over": state.phase.is_final,
         "steps": PERCH_STEPS if hover is None else HOVER_STEPS,
         "done": state.phase is Phase.PERCHED or state.outcome is Outcome.HOVERED,
         "height_m": tick.telemetry.position_m[2] - ground_m,

@@ -339,7 +339,7 @@ def flight_status(tick: Tick) -> Status:
     state, telemetry, target = tick.state, tick.telemetry, tick.target
     x_m, y_m, z_m = telemetry.position_m
     return Status(
-        stage=Stage.ENDING if state.phase.is_over else Stage.FLYING,
+        stage=Stage.ENDING if state.phase.is_final else Stage.FLYING,
         phase=state.phase,
         reason=state.pause_reason or state.reason,
         height_m=z_m - state.belief.ground_z_m,

@@ -318,7 +318,7 @@ def _mission(
         )
         logged = newest
         watchers.tick(tick)
-        if state.phase.is_over:
+        if state.phase.is_final:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return FlightReport.from_state(
                 state,

@@ -51,7 +51,7 @@ from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.release import (
-    catch_slip,
+    catch_falling_vehicle,
     choose_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
@@ -342,7 +342,11 @@ def _restart_landing_with_catch(c: Context) -> Action:
 
 def _catch_fall(c: Context) -> Action | None:
     """Catch the fall by position; None without a heading or with diverged positions."""
-    return None if c.belief.is_heading_lost or c.belief.is_position_diverged else catch_slip(c)
+    return (
+        None
+        if c.belief.is_heading_lost or c.belief.is_position_diverged
+        else catch_falling_vehicle(c)
+    )
 
 
 # --- The four policies ---

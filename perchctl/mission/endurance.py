@@ -27,9 +27,9 @@ STANDOFF_SETTLING_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
 TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
-LANDING_END_DURATION_S = 3.0
+LANDING_DURATION_BEYOND_DESCENT_S = 3.0
 """Time that the end of a landing takes beyond the descent, s, as measured in simulated flights."""
-MAX_PRESS_VOLTAGE_DIP_V = 0.3
+MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
 BACK_OFF_DURATION_S = 3.0
@@ -85,7 +85,7 @@ def predict_hover_time_s(
         safety.min_load_v,
     )
     lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
-    press_v = safety.min_load_v - (0.0 if lasts else MAX_PRESS_VOLTAGE_DIP_V)
+    press_v = safety.min_load_v - (0.0 if lasts else MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V)
     press_load = max(thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
     sag_v, true_to_counted_discharge_ratio = fit_sag_model(state)
     end_v = hover_v + sag_v * thrust_fraction
@@ -134,7 +134,7 @@ def predict_durations(c: Context) -> MissionDurations:
     return MissionDurations(
         attempt_s=aligned_s + _climb_duration_s(c.profile, climb_height_m) + touch_s,
         retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
-        landing_s=descent_s + LANDING_END_DURATION_S,
+        landing_s=descent_s + LANDING_DURATION_BEYOND_DESCENT_S,
     )
 
 
@@ -159,7 +159,8 @@ def battery_shortfall_text(c: Context) -> str:
 
 
 def _missing_battery_reading_timeout_s(c: Context) -> float:
-    """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
+    """Return the time without a battery reading, s, after which the row `battery-unknown` lands the
+    vehicle."""
     return c.safety.battery_stale_s - max(
         c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
     )

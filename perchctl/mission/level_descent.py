@@ -97,7 +97,7 @@ MAX_SPECIFIC_FORCE_IF_AIRBORNE_G = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
 TOUCHDOWN_TO_HOVER_THRUST_RATIO = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
-TOUCHDOWN_DURATION_S = 0.25
+TOUCHDOWN_THRUST_DURATION_S = 0.25
 """Time for which that thrust lasts, s; an impact within this time belongs to the touchdown."""
 MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
 """Height below which an impact from below is the floor's, m."""
@@ -131,7 +131,7 @@ def _fresh_visual_motion(c: Context) -> VisualMotion | None:
     None."""
     b, seen = c.belief, c.belief.visual_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
-    return seen if old and seen.is_known and seen.t_s > b.telemetry.t_s else None
+    return seen if old and seen.is_velocity_known and seen.t_s > b.telemetry.t_s else None
 
 
 def _is_target_redetected(c: Context) -> bool:
@@ -139,7 +139,7 @@ def _is_target_redetected(c: Context) -> bool:
     determine the motion."""
     b, seen = c.belief, c.belief.visual_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
-    return old and not seen.is_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
+    return old and not seen.is_velocity_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
 
 
 def _climb_measured_at_s(c: Context) -> float:
@@ -202,7 +202,7 @@ def descend_level(c: Context) -> Action:
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
-    if touched_s >= TOUCHDOWN_DURATION_S and falls:
+    if touched_s >= TOUCHDOWN_THRUST_DURATION_S and falls:
         floor_detected_at_s = None  # the vehicle falls at low thrust, so it did not touch the floor
     carried = (
         b.is_imu_fresh
@@ -213,7 +213,7 @@ def descend_level(c: Context) -> Action:
         b.is_imu_fresh and tel.acc_z_g < MAX_SPECIFIC_FORCE_IF_AIRBORNE_G
     )
     before = descent.thrust or hover_thrust
-    if touched_s < TOUCHDOWN_DURATION_S:
+    if touched_s < TOUCHDOWN_THRUST_DURATION_S:
         thrust = TOUCHDOWN_TO_HOVER_THRUST_RATIO * hover_thrust
     elif _is_target_redetected(c):
         thrust = before
@@ -271,7 +271,7 @@ def _find_floor_detection_time_s(
     if descent.floor_detected_at_s is not None:
         return descent.floor_detected_at_s
     struck = (
-        c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_DURATION_S
+        c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_THRUST_DURATION_S
         and b.dead_reckoning.climb_before_impact_mps < 0.0
     )
     weak = 0.0 < descent.thrust < MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA * hover_thrust
@@ -405,7 +405,7 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
 
 
 def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
-    """Return world x and y as ahead and left of a vehicle with this heading."""
+    """Return a world vector (x, y) in the axes of a vehicle with this heading: ahead and left."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 

@@ -44,7 +44,7 @@ class Phase(Enum):
         return self in PRE_CONTACT_PHASES
 
     @property
-    def is_over(self) -> bool:
+    def is_final(self) -> bool:
         """True for the final phases."""
         return self in FINAL_PHASES
 

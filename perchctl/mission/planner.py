@@ -114,7 +114,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             row_name=row.name,
             reason=row.reason_text(c),
             diagnosis=row.diagnosis,
-            stop=row.stop,
+            stop_command=row.stop,
         ),
         severity=state.severity.escalate(row.severity),
         outcome=row.outcome_after(state.outcome),

@@ -243,7 +243,8 @@ class Tick:
 
     @property
     def camera_latency_above_profile_s(self) -> float:
-        """Latency that is subtracted from the frames' times, beyond the profile's, s."""
+        """Latency that is subtracted from the frames' times in addition to the profile's latency,
+        s."""
         return self.observation.camera_latency_above_profile_s
 
     @property

@@ -172,7 +172,7 @@ def hold_contact_by_position(c: Context) -> Action:
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
-    """True if raw thrust has brought the motors to rest."""
+    """True if the downward ramp of raw thrust has brought the motors to rest."""
     release_began_at_s = c.state.release_began_at_s
     return release_began_at_s is not None and c.t_s - release_began_at_s > c.planner.complete.ramp_s
 
@@ -207,7 +207,8 @@ def stop_motors(c: Context) -> Action:
 
 
 def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, thrust: float) -> float:
-    """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
+    """Return the distance, m, at which a setpoint above a falling vehicle catches it, given its
+    present `thrust`."""
     turning = thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
     return (
         CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M
@@ -216,7 +217,7 @@ def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, thrust: float) ->
     )
 
 
-def catch_slip(c: Context) -> Action | None:
+def catch_falling_vehicle(c: Context) -> Action | None:
     """Catch a vehicle that falls off the magnet: return a setpoint high above it. None if there is
     nothing to catch, once the fall has ended, or with old telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief

@@ -22,10 +22,10 @@ from perchctl.vision import CameraErrors
 
 MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
-MAX_TOUCHDOWN_AGE_S = 5.0
+MAX_TOUCHDOWN_TO_MOTOR_STOP_S = 5.0
 """Longest time from a touchdown to the stop of the motors, s; an earlier impact was not the
 floor."""
-MAX_TOUCHDOWN_HEIGHT_M = 0.3
+MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M = 0.3
 """Largest height of an impact above the final position for it to be a touchdown, m."""
 SIGMAS_FOR_95_PERCENT_INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
@@ -265,10 +265,10 @@ def find_touchdown(c: Context) -> Touchdown | None:
     impact = imu.newest_impact
     if (
         c.state.phase is Phase.PERCHED
-        or min(tel.t_s, imu.motors_off_since_s) - impact.t_s > MAX_TOUCHDOWN_AGE_S
+        or min(tel.t_s, imu.motors_off_since_s) - impact.t_s > MAX_TOUCHDOWN_TO_MOTOR_STOP_S
     ):
         return None
-    higher = impact.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_M
+    higher = impact.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M
     if b.is_position_valid and b.dead_reckoning_since_s is None and higher:
         return None
     reckoned = b.dead_reckoning_since_s is not None or b.is_position_diverged

@@ -51,7 +51,7 @@ MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
 MAX_TELEMETRY_AGE_FOR_FEEDBACK_S = 0.16
 """Age of the telemetry from which the onboard controllers are left alone, s."""
-LATERAL_FEEDBACK_START_BELOW_TARGET_M = 0.8
+LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_FADE_IN_DISTANCE_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
@@ -83,7 +83,8 @@ def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
 
 
 def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
-    """Return the body's world x and y (m) with the gear below the target at heading `yaw_rad`."""
+    """Return the world x and y (m) of the body at which its gear is below the target, for the
+    heading `yaw_rad`."""
     target = c.belief.target.world_position_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -91,8 +92,8 @@ def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float
 
 
 def make_setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
-    """Return the setpoint with the gear below the target, the target's heading and the body at
-    `z_m`."""
+    """Return the setpoint that brings the gear below the target: the body at height `z_m`, with the
+    target's heading."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
     x, y = body_world_xy_under_target(c, yaw)
@@ -231,7 +232,7 @@ def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[fl
     position, velocity and lean to that of the onboard controllers; zero far from the target or with
     old telemetry."""
     near = (
-        LATERAL_FEEDBACK_START_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
+        LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
     ) / LATERAL_FEEDBACK_FADE_IN_DISTANCE_M
     prompt = (MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - c.belief.attitude_age_s) / (
         MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S

@@ -88,12 +88,12 @@ class PhaseEntry:
     row_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE  # diagnosis of the transition
-    stop: EmergencyStop | StopMotors | None = None  # command that the transition sends at once
+    stop_command: EmergencyStop | StopMotors | None = None  # sent at once by the transition
 
 
 @dataclass(frozen=True, eq=False)
 class PlannerState:
-    """The planner's whole memory. Times are on the loop's clock."""
+    """The planner's whole state. Times are on the loop's clock."""
 
     belief: Belief
     phase: Phase = Phase.APPROACH
@@ -163,7 +163,8 @@ class PlannerState:
 
     @classmethod
     def initial_on_ground(cls, obs: Observation, profile: Profile) -> PlannerState:
-        """Return the memory before the first decision, for a vehicle at its take-off position."""
+        """Return the planner's state before the first decision, for a vehicle at its take-off
+        position."""
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
             belief=Belief.initial_on_ground(obs, profile),

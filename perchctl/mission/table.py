@@ -86,7 +86,7 @@ ALLOWED_TRANSITIONS = frozenset(
     (phase, row.to, row.severity)
     for row in TABLE
     for phase in row.phases & PRE_CONTACT_PHASES - {row.to}
-    if row.severity >= Severity.HOLD and not row.to.is_over
+    if row.severity >= Severity.HOLD and not row.to.is_final
 ) | {(Phase.ALIGN, Phase.ALIGN, Severity.HOLD)}
 """Combinations of phase, next phase and severity allowed for your own rows: wait in ALIGN, or
 interrupt the mission as the built-in table does. None of them climbs, stops a motor, or proves a

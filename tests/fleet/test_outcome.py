@@ -35,7 +35,7 @@ def ended(code: int) -> Result:
 
 
 def test_each_end_of_a_mission_is_an_outcome_and_only_one_of_them_hangs() -> None:
-    ends = {phase: VehicleOutcome.from_phase(phase) for phase in Phase if phase.is_over}
+    ends = {phase: VehicleOutcome.from_phase(phase) for phase in Phase if phase.is_final}
     assert len(set(ends.values())) == len(ends)
     assert VehicleOutcome.FAILED not in ends.values(), "which no mission ends in"
     hanging = [p for p, outcome in ends.items() if replace(PERCHED, outcome=outcome).hangs]

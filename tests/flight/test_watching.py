@@ -110,7 +110,7 @@ def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
     assert [note for note in notes(works) if note.startswith("the display raised Broken")] or (
         part == "event"  # at the landing: its note would come in the next tick
     )
-    assert works.ticks[-1].state.phase.is_over
+    assert works.ticks[-1].state.phase.is_final
 
 
 def test_a_watcher_without_a_name_is_named_by_its_class() -> None:

@@ -109,7 +109,7 @@ def fly(
         ticks.append(Tick(t_s, obs, state, command))
         if isinstance(look, Motors):
             look.obey(state, command)
-        if state.phase.is_over or (one_phase and state.phase is not begun):
+        if state.phase.is_final or (one_phase and state.phase is not begun):
             break
     return Flight(ticks)
 

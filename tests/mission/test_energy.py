@@ -43,7 +43,7 @@ PERIOD_S, MAH = 0.02, 250.0
 BRUSHLESS_MAH = 350.0
 LOW_V = 3.2  # under a long load, by the firmware
 HOVER = HOVER_THRUST / FULL_THRUST
-ATTEMPT_S, LANDING_END_DURATION_S = 12.0, 10.0
+ATTEMPT_S, LANDING_DURATION_BEYOND_DESCENT_S = 12.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,15 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         told_s = predict_hover_time_s(moment.energy, PROFILE, hover, BRUSHED_POWER_TRAIN)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
-            assert told_s < ATTEMPT_S + LANDING_END_DURATION_S + PROFILE.safety.energy_reserve_s
+            assert (
+                told_s
+                < ATTEMPT_S + LANDING_DURATION_BEYOND_DESCENT_S + PROFILE.safety.energy_reserve_s
+            )
         if ahead_s > 70.0:  # and one that is safe three times over is
-            assert told_s > ATTEMPT_S + LANDING_END_DURATION_S + PROFILE.safety.energy_reserve_s
+            assert (
+                told_s
+                > ATTEMPT_S + LANDING_DURATION_BEYOND_DESCENT_S + PROFILE.safety.energy_reserve_s
+            )
 
 
 @pytest.mark.parametrize("rest_v", [3.9, pytest.param(3.95, marks=pytest.mark.long)])

@@ -220,7 +220,7 @@ def estimate_only_mps(
             dead_reckoning, motion, new, is_estimate_trusted=True
         )
         last = new
-    return abs(dead_reckoning.lateral_velocity_unseen_by_imu_mps[0])
+    return abs(dead_reckoning.lateral_velocity_missed_by_imu_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:

@@ -706,7 +706,7 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         before, step = state, descent.step_landing if alone else planner.step_mission
         state, command = step(before, obs, profile)
         assert profile is not BY_TARGET or not isinstance(command, Land)
-        if state.phase.is_over:
+        if state.phase.is_final:
             return
         if Phase.LANDING not in (before.phase, state.phase):
             continue

@@ -505,7 +505,7 @@ def gains_beside(
         if not state.belief.is_position_diverged:
             beside = replace(
                 state.belief.dead_reckoning,
-                lateral_velocity_unseen_by_imu_mps=(0.0, estimate_only_mps),
+                lateral_velocity_missed_by_imu_mps=(0.0, estimate_only_mps),
             )
             state = remembering(state, dead_reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}

@@ -227,7 +227,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
         in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
         dead_reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
-            lateral_velocity_unseen_by_estimate_mps=(x_mps, y_mps),
+            lateral_velocity_missed_by_estimate_mps=(x_mps, y_mps),
         ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)

@@ -60,7 +60,7 @@ def test_the_velocity_is_that_of_the_target_turned_round(
 ) -> None:
     """Wherever the target is and however often it is seen; e^-10 is left of the low pass."""
     motion = watched(place_m, velocity_mps, rate_hz)
-    assert motion.is_known
+    assert motion.is_velocity_known
     assert motion.vehicle_velocity_mps == pytest.approx(velocity_mps, abs=1e-3)
 
 
@@ -80,7 +80,7 @@ def test_a_step_of_the_pose_is_no_motion(
 def test_after_a_gap_the_motion_has_to_be_seen_again() -> None:
     seen = watched((0.0, 0.0, 1.0), (0.0, 0.0, -0.5), 30.0)
     again = seen.with_detection(target_at(seen.t_s + 1.1))
-    assert not again.is_known
+    assert not again.is_velocity_known
     assert again.vehicle_velocity_mps == (0.0, 0.0, 0.0)
 
 

@@ -280,7 +280,7 @@ class Belief:
             MIN_SPEED_GAINED_IN_GUST_MPS
             + GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
-        return math.hypot(*self.dead_reckoning.lateral_velocity_unseen_by_estimate_mps) > least_mps
+        return math.hypot(*self.dead_reckoning.lateral_velocity_missed_by_estimate_mps) > least_mps
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
@@ -432,10 +432,10 @@ class Belief:
 
     @cached_property
     def lateral_offset(self) -> LateralOffset | None:
-        """Vector from the gear to the target and the vehicle's velocity, lateral and in world axes,
-        from pictures and lean. None if the last pictures are too old or too few, or contradict the
-        vehicle's motion: the camera may then be mounted rotated, and feedback of this velocity
-        would not damp the motion."""
+        """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, in
+        world axes, estimated from pictures and lean. None if the last pictures are too old or too
+        few. None, too, if they contradict the vehicle's motion: the camera may then be mounted
+        rotated, and feedback of this velocity would not damp the motion."""
         if self.mounting.is_camera_mounting_wrong or self.obs.camera_imu_mismatch is not None:
             return None
         return self.lateral_offset_filter.predict(self.obs.t_s)

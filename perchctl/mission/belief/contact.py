@@ -74,7 +74,7 @@ MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
 climb is detected late."""
 TOUCH_OFFSET_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
-POSITION_DECK_IMPACT_SIGMA_M = 0.002
+POSITION_DECK_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 POSITION_DECK_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
@@ -161,7 +161,9 @@ def _reckoned_gear_offset(b: Belief) -> ContactOffset:
     )
     if b.profile.positioning.source.is_deck and b.is_position_valid:
         sigma_m = math.hypot(
-            sigma_m, POSITION_DECK_IMPACT_SIGMA_M, POSITION_DECK_SIGMA_GROWTH_MPS * b.sighting_age_s
+            sigma_m,
+            POSITION_DECK_SIGMA_ADDED_BY_IMPACT_M,
+            POSITION_DECK_SIGMA_GROWTH_MPS * b.sighting_age_s,
         )
     return ContactOffset(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
 
@@ -214,7 +216,8 @@ def is_at_contact_height(b: Belief) -> bool:
 
 
 def is_gear_certainly_in_magnet_reach(b: Belief) -> bool:
-    """True if the gear is certainly within the magnet's reach."""
+    """True if the gear is at the target's height and so close to its axis that the magnet reaches
+    it: the offset plus one standard deviation is at most `perch.contact_xy_m`."""
     near = current_gear_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
 
@@ -307,8 +310,8 @@ def is_slipping(b: Belief) -> bool:
 
 
 def is_motionless(b: Belief) -> bool:
-    """True if the vehicle is supported and does not move vertically: the accelerometer reads 1
-    g."""
+    """True if the vehicle is supported and does not move vertically: the accelerometer reads 1 g
+    and, if the position is valid, the vertical speed is almost zero."""
     return b.is_accelerometer_reading_one_g and (
         abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_RATE_MPS or not b.is_position_valid
     )

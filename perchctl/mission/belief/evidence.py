@@ -26,7 +26,7 @@ class RequiredData(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Condition(Generic[ConditionInput]):
-    """A predicate on the current knowledge, evaluated once per tick by `predicate`.
+    """A condition on the belief or the context, evaluated once per tick.
 
     Attributes:
         name: readable name, for `repr`.
@@ -34,7 +34,7 @@ class Condition(Generic[ConditionInput]):
         persists_across_phases: True if the condition describes the vehicle independently of its
             maneuver: a change of phase or a hold does not reset its start time.
         required_data: data that must be fresh for the condition to count. A condition that may stop
-            the motors or end a flight depends at least on fresh telemetry.
+            the motors or end a flight requires at least fresh telemetry.
     """
 
     name: str

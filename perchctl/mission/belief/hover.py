@@ -72,7 +72,7 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
     return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA_FRACTION)
 
 
-def rotor_thrust(b: Belief, dt_s: float) -> float:
+def filter_rotor_thrust(b: Belief, dt_s: float) -> float:
     """Return the thrust, 0..65535, that the rotors produce `dt_s` after the previous sample: the
     reported thrust through a first-order lag with the time constant
     `ROTOR_THRUST_TIME_CONSTANT_S`."""

@@ -222,5 +222,5 @@ class LateralOffsetFilter:
 
 
 def _add_scaled(vector: LateralVector, factor: float, added_vector: LateralVector) -> LateralVector:
-    """Return ``vector + factor * b``."""
+    """Return ``vector + factor * added_vector``."""
     return vector[0] + factor * added_vector[0], vector[1] + factor * added_vector[1]

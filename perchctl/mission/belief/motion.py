@@ -172,8 +172,8 @@ class Impact:
 
 @dataclass(frozen=True)
 class FreezeDetector:
-    """Time for which readings have not changed. A vehicle in the air never reads identical values
-    twice."""
+    """Detector of frozen readings: the times for which they have not changed. A vehicle in the air
+    never reads identical values twice."""
 
     acceleration_frozen_for_s: float = 0.0  # time of identical accelerometer readings
     # time of identical attitude readings; -inf before the first change

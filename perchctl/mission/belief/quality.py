@@ -27,7 +27,7 @@ def _does_estimate_contradict_imu(b: Belief) -> bool:
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
-        and math.hypot(*b.dead_reckoning.lateral_velocity_unseen_by_imu_mps)
+        and math.hypot(*b.dead_reckoning.lateral_velocity_missed_by_imu_mps)
         > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
     )
 

@@ -4,7 +4,7 @@ While positions correct the state estimate, the reckoned velocity v is drawn to 
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                                            each sample
-    v += (e - v) dt / RECKONED_VELOCITY_TIME_CONSTANT_S             while e is trusted
+    v += (e - v) dt / DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S        while e is trusted
     b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S   while e is trusted
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
@@ -33,7 +33,7 @@ from perchctl.mission.belief.motion import (
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
+DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
@@ -59,7 +59,7 @@ MAX_BOUNCE_DISTANCE_BELOW_TARGET_M = 0.1
 bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
 Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
 to 0.3 m/s."""
-VELOCITY_UNSEEN_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
+VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
 just before the last sighting is forgotten."""
@@ -70,7 +70,7 @@ VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
-VELOCITY_UNSEEN_BY_IMU_TIME_CONSTANT_S = 0.5
+VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
 MIN_UNEXPLAINED_POSITION_STEP_M = 0.005
 """Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
@@ -88,12 +88,12 @@ is claimed too precisely."""
 VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
 """Standard deviation of the reckoned velocity at the last sighting, m/s. Smaller: the offset of a
 contact is claimed too precisely."""
-SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
+POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
 WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
-`lateral_velocity_unseen_by_imu_mps`."""
+`lateral_velocity_missed_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a gap."""
 
@@ -110,9 +110,9 @@ class DeadReckoning:
     mean_specific_force_world_xy_mps2: tuple[float, float] = (0.0, 0.0)
     estimated_velocity_mps: Vector = ZERO_VECTOR
     # lateral velocity gained recently by the state estimate alone
-    lateral_velocity_unseen_by_imu_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_velocity_missed_by_imu_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
-    lateral_velocity_unseen_by_estimate_mps: tuple[float, float] = (0.0, 0.0)
+    lateral_velocity_missed_by_estimate_mps: tuple[float, float] = (0.0, 0.0)
     # distance of the gear below the target; inf if unseen or fallen
     gear_below_target_m: float = math.inf
     # lower bound of `gear_below_target_m`: allows for climbs in silences, and falls only add to it
@@ -148,7 +148,7 @@ def advance_dead_reckoning(
     is_estimated_velocity_being_corrected: bool = False,
     ignores_lateral_estimate: bool = False,
 ) -> DeadReckoning:
-    """Return the reckoning one tick later.
+    """Return the dead reckoning one tick later.
 
     - `is_estimate_trusted`: adopt the sample's estimated velocity, and learn from it the bias of
       the acceleration, which is due to accelerometer and attitude.
@@ -224,8 +224,8 @@ def _restart(
         imu=imu,
         velocity_mps=velocity_mps,
         estimated_velocity_mps=estimated_velocity_mps,
-        lateral_velocity_unseen_by_imu_mps=(0.0, 0.0),
-        lateral_velocity_unseen_by_estimate_mps=(0.0, 0.0),
+        lateral_velocity_missed_by_imu_mps=(0.0, 0.0),
+        lateral_velocity_missed_by_estimate_mps=(0.0, 0.0),
     )
     if old.imu is None:
         return unknown
@@ -261,18 +261,18 @@ def _integrate_sample(
     is_estimated_velocity_being_corrected: bool,
     ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
-    """Return the reckoning one sample after `previous_imu`, by the equations in the module
+    """Return the dead reckoning one sample after `previous_imu`, by the equations in the module
     docstring."""
     estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, lateral_velocity_unseen_by_imu_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    velocity, bias, lateral_velocity_missed_by_imu_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
     remembers = (
-        math.exp(-dt_s / VELOCITY_UNSEEN_BY_ESTIMATE_TIME_CONSTANT_S)
+        math.exp(-dt_s / VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S)
         if is_estimated_velocity_being_corrected
         else 1.0
     )
-    keeps = math.exp(-dt_s / VELOCITY_UNSEEN_BY_IMU_TIME_CONSTANT_S)
+    keeps = math.exp(-dt_s / VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S)
     calm = (
         is_estimate_trusted
         and imu.t_s - imu.last_lateral_push_at_s > MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
@@ -302,16 +302,16 @@ def _integrate_sample(
         )
         if i < 2:
             alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
-            missed[i] = remembers * old.lateral_velocity_unseen_by_estimate_mps[i] + alone
+            missed[i] = remembers * old.lateral_velocity_missed_by_estimate_mps[i] + alone
         if is_estimate_trusted and (i == 2 or not ignores_lateral_estimate):
             v += (estimated_velocity_mps[i] - v) * min(
-                1.0, dt_s / RECKONED_VELOCITY_TIME_CONSTANT_S
+                1.0, dt_s / DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S
             )
             wrong = (gained - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])) / dt_s
             if calm and i < 2:
                 more = estimated_velocity_mps[i] - old.estimated_velocity_mps[i] - gained + b * dt_s
-                lateral_velocity_unseen_by_imu_mps[i] = (
-                    keeps * old.lateral_velocity_unseen_by_imu_mps[i] + more
+                lateral_velocity_missed_by_imu_mps[i] = (
+                    keeps * old.lateral_velocity_missed_by_imu_mps[i] + more
                 )
             if abs(wrong) <= MAX_ACCELERATION_BIAS_INNOVATION_MPS2:
                 share = min(1.0, dt_s / ACCELERATION_BIAS_TIME_CONSTANT_S)
@@ -331,7 +331,7 @@ def _integrate_sample(
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
         VELOCITY_SIGMA_AT_SIGHTING_MPS + ACCELERATION_BIAS_SIGMA_MPS2 * unseen_s
-    ) * dt_s + SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
+    ) * dt_s + POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
     ex, ey = old.gear_to_target_world_xy_m
     return replace(
         old,
@@ -343,11 +343,11 @@ def _integrate_sample(
             mean_specific_force_world_xy_mps2[1],
         ),
         estimated_velocity_mps=estimated_velocity_mps,
-        lateral_velocity_unseen_by_imu_mps=(
-            lateral_velocity_unseen_by_imu_mps[0],
-            lateral_velocity_unseen_by_imu_mps[1],
+        lateral_velocity_missed_by_imu_mps=(
+            lateral_velocity_missed_by_imu_mps[0],
+            lateral_velocity_missed_by_imu_mps[1],
         ),
-        lateral_velocity_unseen_by_estimate_mps=(missed[0], missed[1]),
+        lateral_velocity_missed_by_estimate_mps=(missed[0], missed[1]),
         gear_below_target_m=math.inf
         if fell
         else old.gear_below_target_m - (vz + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS) * dt_s,
@@ -414,8 +414,8 @@ def learn_acceleration_bias_at_rest(
 
 
 def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
-    """Return the reckoning after an interruption of the velocity-bias learning: the bias is kept,
-    and the low-pass filters restart."""
+    """Return the dead reckoning after an interruption of the velocity-bias learning: the bias is
+    kept, and the low-pass filters restart."""
     return (
         old
         if old.mean_estimated_world_xy_m is None
@@ -424,12 +424,12 @@ def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the reckoning with its acceleration bias corrected after positions in wrong axes. They
-    have given the state estimate a velocity that the accelerometer has not measured and, in
+    """Return the dead reckoning with its acceleration bias corrected after positions in wrong axes.
+    They have given the state estimate a velocity that the accelerometer has not measured and, in
     proportion to it, a wrong tilt, which was learned as a bias."""
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_mps2,
-        old.lateral_velocity_unseen_by_imu_mps,
+        old.lateral_velocity_missed_by_imu_mps,
     )
     return replace(
         old,
@@ -444,9 +444,9 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
 def accumulate_unexplained_position_step(
     old: DeadReckoning, last: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
-    """Return the reckoning with one more step of the estimated position added to their sum, which
-    makes the offset at a contact less certain. A step is the motion between two samples beyond what
-    the estimated velocity explains. After a gap in the samples, no step is added."""
+    """Return the dead reckoning with one more step of the estimated position added to their sum,
+    which makes the offset at a contact less certain. A step is the motion between two samples
+    beyond what the estimated velocity explains. After a gap in the samples, no step is added."""
     dt_s = _position_time_s(sample) - _position_time_s(last)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
@@ -483,7 +483,7 @@ def add_sighting(
     gear_below_target_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
-    """Return the reckoning restarted at a sighting.
+    """Return the dead reckoning restarted at a sighting.
 
     `gear_to_target_world_xy_m` is the vector from the gear to the target (world x, y), with the
     standard deviation `sigma_m`; `gear_below_target_m` is how far the gear is below the target.

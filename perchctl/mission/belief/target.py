@@ -119,7 +119,7 @@ class VisualMotion:
     vehicle_velocity_mps: Vector = ZERO_VECTOR
 
     @property
-    def is_known(self) -> bool:
+    def is_velocity_known(self) -> bool:
         """True if the target was detected for long enough to determine the velocity."""
         return self.t_s - self.detected_since_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
 

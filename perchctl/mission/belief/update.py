@@ -268,8 +268,8 @@ def _compare_thrust_with_command(b: Belief) -> Belief:
 
 
 def _update_dead_reckoning(b: Belief) -> Belief:
-    """Return the belief with the reckoning one tick later, the time within the magnet's reach, and
-    the height of a vehicle without a position."""
+    """Return the belief with the dead reckoning one tick later, the time within the magnet's reach,
+    and the height of a vehicle without a position."""
     new = _integrate_dead_reckoning(b)
     new = _stop_dead_reckoning_at_contact(b, new)
     new = _adopt_camera_velocity(b, new)
@@ -418,12 +418,13 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
 
 
 def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
-    """Return the time since which the magnet may hold the vehicle."""
+    """Return the loop time since which the magnet may have held the vehicle; None if it cannot hold
+    it."""
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     # a released or stopped vehicle does not move into or out of reach
     if not b.command_history.is_before_release_and_motor_stop:
         return in_magnet_reach_since_s
-    # A vehicle that has touched the floor does not climb, whatever the reckoning says.
+    # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
     near = (
         new.gear_below_target_m < MAGNET_REACH_M and b.command_history.floor_detected_at_s is None
     )
@@ -479,7 +480,7 @@ def _update_estimators(b: Belief) -> Belief:
     b = replace(
         b,
         hover_thrust_estimate=b.hover_thrust_estimate.propagate_without_measurement(dt_s),
-        rotor_thrust=hover.rotor_thrust(b, sample_dt_s),
+        rotor_thrust=hover.filter_rotor_thrust(b, sample_dt_s),
     )
     found = b.hover_thrust_estimate
     if away and maneuver.learns_hover_thrust and is_flying_at_hover_thrust(b):

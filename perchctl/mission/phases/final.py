@@ -19,8 +19,8 @@ def rest(c: Context) -> Action:
 
 
 def abort(c: Context) -> Action:
-    """Stop the motors once; without a stop, the firmware would lock a vehicle that hangs with still
-    motors."""
+    """Stop the motors once. Without a stop command, the firmware would lock a hanging vehicle whose
+    motors stand still."""
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (
@@ -28,7 +28,7 @@ def abort(c: Context) -> Action:
     )
     return replace(
         c.state, stop_or_land_command_count=1, last_stop_or_land_command_at_s=c.t_s
-    ), c.state.entry.stop or ends
+    ), c.state.entry.stop_command or ends
 
 
 PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=rest)

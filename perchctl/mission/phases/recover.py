@@ -17,7 +17,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.release import (
-    catch_slip,
+    catch_falling_vehicle,
     choose_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
@@ -102,7 +102,7 @@ def _find_touch_offset(
 
 def act(c: Context) -> Action:
     """Hold `descend_m` below the position where the attempt ended, in position mode throughout."""
-    if (caught := catch_slip(c)) is not None:
+    if (caught := catch_falling_vehicle(c)) is not None:
         return caught
     recover = c.planner.recover
     c = Context(

@@ -21,7 +21,7 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-OBSTACLE_CLEARANCE_M = 0.1
+MIN_CLEARANCE_BELOW_OBSTACLE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
 MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M = 0.2
 """Largest lateral distance flown to a target seen before, while the camera's mounting is
@@ -61,7 +61,7 @@ def act(c: Context) -> Action:
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
         if state.obstacle_blocked_at_z_m is not None:
-            top = min(top, state.obstacle_blocked_at_z_m - OBSTACLE_CLEARANCE_M)
+            top = min(top, state.obstacle_blocked_at_z_m - MIN_CLEARANCE_BELOW_OBSTACLE_M)
         height = min(z + search.step_m * state.searched_position_count, top)
     yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_position_count
     goal = PositionSetpoint(x, y, height, yaw)
