@@ -195,12 +195,14 @@ class FreezeDetector:
         compare."""
         return replace(
             self,
-            acceleration_frozen_for_s=_frozen_for_s(
-                self.acceleration_frozen_for_s, last, new, _ACCELERATION
+            acceleration_frozen_for_s=_update_frozen_time_s(
+                self.acceleration_frozen_for_s, last, new, _GET_ACCELERATION
             ),
-            attitude_frozen_for_s=_frozen_for_s(self.attitude_frozen_for_s, last, new, _ATTITUDE),
-            position_frozen_for_s=_frozen_for_s(
-                self.position_frozen_for_s, last, new, _POSITION_AND_VELOCITY
+            attitude_frozen_for_s=_update_frozen_time_s(
+                self.attitude_frozen_for_s, last, new, _GET_ATTITUDE
+            ),
+            position_frozen_for_s=_update_frozen_time_s(
+                self.position_frozen_for_s, last, new, _GET_POSITION_AND_VELOCITY
             ),
         )
 
@@ -295,13 +297,13 @@ class ImpactDetector:
             if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS
             else self.last_impact_at_s,
             recent_samples=recent_samples,
-            newest_impact=_newest_impact(
+            newest_impact=_update_newest_impact(
                 self.newest_impact, newest_sample, z_m, recent_samples, speed_gained_in_impact_mps
             ),
         )
 
 
-def _newest_impact(
+def _update_newest_impact(
     old: Impact,
     newest_sample: Impact,
     z_m: float,
@@ -605,22 +607,22 @@ def _estimate_tilt_error(
     return TiltError(error, rates)
 
 
-_ACCELERATION = attrgetter("acc_x_g", "acc_y_g", "acc_z_g")
-_ATTITUDE = attrgetter("roll_rad", "pitch_rad", "yaw_rad")
-_POSITION_AND_VELOCITY = attrgetter("position_m", "velocity_mps")
+_GET_ACCELERATION = attrgetter("acc_x_g", "acc_y_g", "acc_z_g")
+_GET_ATTITUDE = attrgetter("roll_rad", "pitch_rad", "yaw_rad")
+_GET_POSITION_AND_VELOCITY = attrgetter("position_m", "velocity_mps")
 
 
-def _frozen_for_s(
+def _update_frozen_time_s(
     previously_frozen_for_s: float,
     last: Telemetry | None,
     new: Telemetry,
-    reading: Callable[[Telemetry], object],
+    get_reading: Callable[[Telemetry], object],
 ) -> float:
     if last is None:
         return previously_frozen_for_s
     return (
         0.0
-        if reading(last) != reading(new)
+        if get_reading(last) != get_reading(new)
         else previously_frozen_for_s + max(0.0, new.t_s - last.t_s)
     )
 
