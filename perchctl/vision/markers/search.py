@@ -80,6 +80,12 @@ def search(
     """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
+
+    def search_part(part: Window, threshold_windows_px: ThresholdWindowRange) -> FoundMarkers:
+        return _search_once(
+            picture, part, expected_corners_px, threshold_windows_px, measure_own_target_distance_m
+        )
+
     if setup.is_line_fit_enabled and expected_corners_px and search_mode != "whole_sharp":
         quickly = search_half_size(picture, expected_corners_px, measure_own_target_distance_m)
         if quickly is not None:
@@ -87,32 +93,14 @@ def search(
         window = make_search_window(expected_corners_px, setup.small_to_large_side, shape) or whole
         found = FoundMarkers()
         if len(expected_corners_px) == 2:
-            found = _search_once(
-                picture,
-                window,
-                expected_corners_px,
-                QUICK_THRESHOLD_WINDOWS_PX,
-                measure_own_target_distance_m,
-            )
+            found = search_part(window, QUICK_THRESHOLD_WINDOWS_PX)
         if len(found.corners_px) < 2 and window != whole:
-            found = _search_once(
-                picture,
-                window,
-                expected_corners_px,
-                OPENCV_THRESHOLD_WINDOWS_PX,
-                measure_own_target_distance_m,
-            )
+            found = search_part(window, OPENCV_THRESHOLD_WINDOWS_PX)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             search_mode in ("near_expected", "expected_window") and window != whole
         ):
             return found
-    return _search_once(
-        picture,
-        whole,
-        expected_corners_px,
-        OPENCV_THRESHOLD_WINDOWS_PX,
-        measure_own_target_distance_m,
-    )
+    return search_part(whole, OPENCV_THRESHOLD_WINDOWS_PX)
 
 
 def search_half_size(
