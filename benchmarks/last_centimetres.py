@@ -119,7 +119,7 @@ def ascent(case: Case, setup: Pipeline, scene: Renderer, seed: int, in_hand: boo
             e, heading = rot_z(-yaw) @ (way - T[:3, :3] @ gear), -yaw
         range_m = FROM_M - SPEED_MPS * t_s
         pose = next(iter(output.poses.values()), None)
-        if pose is None or not state.measured.poses_by_track:
+        if pose is None or not state.marker_poses.poses_by_track:
             rows.append(Row(range_m, False, None, math.nan, took_s))
             continue
         error = np.array([*(pose.e_m - e), wrap_rad(pose.e_yaw_rad - heading)])

@@ -280,7 +280,7 @@ def _add_pose(
     T_level_cam = make_T(R_level_body, np.zeros(3)) @ T_body_cam
     order = [3, 4, 5, 0, 1, 2]
     covariance = target_covariance_cam(pose)[np.ix_(order, order)]
-    print_m = T_level_cam[:3, :3].T @ pose.print_error_shifts_m
+    print_m = T_level_cam[:3, :3].T @ pose.shift_per_print_error_sigma_m
     covariance[:3, :3] += print_m @ print_m.T
     level = None if attitude is None else T_level_cam @ T_cam_target
     return replace(seen, T_cam_target=T_cam_target, covariance=covariance, T_level_target=level)

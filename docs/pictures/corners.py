@@ -28,13 +28,13 @@ from perchctl.vision.markers.corners import (
     mean_side_px,
     refine_subpix,
 )
-from perchctl.vision.markers.cut import RigidPose, fit_pose, make_lattice, make_outline
+from perchctl.vision.markers.cut import RigidPose, fit_pose, make_coarse_lattice, make_outline
 from perchctl.vision.markers.edge_fit import measure_edges, prepare_marker_sides
 from perchctl.vision.markers.partial import find_visible_edges
 from perchctl.vision.markers.photometric_fit import (
     align_drawing,
     distort_px,
-    make_grid,
+    make_sampling_grid,
     project_nodes,
     render_blurred,
 )
@@ -70,8 +70,8 @@ def half_size_search(file: Path) -> None:
     figure, whole, half = _panels(view, width_ratios=(2.0, 1.0))
     rows, columns = (
         make_search_window(
-            view.prior.expected_corners_of_both_markers_px,
-            SETUP.small_to_large_side,
+            view.prior.expected_corners_both_markers_px,
+            SETUP.small_to_large_side_ratio,
             view.image.shape,
         )
         or _WHOLE
@@ -84,7 +84,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_half_size(view.picture, view.prior.expected_corners_of_both_markers_px)
+    searched = search_half_size(view.picture, view.prior.expected_corners_both_markers_px)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25
@@ -130,7 +130,9 @@ def cut_view_fit(file: Path) -> None:
         + fit.pose.t_cam_drawing_half_sides
     )
     x = X[:, :2] / X[:, 2:]
-    at = distort_to_px(x[np.hypot(*x.T) < make_lattice(CAMERA).valid_radius_normalised], CAMERA)
+    at = distort_to_px(
+        x[np.hypot(*x.T) < make_coarse_lattice(CAMERA).valid_radius_normalised], CAMERA
+    )
     _dots(whole, near, at[((at > 0.0) & (at < (639.0, 479.0))).all(axis=1)], "edge of the drawing")
     _finish(figure, file, whole, view)
 
@@ -159,7 +161,7 @@ def _view(method: str) -> View:
 
 
 def _expected(view: View) -> Array:
-    return view.prior.expected_corners_of_both_markers_px[view.marker]
+    return view.prior.expected_corners_both_markers_px[view.marker]
 
 
 def _found(view: View) -> Array:
@@ -222,7 +224,7 @@ def _drawing(view: View, file: Path) -> None:
     fit = align_drawing(view.image, found, drawing, CAMERA, view.blur_px)
     assert fit is not None
     n = 44
-    grid = make_grid(n, drawing.photometric_fit_reach_half_sides)
+    grid = make_sampling_grid(n, drawing.photometric_fit_reach_half_sides)
     H = homography_from_centred_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
@@ -240,8 +242,8 @@ def _drawing(view: View, file: Path) -> None:
     picture.set_ylim(bottom, top)
     _square(picture, found, BLUE, "found")
     picture.plot(*view.true_px.T, "+", color=GREEN, markersize=8, markeredgewidth=2.0, label="true")
-    error_px = float(np.abs(found - view.true_px).max())
-    picture.set_title(f"picture, error {error_px:.2f} px", fontsize=9)
+    reprojection_error_px = float(np.abs(found - view.true_px).max())
+    picture.set_title(f"picture, error {reprojection_error_px:.2f} px", fontsize=9)
     low, high = float(grey.min()), float(grey.max())
     for ax, values, title in (
         (seen, grey, "picture on the grid"),
@@ -261,8 +263,8 @@ def _drawing(view: View, file: Path) -> None:
 
 def _finish(figure: Figure, file: Path, whole: Axes, view: View) -> None:
     true, found = view.true_px, _found(view)
-    error_px = float(np.abs(found - true).max())
-    whole.set_title(f"largest error {error_px:.2f} px", fontsize=9)
+    reprojection_error_px = float(np.abs(found - true).max())
+    whole.set_title(f"largest error {reprojection_error_px:.2f} px", fontsize=9)
     labelled = {}
     for ax in figure.axes:
         ax.set_xticks([])

@@ -174,7 +174,7 @@ class FlightInputs:
             for _, self.output in perception.process_fields(frame):
                 if positioning is not None and self._is_heard(now_s):
                     positioning.add_pose(
-                        perception.state.measured.most_certain_pose, self.history, now_s
+                        perception.state.marker_poses.most_certain_pose, self.history, now_s
                     )
         self.camera_problem = self._note
         self.problem_kind = self._frame_kind if is_doubtful else None

@@ -131,7 +131,7 @@ class Perception:
 
     def _calibrate(self, output: PipelineOutput, used_s: float) -> None:
         # Use the source's stamp: a correction of the latency in progress must not change it.
-        pose, t_s = self.state.measured.most_certain_pose, output.detections.t_s + used_s
+        pose, t_s = self.state.marker_poses.most_certain_pose, output.detections.t_s + used_s
         if pose is None:
             return
         measured = self._measured_latency

@@ -1,7 +1,7 @@
 """Estimate the target from a frame with pure functions: detection, pose, merge and filter.
 
-pipeline: the only path from a picture to the target; its memory is a value.
-fields: the two pictures of an interlaced frame.
+pipeline: the only path from an image to the target; its memory is a value.
+fields: the two images of an interlaced frame.
 markers: detection of the corners of both markers.
 lens: removal of the lens distortion from corners.
 pose: pose and covariance of the target from its corners.

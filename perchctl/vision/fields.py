@@ -2,7 +2,7 @@
 
 An interlaced frame consists of two fields, half a frame period apart, each in every second row.
 Motion between the fields shows as combing: a row differs from its neighbours. Only strong
-differences count, so that a small target in a noisy picture is enough. The order of the fields
+differences count, so that a small target in a noisy image is enough. The order of the fields
 follows from successive frames: the later field of a frame is more similar to the earlier field of
 the next one.
 """
@@ -23,31 +23,33 @@ GreyImage = NDArray[np.uint8]
 
 # energy of the strong differences between the two fields over that within the fields; exceeded by
 # fields one pixel apart
-_MIN_ACROSS_TO_WITHIN_FIELD_ENERGY = 1.4
+_MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # a pixel's difference counts above this multiple of the mean difference within the fields
-_MIN_FIELD_DIFFERENCE_OVER_MEAN = 5.0
+_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
-_CLASSIFICATION_PERIOD_FRAMES = 3
+_COMBING_CHECK_INTERVAL_FRAMES = 3
 _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 # cubic interpolation at the midpoint
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
-_STANDARD_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
-_SNAPPED_FRAME_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
-_VALID_PERIOD_RANGE_S = (0.004, 0.1)
-_MAX_KEPT_PERIODS = 25
-_MIN_LOST_FRAME_PERIOD_RATIO = 1.8
-_MAX_FRAME_GAP_S = 0.25  # s; older pictures carry no information about the order
-_MIN_ORDER_VOTES = 1.0  # sum of votes, each at most 1, that decides the order: two frames at least
-_MAX_ORDER_VOTES = 3.0  # limit of the sum, so that a changed order is noticed in time
-_MIN_REVERSAL_VOTES = 1.0  # sum of votes that reverses an order decided before
+_NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
+_ROUNDED_TO_NTSC_OR_PAL_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
+_VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
+_MAX_STORED_FRAME_PERIODS = 25
+_MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
+_MAX_FRAME_GAP_S = 0.25  # s; older images carry no information about the order
+_MIN_FIELD_ORDER_VOTES = (
+    1.0  # sum of votes, each at most 1, that decides the order: two frames at least
+)
+_MAX_FIELD_ORDER_VOTES = 3.0  # limit of the sum, so that a changed order is noticed in time
+_MIN_FIELD_ORDER_REVERSAL_VOTES = 1.0  # sum of votes that reverses an order decided before
 
 
 def is_combed(image: GreyImage) -> bool:
-    """True if an interlaced picture (h, w) shows combing: a row differs more from its neighbours
+    """True if an interlaced image (h, w) shows combing: a row differs more from its neighbours
     than from the rows of its own field."""
     groups, width = len(image) // _ROWS_PER_COMBING_GROUP, image.shape[1]
     if groups == 0:
@@ -64,18 +66,19 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_MIN_FIELD_DIFFERENCE_OVER_MEAN * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
+    least = max(_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
     return (
-        energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_ACROSS_TO_WITHIN_FIELD_ENERGY
+        energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size)
+        > _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO
     )
 
 
 def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
-    """Return the top and bottom field, each (h, w), of a combed picture; otherwise the picture
+    """Return the top and bottom field, each (h, w), of a combed image; otherwise the result
     alone."""
     if not is_combed(image):
         return (image,)
@@ -89,13 +92,13 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
     between = cv2.filter2D(
         own, -1, _INTERPOLATION_TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE
     )
-    picture = image.copy()
+    result = image.copy()
     if first_row == 0:
-        picture[1::2] = between[: len(picture[1::2])]
+        result[1::2] = between[: len(result[1::2])]
     else:
-        picture[2::2] = between[: len(picture[2::2])]
-        picture[0] = own[0]
-    return picture
+        result[2::2] = between[: len(result[2::2])]
+        result[0] = own[0]
+    return result
 
 
 def interpolated_edge_sigma_px(blur_px: float) -> float:
@@ -122,7 +125,7 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the new state, and the pictures of a stream's frame in time order: the frame itself,
+    """Return the new state, and the images of a stream's frame in time order: the frame itself,
     or its two fields, a quarter of the frame period before and after the frame's time.
 
     Until a frame was found to be woven, only every third frame is examined for combing.
@@ -130,7 +133,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     skip = (
         frame.picture_kind is None
         and state.kind == "whole"
-        and state.frames_since_examined + 1 < _CLASSIFICATION_PERIOD_FRAMES
+        and state.frames_since_examined + 1 < _COMBING_CHECK_INTERVAL_FRAMES
     )
     frame = replace(frame, picture_kind="whole") if skip else classify_fields(frame)
     skipped = state.frames_since_examined + 1 if skip else 0
@@ -150,30 +153,32 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
         return state, (frame,)
     top, bottom = interpolate_fields(frame)
     early, late = (top, bottom) if state.is_top_first else (bottom, top)
-    apart_s = _estimate_period_s(state.frame_periods_s) / 2.0
+    apart_s = _estimate_frame_period_s(state.frame_periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
     )
 
 
-def _estimate_period_s(frame_periods_s: tuple[float, ...]) -> float:
+def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
     if not frame_periods_s:
-        return _STANDARD_PERIODS_S[1]
+        return _NTSC_AND_PAL_FRAME_PERIODS_S[1]
     middle_s = median(frame_periods_s)
     # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
     # ms apart.
-    period_s = mean(p for p in frame_periods_s if p < _MIN_LOST_FRAME_PERIOD_RATIO * middle_s)
-    if _SNAPPED_FRAME_PERIOD_RANGE_S[0] < period_s < _SNAPPED_FRAME_PERIOD_RANGE_S[1]:
-        return min(_STANDARD_PERIODS_S, key=lambda p: abs(p - period_s))
+    period_s = mean(
+        p for p in frame_periods_s if p < _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO * middle_s
+    )
+    if _ROUNDED_TO_NTSC_OR_PAL_RANGE_S[0] < period_s < _ROUNDED_TO_NTSC_OR_PAL_RANGE_S[1]:
+        return min(_NTSC_AND_PAL_FRAME_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s
 
 
 def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     if state.last_frame_t_s is not None:
         gap_s = frame.t_s - state.last_frame_t_s
-        if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
-            return (*state.frame_periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
+        if _VALID_FRAME_PERIOD_RANGE_S[0] < gap_s < _VALID_FRAME_PERIOD_RANGE_S[1]:
+            return (*state.frame_periods_s[1 - _MAX_STORED_FRAME_PERIODS :], gap_s)
     return state.frame_periods_s
 
 
@@ -196,12 +201,15 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        top_first_votes = min(max(top_first_votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
-    if is_top_first is None and abs(top_first_votes) > _MIN_ORDER_VOTES:
+        top_first_votes = min(
+            max(top_first_votes + vote, -_MAX_FIELD_ORDER_VOTES), _MAX_FIELD_ORDER_VOTES
+        )
+    if is_top_first is None and abs(top_first_votes) > _MIN_FIELD_ORDER_VOTES:
         is_top_first = top_first_votes > 0.0
     elif (
         is_top_first is not None
-        and (top_first_votes if not is_top_first else -top_first_votes) > _MIN_REVERSAL_VOTES
+        and (top_first_votes if not is_top_first else -top_first_votes)
+        > _MIN_FIELD_ORDER_REVERSAL_VOTES
     ):
         is_top_first = not is_top_first
     return replace(

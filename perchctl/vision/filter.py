@@ -35,19 +35,19 @@ MAX_PREDICTION_S = 1.0
 
 _IDENTITY_3: Array = np.eye(3)
 _IDENTITY_8: Array = np.eye(8)
-_RATE_TO_VALUE_MATRIX: Array = np.eye(8, k=1)
-_RATE_TO_VALUE_MATRIX[RATES] = 0.0
+_RATE_INTEGRATION_MATRIX: Array = np.eye(8, k=1)
+_RATE_INTEGRATION_MATRIX[RATES] = 0.0
 
-_CM = 0.01
-_DEG = math.radians(1.0)
-_SI_PER_PUBLISHED_UNIT = np.array(
-    [_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM]
+_M_PER_CM = 0.01
+_RAD_PER_DEG = math.radians(1.0)
+_SI_PER_PAPER_UNIT = np.array(
+    [_RAD_PER_DEG, _RAD_PER_DEG, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM]
 )  # units of the paper, per state
 
 _ACCELERATION_CORRELATION_TIME_S = 0.1
 """Duration of an acceleration, s: the density of the white noise is its square times this,
 (m/s^2)^2 s."""
-_ESTIMATE_WALK_VARIANCE_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+_WORLD_FRAME_DRIFT_VARIANCE_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
 m^2)."""
 _HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
@@ -98,7 +98,7 @@ class FilterSetup:
             of the profile.
         acceleration_noise: process noise that replaces Q, while the covariance of each pose
             replaces R; None: Q and R are used.
-        tilt_sigma_rad: constant error of the vehicle's roll and pitch.
+        roll_pitch_bias_sigma_rad: constant error of the vehicle's roll and pitch.
         max_target_speed_mps: largest speed of the target in the track's frame while it is not
             measured: that of the drift of the world frame, unlimited in the level frame.
         max_nis_without_restart: largest normalized innovation squared (NIS) of a measurement that
@@ -116,7 +116,7 @@ class FilterSetup:
     velocity_factor_per_unseen_frame: float
     max_unseen_frames: int
     acceleration_noise: ProcessNoise | None = None
-    tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
+    roll_pitch_bias_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
     max_target_speed_mps: float = (
         math.inf
     )  # largest speed of the target in its frame without measurements
@@ -124,18 +124,18 @@ class FilterSetup:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class TrackMeasurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
     means the setup's R.
 
-    `shift_per_constant_error` (4, 4) has one row for each element of z and one column for each
+    `shift_per_bias_sigma` (4, 4) has one row for each element of z and one column for each
     constant error: the vehicle's roll and pitch, the print's size and curl. A column is the change
     of z by one standard deviation of that error. None means no such errors.
     """
 
     z: Array
     R: Array | None = None
-    shift_per_constant_error: Array | None = None
+    shift_per_bias_sigma: Array | None = None
 
 
 @cache
@@ -157,7 +157,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
     first[RATES] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
-    squares = _SI_PER_PUBLISHED_UNIT**2
+    squares = _SI_PER_PAPER_UNIT**2
     acceleration_noise = None
     if measured:
         acceleration_noise = (
@@ -174,7 +174,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
         velocity_factor_per_unseen_frame=config.alpha,
         max_unseen_frames=config.n_max,
         acceleration_noise=acceleration_noise,
-        tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
+        roll_pitch_bias_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         max_target_speed_mps=config.drift_mps if is_world_frame else math.inf,
         # In flight, the gate detects jumps of the state estimate (`perchctl.vision.tracks`).
         max_nis_without_restart=_MAX_NIS_WITHOUT_RESTART
@@ -192,7 +192,7 @@ def vector_by_tilt_jacobian(vector_m: Array) -> Array:
 
 def transition_matrix(dt_s: float) -> Array:
     """Return the state transition matrix F (8, 8) of the paper's equation 1 over `dt_s`."""
-    return _IDENTITY_8 + dt_s * _RATE_TO_VALUE_MATRIX
+    return _IDENTITY_8 + dt_s * _RATE_INTEGRATION_MATRIX
 
 
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
@@ -207,7 +207,7 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_world_frame_drifting:
-        Q[MEASURED, MEASURED] += _ESTIMATE_WALK_VARIANCE_PER_S * dt_s
+        Q[MEASURED, MEASURED] += _WORLD_FRAME_DRIFT_VARIANCE_PER_S * dt_s
     return Q
 
 
@@ -224,25 +224,25 @@ def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> A
     return density
 
 
-def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
+def start_track(measurement: TrackMeasurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
     """Return a track that starts with the measurement at `t_s`."""
     x = np.zeros(8)
-    x[MEASURED] = measured.z
-    x[YAW] = wrap_rad(float(measured.z[0]))
+    x[MEASURED] = measurement.z
+    x[YAW] = wrap_rad(float(measurement.z[0]))
     P = setup.P0.copy()
-    if measured.R is not None:
-        P[MEASURED, MEASURED] = measured.R
-    shift_per_constant_error = np.zeros((8, 4))
-    if measured.shift_per_constant_error is not None:
-        shift_per_constant_error[MEASURED] = measured.shift_per_constant_error
+    if measurement.R is not None:
+        P[MEASURED, MEASURED] = measurement.R
+    shift_per_bias_sigma = np.zeros((8, 4))
+    if measurement.shift_per_bias_sigma is not None:
+        shift_per_bias_sigma[MEASURED] = measurement.shift_per_bias_sigma
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_constant_error=shift_per_constant_error
+        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_bias_sigma=shift_per_bias_sigma
     )
 
 
 def step_track(
     track: MarkerTrack | None,
-    measured: Measurement | None,
+    measurement: TrackMeasurement | None,
     t_s: float,
     setup: FilterSetup,
 ) -> MarkerTrack | None:
@@ -250,7 +250,7 @@ def step_track(
 
     Args:
         track: the track so far, None before the first measurement.
-        measured: the measurement; None or not finite if the marker was not measured.
+        measurement: the measurement; None or not finite if the marker was not measured.
         t_s: the frame's time.
 
     Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
@@ -258,18 +258,18 @@ def step_track(
     `MAX_TRACK_GAP_S` in either direction restarts the track, and so does a measurement that the
     motion model does not explain (`FilterSetup.max_nis_without_restart`).
     """
-    if measured is not None and not is_finite(measured.z):
-        measured = None
+    if measurement is not None and not is_finite(measurement.z):
+        measurement = None
     if not math.isfinite(t_s):
         return track
     if track is None:
-        return None if measured is None else start_track(measured, t_s, setup)
+        return None if measurement is None else start_track(measurement, t_s, setup)
     dt_s = t_s - track.t_s
     if abs(dt_s) > MAX_TRACK_GAP_S or not is_finite(track.x):
-        return None if measured is None else start_track(measured, t_s, setup)
+        return None if measurement is None else start_track(measurement, t_s, setup)
     if dt_s <= 0.0:
         return track
-    if measured is None:
+    if measurement is None:
         if track.unseen_frames >= setup.max_unseen_frames:
             return None
         x = track.x.copy()
@@ -277,22 +277,22 @@ def step_track(
         return _predict_from_state(track, x, dt_s, t_s, track.unseen_frames + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise_covariance(dt_s, track.x[POSITION], setup)
     x, P = _import_filterpy_predict()(track.x, track.P, F=F, Q=Q)
-    R = setup.R if measured.R is None else measured.R
+    R = setup.R if measurement.R is None else measurement.R
     if setup.max_nis_without_restart < math.inf:
-        off, S = _innovation(x, measured.z), P[MEASURED, MEASURED] + R
+        off, S = _innovation(x, measurement.z), P[MEASURED, MEASURED] + R
         regular, solved = cv2.solve(S, off[:, None], flags=cv2.DECOMP_CHOLESKY)
         if regular and off.dot(solved)[0] > setup.max_nis_without_restart:
-            begun = start_track(measured, t_s, setup)
+            begun = start_track(measurement, t_s, setup)
             begun.P[MEASURED, MEASURED] += np.outer(off, off)
             return begun
-    x, P, gain = _kalman_update(x, P, measured.z, R)
-    shift_per_constant_error = F.dot(track.shift_per_constant_error)
-    if measured.shift_per_constant_error is not None:
-        shift_per_constant_error += gain.dot(
-            measured.shift_per_constant_error - shift_per_constant_error[MEASURED]
+    x, P, gain = _kalman_update(x, P, measurement.z, R)
+    shift_per_bias_sigma = F.dot(track.shift_per_bias_sigma)
+    if measurement.shift_per_bias_sigma is not None:
+        shift_per_bias_sigma += gain.dot(
+            measurement.shift_per_bias_sigma - shift_per_bias_sigma[MEASURED]
         )
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_constant_error=shift_per_constant_error
+        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_bias_sigma=shift_per_bias_sigma
     )
 
 
@@ -353,5 +353,5 @@ def _predict_from_state(
         x=x,
         P=P,
         unseen_frames=unseen_frames,
-        shift_per_constant_error=F @ track.shift_per_constant_error,
+        shift_per_bias_sigma=F @ track.shift_per_bias_sigma,
     )

@@ -1,6 +1,6 @@
 """Convert pixels to rays and back: the only module with a lens model.
 
-Corners are undistorted, never pictures: undistorting the frame first loses markers at its edge and
+Corners are undistorted, never images: undistorting the frame first loses markers at its edge and
 blurs the others.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
-# OpenCV's default stops after five iterations, with errors of up to 0.12 px in the picture's
+# OpenCV's default stops after five iterations, with errors of up to 0.12 px in the image's
 # corners.
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
 _ZERO_VECTOR = np.zeros(3)
@@ -34,26 +34,26 @@ def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
 
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
-    """Convert pixels (n, 2) of the distorted picture to those (n, 2) of an undistorted one, taken
+    """Convert pixels (n, 2) of the distorted image to those (n, 2) of an undistorted one, taken
     by a pinhole camera with the same `K`."""
     return pinhole_px(undistort_to_normalised(points_px, camera), camera)
 
 
-def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
+def pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
     """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole camera with the same
     `K`."""
     K = camera.K
-    result = np.empty_like(normalised)
-    result[:, 0] = K[0, 0] * normalised[:, 0] + K[0, 1] * normalised[:, 1] + K[0, 2]
-    result[:, 1] = K[1, 1] * normalised[:, 1] + K[1, 2]
+    result = np.empty_like(points_normalised)
+    result[:, 0] = K[0, 0] * points_normalised[:, 0] + K[0, 1] * points_normalised[:, 1] + K[0, 2]
+    result[:, 1] = K[1, 1] * points_normalised[:, 1] + K[1, 2]
     return result
 
 
-def distort_to_px(normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the distorted picture; the inverse
+def distort_to_px(points_normalised: Array, camera: CameraModel) -> Array:
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the distorted image; the inverse
     of `undistort_to_normalised`."""
-    rays = np.ones((len(normalised), 1, 3))
-    rays[:, 0, :2] = normalised
+    rays = np.ones((len(points_normalised), 1, 3))
+    rays[:, 0, :2] = points_normalised
     return _project_points(rays, _ZERO_VECTOR, _ZERO_VECTOR, camera)
 
 

@@ -20,8 +20,8 @@ from perchctl.vision.types import (
     Detection,
     Detections,
     MarkerPose,
+    MarkerPoses,
     MarkerTrack,
-    MeasuredMarkers,
     VehicleState,
     VisibleMarkers,
 )
@@ -29,7 +29,7 @@ from perchctl.vision.types import (
 MAX_CONSISTENT_CHI2 = 4.0
 """Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
 _POSITION_AND_YAW = [X, Y, Z, YAW]
-_STAGE_OF = {
+_VISIBLE_MARKERS_BY_POSE_SOURCE = {
     "joint": VisibleMarkers.BOTH,
     "large": VisibleMarkers.LARGE,
     "small": VisibleMarkers.SMALL,
@@ -44,19 +44,19 @@ class MergedTarget:
     Attributes:
         track_frame_xyz_yaw: position and yaw of the target (4,).
         track_frame_velocity_mps: velocity of that position (3,).
-        cov_m2, var_yaw_rad2: covariance (3, 3) of the position, and variance of the yaw, without
-            constant errors.
-        shift_per_constant_error_m: change (3, 4) of the position by one standard deviation of each
-            constant error, one column per error (see `Measurement`).
+        position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance of the yaw,
+            without constant errors.
+        shift_per_bias_sigma_m: change (3, 4) of the position by one standard deviation of each
+            constant error, one column per error (see `TrackMeasurement`).
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
 
     track_frame_xyz_yaw: Array
     track_frame_velocity_mps: Array
-    cov_m2: Array
-    shift_per_constant_error_m: Array
-    var_yaw_rad2: float
+    position_cov_m2: Array
+    shift_per_bias_sigma_m: Array
+    yaw_var_rad2: float
     unseen_frames: int
     stage: VisibleMarkers
 
@@ -68,14 +68,14 @@ def measure_markers(
     previous_target_normal_cam: Array | None,
     config: MergeConfig,
     setup: PoseSetup,
-) -> MeasuredMarkers:
+) -> MarkerPoses:
     """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
     `start_pose` is the last pose of the target, moved by the vehicle's motion since.
     `previous_target_normal_cam` (3,) is the target's unit normal, out of the paper, in the last
     pose, in the camera's axes at that time.
     """
-    seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
+    seen, t_s = correct_rolling_shutter(detections, setup), detections.t_s
     joint = None
     if config.method == "joint" and len(seen) == 2:
         joint = estimate_pose(seen, t_s, attitude, setup, previous_target_normal_cam, start_pose)
@@ -91,17 +91,17 @@ def measure_markers(
                 singles[each.marker] = pose
     poses |= singles
     if joint is not None and enough:
-        return MeasuredMarkers(poses, {"joint": joint})
-    are_markers_contradicting = False
+        return MarkerPoses(poses, {"joint": joint})
+    do_markers_contradict = False
     if not clear and len(singles) == 2:
-        are_markers_contradicting = is_pair_inconsistent(
+        do_markers_contradict = is_pair_inconsistent(
             singles["large"], singles["small"], config.disagreement_m
         )
     poses_by_track, one = dict(singles), joint
     if len(singles) == 2:
         better = choose_better_conditioned(singles["large"], singles["small"])
         one = joint or better
-        if are_markers_contradicting:
+        if do_markers_contradict:
             poses_by_track = {better.source: better}
         elif config.stages == "range":
             # By the distance from the camera to the target's plane (equations 4, 6 and 11).
@@ -112,7 +112,7 @@ def measure_markers(
     if config.method == "joint":
         one = next(iter(poses_by_track.values())) if len(poses_by_track) == 1 else one
         poses_by_track = {} if one is None else {"joint": one}
-    return MeasuredMarkers(poses, poses_by_track, are_markers_contradicting)
+    return MarkerPoses(poses, poses_by_track, do_markers_contradict)
 
 
 def merge_tracks(
@@ -133,11 +133,11 @@ def merge_tracks(
         return MergedTarget(
             track_frame_xyz_yaw=track.x[_POSITION_AND_YAW],
             track_frame_velocity_mps=track.x[VELOCITY],
-            cov_m2=track.P[POSITION, POSITION],
-            shift_per_constant_error_m=track.shift_per_constant_error[POSITION],
-            var_yaw_rad2=float(track.P[YAW, YAW]),
+            position_cov_m2=track.P[POSITION, POSITION],
+            shift_per_bias_sigma_m=track.shift_per_bias_sigma[POSITION],
+            yaw_var_rad2=float(track.P[YAW, YAW]),
             unseen_frames=least,
-            stage=_STAGE_OF[poses_by_track[name].source]
+            stage=_VISIBLE_MARKERS_BY_POSE_SOURCE[poses_by_track[name].source]
             if name in poses_by_track
             else VisibleMarkers.NONE,
         )
@@ -150,16 +150,16 @@ def merge_tracks(
     return MergedTarget(
         track_frame_xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
         track_frame_velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
-        cov_m2=np.diag(variance[:3]),
-        shift_per_constant_error_m=w[:, None] * large.shift_per_constant_error[POSITION]
-        + (1.0 - w[:, None]) * small.shift_per_constant_error[POSITION],
-        var_yaw_rad2=float(variance[3]),
+        position_cov_m2=np.diag(variance[:3]),
+        shift_per_bias_sigma_m=w[:, None] * large.shift_per_bias_sigma[POSITION]
+        + (1.0 - w[:, None]) * small.shift_per_bias_sigma[POSITION],
+        yaw_var_rad2=float(variance[3]),
         unseen_frames=least,
         stage=VisibleMarkers.BOTH if poses_by_track else VisibleMarkers.NONE,
     )
 
 
-def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
+def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Return the target with a covariance that also covers a second possible position: that of a
     rival, a target-like pattern at a place that contradicts the target's track, with the state
     `rival_state` (8,). With the difference d between both, the covariance grows by d d^T."""
@@ -167,8 +167,8 @@ def widen_covariance(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
-        cov_m2=merged.cov_m2 + np.outer(off_m, off_m),
-        var_yaw_rad2=merged.var_yaw_rad2 + off_rad * off_rad,
+        position_cov_m2=merged.position_cov_m2 + np.outer(off_m, off_m),
+        yaw_var_rad2=merged.yaw_var_rad2 + off_rad * off_rad,
     )
 
 
@@ -184,7 +184,7 @@ FLOW_SIGMA_FRACTION, FLOW_ROTATION_SIGMA = 0.05, 0.015
 frame earlier."""
 
 
-def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
+def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the markers with their corners moved to the frame's time.
 
     With `readout_s` None, the corners stay, and `rolling_shutter_error_shift_px` is their possible
@@ -226,7 +226,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 # --- Merge the two markers into one target pose (paper, section II-A.2) ---
 
 
-def detected_stage(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
+def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
     """Return the stage (paper, section II-A.2) of a frame from whether its large and its small
     marker were detected."""
     if is_large_detected:
@@ -260,7 +260,7 @@ def is_pair_inconsistent(
     both markers alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
-        np.maximum(p.sigma_m**2 - (p.print_error_shifts_m**2).sum(axis=1), 0.0)
+        np.maximum(p.sigma_m**2 - (p.shift_per_print_error_sigma_m**2).sum(axis=1), 0.0)
         for p in (large, small)
     ]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])

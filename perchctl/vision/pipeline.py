@@ -1,6 +1,6 @@
 """The vision pipeline: one frame through detection, pose, filter and merge.
 
-`step` is the only path from a picture to a pose, and `estimate` predicts its result to any later
+`step` is the only path from an image to a pose, and `estimate` predicts its result to any later
 time. All memory is in `PipelineState`, which the functions take and return. Small matrices are
 multiplied by `dot` because `@` takes twice as long.
 """
@@ -24,20 +24,20 @@ from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_
 from perchctl.values import replace
 from perchctl.vision.fields import classify_fields, deinterlace_frame
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
-from perchctl.vision.markers.cut import warm_up_cut_marker_fit
+from perchctl.vision.markers.cut import warm_up_truncated_marker_fit
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_detector_setup
 from perchctl.vision.merge import (
     MergedTarget,
-    detected_stage,
+    classify_visible_markers,
     measure_markers,
     merge_tracks,
-    widen_covariance,
+    widen_covariance_for_rival,
 )
 from perchctl.vision.pose import PoseCandidate, PoseSetup, target_normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPosition,
-    gear_to_target_error_shifts_m,
+    gear_to_target_shift_per_bias_sigma_m,
     marker_to_own_target_m,
     target_level_to_world,
     target_world_to_level,
@@ -70,7 +70,7 @@ SEVERAL_TARGETS_TEXT = "more than one target in view: perchctl keeps following t
 
 
 class Detector(Protocol):
-    """A detection function that ``detector.own`` in a profile names. It takes a grey picture
+    """A detection function that ``detector.own`` in a profile names. It takes a grey image
     (height, width) and returns a dict with the detected markers, ``large`` and ``small``. Each
     value is an array of corners (4, 2) px in the order top left, top right, bottom right, bottom
     left on the paper, or a tuple of corners and their standard deviation, px (0.5 by default). (0,
@@ -104,7 +104,7 @@ def make_pipeline(
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera; several streams may share it.
 
-    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's pictures; None
+    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images; None
     reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
     """
     pose_setup = PoseSetup(
@@ -123,7 +123,7 @@ def make_pipeline(
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
     detector_setup = make_detector_setup(profile.detector, profile.target, mask)
     if detector_setup.is_line_fit_enabled:
-        warm_up_cut_marker_fit(detector_setup.patterns, camera)
+        warm_up_truncated_marker_fit(detector_setup.patterns, camera)
     target = profile.target
     # the position where the vehicle searches for it
     own = OwnTargetPosition(profile.planner.approach_xy_m)
@@ -137,7 +137,7 @@ def make_pipeline(
             level_filter=make_filter(profile.kalman, is_world_frame=False),
             world_filter=make_filter(profile.kalman, is_world_frame=True),
             pose_setup=pose_setup,
-            has_gate=profile.kalman.gate,
+            is_gate_enabled=profile.kalman.gate,
             own_target=own,
         ),
         kalman=profile.kalman,
@@ -167,7 +167,7 @@ def deinterlace(
     """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
     two fields in time order if the camera is interlaced. Raises InvalidValue as `step` does."""
     with one_thread():
-        frame = _grey_frame(frame, pipeline.camera)
+        frame = _convert_to_grey(frame, pipeline.camera)
         fields, found = deinterlace_frame(state.field_state, frame)
     return replace(state, field_state=fields), found
 
@@ -181,14 +181,14 @@ def step(
     `attitude` is the vehicle's at the frame's time. Without it, the vehicle is assumed level and at
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
-    frame = classify_fields(_grey_frame(frame, pipeline.camera))
+    frame = classify_fields(_convert_to_grey(frame, pipeline.camera))
     expected_corners_px, start_pose = expected_corners(
         state.last_pose, frame.t_s, attitude, pipeline.pose_setup
     )
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
-        # The first picture is searched by all methods.
+        # The first image is searched by all methods.
         first = (
             state.last_detections is None
             and state.rival is None
@@ -214,7 +214,7 @@ def step(
     )
 
 
-def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
+def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
     """Return the frame in grey. Raises InvalidValue."""
     grey, size_px = to_grey(frame.image), camera.size_px
     if grey is not frame.image:
@@ -256,42 +256,42 @@ def step_detections(
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
     """Run the part of `step` after the detection. `start_pose` is the expected pose of the target,
-    and `picture_kind` tells whether the picture is whole or a field."""
+    and `picture_kind` tells whether the image is whole or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
     )
-    measured = measure_markers(
+    marker_poses = measure_markers(
         detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose_setup
     )
 
     is_in_world_frame = pipeline.kalman.frame == "world" and attitude is not None
     tracked_frame = update_tracks(
-        state, measured, t_s, attitude, is_in_world_frame, pipeline.track_setup
+        state, marker_poses, t_s, attitude, is_in_world_frame, pipeline.track_setup
     )
-    measured, verdict = tracked_frame.measured, tracked_frame.verdict
+    marker_poses, verdict = tracked_frame.marker_poses, tracked_frame.verdict
 
-    stage = detected_stage(detections.large is not None, detections.small is not None)
+    stage = classify_visible_markers(detections.large is not None, detections.small is not None)
     anything = stage is not VisibleMarkers.NONE
     disagreeing = state.frames_with_contradicting_markers
-    if stage is VisibleMarkers.BOTH and verdict.accepted:
-        disagreeing = disagreeing + 1 if measured.are_markers_contradicting else 0
-    most_certain_pose = measured.most_certain_pose
-    sees = most_certain_pose is not None and verdict.accepted
+    if stage is VisibleMarkers.BOTH and verdict.is_accepted:
+        disagreeing = disagreeing + 1 if marker_poses.do_markers_contradict else 0
+    most_certain_pose = marker_poses.most_certain_pose
+    sees = most_certain_pose is not None and verdict.is_accepted
     if most_certain_pose is not None and sees:
         last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose_setup)
     target = _estimate_at_frame(
         tracked_frame, state.target, t_s, attitude, is_in_world_frame, pipeline
     )
     last = state.last_detections
-    if anything and verdict.accepted:
+    if anything and verdict.is_accepted:
         last = detections
     elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
         last = None
     new = PipelineState(
         tracks=tracked_frame.tracks,
         are_tracks_in_world_frame=is_in_world_frame,
-        measured=measured,
+        marker_poses=marker_poses,
         target=target or state.target,
         last_detections=last,
         last_pose=last_pose if sees or tracked_frame.tracks else None,
@@ -303,11 +303,11 @@ def step_detections(
     )
     output = PipelineOutput(
         detections=detections,
-        poses=measured.poses,
+        poses=marker_poses.poses,
         target=target,
         stage=stage,
         frames_with_contradicting_markers=disagreeing,
-        lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
+        lock_note=verdict.reason or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
         picture_kind=picture_kind,
         is_foreign_target=verdict.is_foreign_target,
     )
@@ -332,10 +332,10 @@ def estimate(
     if state.tracks and state.are_tracks_in_world_frame:
         world = pipeline.track_setup.world_filter
         tracks = {n: predict_track(t, t_s, world) for n, t in state.tracks.items()}
-        merged = merge_tracks(tracks, state.measured.poses_by_track, pipeline.merge.weights)
+        merged = merge_tracks(tracks, state.marker_poses.poses_by_track, pipeline.merge.weights)
         assert merged is not None
         rival = predict_rival_state(state.lock, state.rival, True, t_s, world)
-        merged = merged if rival is None else widen_covariance(merged, rival)
+        merged = merged if rival is None else widen_covariance_for_rival(merged, rival)
         frames = _express_in_level_and_world(merged, attitude, True, pipeline)
         return replace(target, t_s=t_s, **frames)
     if not state.tracks:
@@ -367,7 +367,7 @@ def _estimate_at_frame(
     is_in_world_frame: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    poses_by_track, tracks = tracked_frame.measured.poses_by_track, tracked_frame.tracks
+    poses_by_track, tracks = tracked_frame.marker_poses.poses_by_track, tracked_frame.tracks
     merged = merge_tracks(tracks, poses_by_track, pipeline.merge.weights)
     if merged is None:
         return None
@@ -375,7 +375,7 @@ def _estimate_at_frame(
     rival = predict_rival_state(
         tracked_frame.lock, tracked_frame.rival, is_in_world_frame, t_s, filter_setup
     )
-    merged = merged if rival is None else widen_covariance(merged, rival)
+    merged = merged if rival is None else widen_covariance_for_rival(merged, rival)
     measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_track)
     small = measured and merged.stage in (VisibleMarkers.BOTH, VisibleMarkers.SMALL)
     never = -np.inf
@@ -416,7 +416,7 @@ def _express_in_level_and_world(
     pipeline: Pipeline,
 ) -> dict[str, Any]:
     place_m, yaw_rad = merged.track_frame_xyz_yaw[:3], float(merged.track_frame_xyz_yaw[3])
-    cov_m2, error_shifts_m = merged.cov_m2, merged.shift_per_constant_error_m
+    position_cov_m2, error_shifts_m = merged.position_cov_m2, merged.shift_per_bias_sigma_m
     seen: dict[str, Any] = {"velocity_mps": merged.track_frame_velocity_mps}
     if attitude is not None and is_in_world_frame:
         turn = attitude.R_world_level.T
@@ -426,8 +426,8 @@ def _express_in_level_and_world(
         )
         seen["velocity_mps"] = turn.dot(merged.track_frame_velocity_mps)
         seen["world_velocity_mps"] = merged.track_frame_velocity_mps
-        cov_m2 = turn.dot(cov_m2).dot(turn.T)
-        error_shifts_m = gear_to_target_error_shifts_m(
+        position_cov_m2 = turn.dot(position_cov_m2).dot(turn.T)
+        error_shifts_m = gear_to_target_shift_per_bias_sigma_m(
             error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose_setup
         )
     else:
@@ -435,7 +435,7 @@ def _express_in_level_and_world(
         if attitude is not None:
             world = target_level_to_world(place_m, yaw_rad, attitude, pipeline.pose_setup)
             seen["world_m"], seen["world_yaw_rad"] = world
-    variance = cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)
+    variance = position_cov_m2.diagonal() + (error_shifts_m * error_shifts_m).sum(axis=1)
     seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-    seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
+    seen["sigma_yaw_rad"] = math.sqrt(max(merged.yaw_var_rad2, 0.0))
     return seen

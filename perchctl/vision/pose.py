@@ -1,6 +1,6 @@
 """Compute the target's pose relative to the gear from its corners.
 
-A planar marker has two tilts with nearly identical pictures. The vehicle's roll and pitch decide
+A planar marker has two tilts with nearly identical images. The vehicle's roll and pitch decide
 between them (the target is horizontal), or otherwise the tilt in the previous frame. The position
 is also rotated to the level frame by the vehicle's roll and pitch, never by the marker's own axes:
 at 1.15 m, the error is 0.5 mm instead of 40 mm.
@@ -26,13 +26,13 @@ _ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)  # mounting, estimate and ceiling c
 _PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
 _MIN_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
 _MAX_CHI2_FRACTION_WITH_CURL = 0.5  # share that may remain if the curl of the sheet is the cause
-_Source = Literal["large", "small", "joint"]
+_PoseSource = Literal["large", "small", "joint"]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
     """The constants of pose estimation: `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
-    (3,) the tip of the gear, and `readout_s` the time from a picture's first row to its last (None
+    (3,) the tip of the gear, and `readout_s` the time from an image's first row to its last (None
     if unknown)."""
 
     config: PoseConfig
@@ -43,16 +43,16 @@ class PoseSetup:
     readout_s: float | None = 0.0
 
     @cached_property
-    def corners_m(self) -> dict[_Source, Array]:
+    def corners_m(self) -> dict[_PoseSource, Array]:
         """Corners (4, 3) of each marker in its own axes, m; ``joint`` (8, 3): large, then small."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def curl_lift_m(self) -> dict[_Source, Array]:
+    def curl_lift_m(self) -> dict[_PoseSource, Array]:
         """Distance of each corner from the flat sheet, m, for one standard deviation of the sheet's
         curl: (8, 2), or (16, 2) for ``joint``. The columns are the modes of `curl_lift`; each
-        corner has two equal rows, for its x and y in the picture."""
+        corner has two equal rows, for its x and y in the image."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
@@ -85,12 +85,12 @@ def estimate_pose(
     pose: no finite solution in front of the camera, or a reprojection error (RMS over the corners)
     above `pose.max_reprojection_px`.
     """
-    source: _Source = "joint" if len(detections) > 1 else detections[0].marker
-    image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
-    if not is_finite(image_px):
+    source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
+    image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
+    if not is_finite(image_points_px):
         return None  # the lens model cannot image these corners
     K, lift = setup.camera.K, setup.curl_lift_m[source]
-    points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
+    points = weigh_corners(detections, setup.corners_m[source], image_points_px, K, lift)
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
@@ -132,7 +132,7 @@ def _refine_from_start(
 
 
 def _make_marker_pose(
-    source: _Source,
+    source: _PoseSource,
     t_s: float,
     solution: ScoredPose,
     points: WeightedCorners,
@@ -166,7 +166,7 @@ def _make_marker_pose(
         rms_reprojection_px=solution.rms_px,
         chi2=chi2,
         xyz_yaw_cov=cov_e,
-        print_error_shifts_m=print_shift_m,
+        shift_per_print_error_sigma_m=print_shift_m,
         rvec_tvec_cov=cov,
     )
 
@@ -210,11 +210,11 @@ def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR: Array) -> Array
 # --- Rotation and translation from corners: a closed form, then weighted least squares ---
 
 
-_MIN_FLIP_RAD = math.radians(2.0)  # solutions closer than this are the same
+_MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # solutions closer than this are the same
 _MIN_SCORE_SIGMA_PX = 0.05  # lens and print limit the information in smaller residuals
-_MAX_STEPS = 8
+_MAX_GAUSS_NEWTON_STEPS = 8
 # weight of the claimed spread against the residuals, in degrees of freedom
-_CLAIMED_SIGMA_DOF = 8.0
+_CORNER_SIGMA_PRIOR_DOF = 8.0
 
 _MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # rad and m
 # The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
@@ -234,14 +234,14 @@ class ScoredPose(PoseCandidate):
     """A candidate, its reprojection errors (n, 2), and their Jacobian (2n, 6) with respect to rvec
     and tvec."""
 
-    error_px: Array
+    reprojection_error_px: Array
     jacobian: Array
 
     @property
     def rms_px(self) -> float:
         """Root mean square distance of projected from measured corners, px."""
-        flat = self.error_px.ravel()
-        return math.sqrt(float(flat.dot(flat)) / len(self.error_px))
+        flat = self.reprojection_error_px.ravel()
+        return math.sqrt(float(flat.dot(flat)) / len(self.reprojection_error_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +281,9 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_GAUSS_NEWTON_STEPS):
         scored = _score(candidate, points)
-        A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
+        A, error = W.dot(scored.jacobian), W.dot(scored.reprojection_error_px.ravel())
         B, weighed = A, error
         if points.allows_for_curl:
             weight = curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
@@ -303,9 +303,9 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
         if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
             # Errors are linear in a step of this size.
-            error_px = scored.error_px - moved_px
+            reprojection_error_px = scored.reprojection_error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
-            return ScoredPose(rvec, tvec, error_px, scored.jacobian)
+            return ScoredPose(rvec, tvec, reprojection_error_px, scored.jacobian)
         if gain < 1e-4 + 1e-6 * cost:
             return scored
         candidate, before = (
@@ -333,7 +333,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     common to all corners, and a twist of the sheet, but not its curl.
     """
     W = points.whitening
-    A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
+    A, error = W.dot(scored.jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
     curl = _whitened_paper_curl_shift(points, scored)
     weight = curl_weight_matrix(curl) if points.allows_for_curl else None
@@ -343,7 +343,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
         return PoseCovariance(np.full((6, 6), np.inf), math.inf, np.zeros(6))
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
-    growth = max((_CLAIMED_SIGMA_DOF + chi2) / (_CLAIMED_SIGMA_DOF + freedom), 0.7)
+    growth = max((_CORNER_SIGMA_PRIOR_DOF + chi2) / (_CORNER_SIGMA_PRIOR_DOF + freedom), 0.7)
     common = gain.dot(points.whitened_corner_shift_per_error)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
@@ -373,7 +373,7 @@ def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
     """Return the candidates of OpenCV's SQPNP; none for collinear corners."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
+            points.object_points_m, points.image_points_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
         )
     except cv2.error:
         return []
@@ -390,7 +390,9 @@ def _is_valid(candidate: PoseCandidate) -> bool:
 def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
-        rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
+        rvec, tvec = cv2.solvePnPRefineLM(
+            points.object_points_m, points.image_points_px, points.K, None, *first
+        )
     except cv2.error:
         return start
     return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
@@ -398,8 +400,8 @@ def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
 
 def _score(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
     rvec, tvec = candidate.rvec, candidate.tvec
-    projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
-    error: Array = projected.reshape(-1, 2) - points.image_px
+    projected, jacobian = cv2.projectPoints(points.object_points_m, rvec, tvec, points.K, None)
+    error: Array = projected.reshape(-1, 2) - points.image_points_px
     return ScoredPose(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
 
 
@@ -412,7 +414,7 @@ def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> lis
     axis = np.cross(normal, other)
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
     angle = math.atan2(sine, cosine)
-    if angle < _MIN_FLIP_RAD or sine < 1e-9:
+    if angle < _MIN_FLIP_ANGLE_RAD or sine < 1e-9:
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refine(points, PoseCandidate(rvec, scored.tvec))
@@ -427,7 +429,7 @@ def _choose_likeliest(
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
 
     def cost(s: ScoredPose) -> float:
-        total = float(((s.error_px / sigma) ** 2).sum())
+        total = float(((s.reprojection_error_px / sigma) ** 2).sum())
         if prior.target_normal_cam is not None:
             total += (
                 angle_to_expected_normal_rad(s.rvec, prior.target_normal_cam) / prior.sigma_rad
@@ -440,12 +442,12 @@ def _choose_likeliest(
 # --- A sheet that is not flat: effect of its curl on corners, and their weights ---
 
 
-def curl_lift(object_m: Array, paper_curvature_per_m: float) -> Array:
+def curl_lift(object_points_m: Array, paper_curvature_per_m: float) -> Array:
     """Return the distances of corners (n, 3) from the flat sheet for one standard deviation of each
     mode of curl: a bowl, with all corners to one side, and a saddle, with neighbouring corners to
     opposite sides. `paper_curvature_per_m` is the lift per squared distance from the centre. Shape
     (2n, 2), m, with each corner's row twice, for its x and y."""
-    x, y = object_m[:, 0], object_m[:, 1]
+    x, y = object_points_m[:, 0], object_points_m[:, 1]
     lift: Array = paper_curvature_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
@@ -468,14 +470,20 @@ def curl_weight_matrix(whitened_curl: Array) -> Array:
 
 _IDENTITY_8 = np.eye(8)
 _TILT_WHITENING_FACTOR = np.array(1.0 / math.sqrt(3.0))
-_PREVIOUS_CORNER = np.array([3, 0, 1, 2])
-_SIDE_START = np.arange(4)  # side k runs from corner k ...
-_SIDE_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
+_PREVIOUS_CORNER_INDICES = np.array([3, 0, 1, 2])
+_SIDE_START_CORNER_INDICES = np.arange(4)  # side k runs from corner k ...
+_SIDE_END_CORNER_INDICES = np.array([1, 2, 3, 0])  # ... to corner k + 1
 _SIDE_WHITENING_ROWS = np.concatenate(
-    [2 * np.tile(_SIDE_START, 4), 2 * np.tile(_SIDE_START, 4) + 1]
+    [2 * np.tile(_SIDE_START_CORNER_INDICES, 4), 2 * np.tile(_SIDE_START_CORNER_INDICES, 4) + 1]
 )
 _SIDE_WHITENING_COLUMNS = np.concatenate(
-    [2 * _SIDE_START, 2 * _SIDE_START + 1, 2 * _SIDE_END, 2 * _SIDE_END + 1] * 2
+    [
+        2 * _SIDE_START_CORNER_INDICES,
+        2 * _SIDE_START_CORNER_INDICES + 1,
+        2 * _SIDE_END_CORNER_INDICES,
+        2 * _SIDE_END_CORNER_INDICES + 1,
+    ]
+    * 2
 )
 # indices into a flattened (8, 8) matrix
 _SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMNS
@@ -486,8 +494,8 @@ class WeightedCorners:
     """Corners with the weights of their errors.
 
     Attributes:
-        object_m, image_px: corners (n, 3) on the target, and (n, 2) in the picture of a pinhole
-            camera `K` (3, 3).
+        object_points_m, image_points_px: corners (n, 3) on the target, and (n, 2) in the image of a
+            pinhole camera `K` (3, 3).
         sigma_px: standard deviations (n,).
         whitening: matrix (2n, 2n) that makes the errors independent, with unit variance.
         whitened_corner_shift_per_error: whitened shift of the corners by one standard deviation of
@@ -499,8 +507,8 @@ class WeightedCorners:
             weight; False: it is taken for flat.
     """
 
-    object_m: Array
-    image_px: Array
+    object_points_m: Array
+    image_points_px: Array
     sigma_px: Array
     whitening: Array
     whitened_corner_shift_per_error: Array
@@ -511,19 +519,19 @@ class WeightedCorners:
 
 def weigh_corners(
     detections: Sequence[Detection],
-    object_m: Array,
-    image_px: Array,
+    object_points_m: Array,
+    image_points_px: Array,
     K: Array,
     curl_lift_m: Array,
 ) -> WeightedCorners:
-    """Weigh the detections' corners. `image_px` are the corners in a pinhole camera K, and
+    """Weigh the detections' corners. `image_points_px` are the corners in a pinhole camera K, and
     `curl_lift_m` is the result of `curl_lift`."""
-    n, m = len(image_px), len(detections)
+    n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
-    corners_px = image_px.reshape(m, 4, 2)
+    corners_px = image_points_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
     # A shift of all edges by one pixel moves a corner along the normals of both of its sides.
-    moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
+    moved = (normals + normals.take(_PREVIOUS_CORNER_INDICES, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
         error_shifts[rows, 0] = d.remaining_edge_shift_sigma_px * moved[i]
@@ -539,7 +547,7 @@ def weigh_corners(
                 else _side_sigma_px(d, corners)
             )
             own = np.zeros(64)
-            own[_SIDE_WHITENING_FLAT_INDICES] = _whitening_of_lines(normals[i], spread_px)
+            own[_SIDE_WHITENING_FLAT_INDICES] = _line_whitening_elements(normals[i], spread_px)
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
@@ -553,12 +561,14 @@ def weigh_corners(
             error_shifts[along_x, 2 + 2 * i] = 0.5 * d.row_jitter_sigma_px
             error_shifts[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
-    return WeightedCorners(object_m, image_px, sigma_px, W, W.dot(error_shifts), K, curl_lift_m)
+    return WeightedCorners(
+        object_points_m, image_points_px, sigma_px, W, W.dot(error_shifts), K, curl_lift_m
+    )
 
 
 def _outward_normals(corners: Array) -> Array:
     """Return the outward unit normals (m, 4, 2) of the sides of m squares."""
-    side = corners.take(_SIDE_END, axis=1) - corners
+    side = corners.take(_SIDE_END_CORNER_INDICES, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
     length = np.copysign(length, (x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])[:, None])
@@ -570,8 +580,8 @@ def _outward_normals(corners: Array) -> Array:
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
     """Return the standard deviation, px, of each side's position across it, (4,): larger for a side
-    along the picture's rows, because a field has only every second row."""
-    sides = corners.take(_SIDE_END, axis=0) - corners
+    along the image's rows, because a field has only every second row."""
+    sides = corners.take(_SIDE_END_CORNER_INDICES, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])
     return np.asarray(
@@ -582,7 +592,7 @@ def _side_sigma_px(detection: Detection, corners: Array) -> Array:
     )
 
 
-def _whitening_of_lines(normals: Array, sigma_px: float | Array) -> Array:
+def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
     """Return the elements, at `_SIDE_WHITENING_FLAT_INDICES`, of the matrix that whitens corners
     which are intersections of four fitted lines. Each line has independent errors of offset and
     tilt.

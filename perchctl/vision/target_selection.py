@@ -14,11 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
-from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, vector_by_tilt_jacobian
+from perchctl.vision.filter import (
+    PRINT,
+    TILTS,
+    FilterSetup,
+    TrackMeasurement,
+    vector_by_tilt_jacobian,
+)
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Detection, MarkerName, MarkerPose, VehicleState
 
-_SEARCHED_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
+_RAW_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,7 @@ def marker_to_own_target_m(
 ) -> float:
     """Return `horizontal_distance_to_own_target_m` for a marker's corners (4, 2) px; infinite
     beyond `own_target.max_distance_m`."""
-    seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, is_fitted=False)
+    seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, is_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
         _NO_POSE_DISTANCE_M
@@ -123,13 +129,13 @@ def target_world_to_level(
     return body_to_target_m - gear_level, wrap_rad(target_yaw_world_rad - attitude.yaw_rad)
 
 
-def track_measurement(
+def make_track_measurement(
     pose: MarkerPose,
     attitude: VehicleState | None,
     is_in_world_frame: bool,
     filter_setup: FilterSetup,
     setup: PoseSetup,
-) -> Measurement:
+) -> TrackMeasurement:
     """Return a pose as a measurement for the filter, in the world or the level frame."""
     z, lever_m = np.empty(4), pose.e_m  # an error of the tilt turns the lever
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
@@ -139,38 +145,38 @@ def track_measurement(
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
         z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
     if filter_setup.acceleration_noise is None or pose.xyz_yaw_cov is None:
-        return Measurement(z)
+        return TrackMeasurement(z)
     noise = pose.xyz_yaw_cov.copy()
-    noise[:3, :3] -= pose.print_error_shifts_m.dot(pose.print_error_shifts_m.T)
-    shift_per_constant_error = np.zeros((4, 4))
-    shift_per_constant_error[1:, PRINT] = pose.print_error_shifts_m
+    noise[:3, :3] -= pose.shift_per_print_error_sigma_m.dot(pose.shift_per_print_error_sigma_m.T)
+    shift_per_bias_sigma = np.zeros((4, 4))
+    shift_per_bias_sigma[1:, PRINT] = pose.shift_per_print_error_sigma_m
     if attitude is not None:
-        shift_per_constant_error[1:, TILTS] = (
-            vector_by_tilt_jacobian(lever_m) * filter_setup.tilt_sigma_rad
+        shift_per_bias_sigma[1:, TILTS] = (
+            vector_by_tilt_jacobian(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
         )
     if is_in_world_frame and attitude is not None:
         turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
-        shift_per_constant_error[1:] = attitude.R_world_level.dot(shift_per_constant_error[1:])
+        shift_per_bias_sigma[1:] = attitude.R_world_level.dot(shift_per_bias_sigma[1:])
     R = (
         np.asarray(noise[_YAW_FIRST_INDICES] + _MIN_MEASUREMENT_COVARIANCE)
         if is_finite(noise)
         else None
     )
-    return Measurement(z, R, shift_per_constant_error)
+    return TrackMeasurement(z, R, shift_per_bias_sigma)
 
 
-def gear_to_target_error_shifts_m(
-    target_error_shifts_m: Array,
+def gear_to_target_shift_per_bias_sigma_m(
+    target_shift_per_bias_sigma_m: Array,
     attitude: VehicleState,
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> Array:
     """Return the change (3, 4) of the vector from gear to target, in level axes, by one standard
-    deviation of each constant error: `target_error_shifts_m` (3, 4) of the target in the world,
-    minus the effect of roll and pitch errors on the gear."""
+    deviation of each constant error: `target_shift_per_bias_sigma_m` (3, 4) of the target in the
+    world, minus the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
-    moved = attitude.R_world_level.T.dot(target_error_shifts_m)
-    moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.tilt_sigma_rad
+    moved = attitude.R_world_level.T.dot(target_shift_per_bias_sigma_m)
+    moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
     return np.asarray(moved)

@@ -15,21 +15,21 @@ from perchctl.vision.filter import (
     MEASURED,
     POSITION,
     FilterSetup,
-    Measurement,
+    TrackMeasurement,
     predict_track,
     start_track,
     step_track,
 )
 from perchctl.vision.lens import project
-from perchctl.vision.markers.cut import make_lattice
+from perchctl.vision.markers.cut import make_coarse_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import OwnTargetPosition, refusal_text, track_measurement
+from perchctl.vision.target_selection import OwnTargetPosition, make_track_measurement, refusal_text
 from perchctl.vision.types import (
     LastPose,
     MarkerName,
     MarkerPose,
+    MarkerPoses,
     MarkerTrack,
-    MeasuredMarkers,
     MotionErrors,
     PipelineState,
     RivalTrack,
@@ -41,13 +41,13 @@ from perchctl.vision.types import (
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
     """Constants of the filters in the level and the world frame and of the pose estimation; whether
-    poses that do not fit the tracked target are rejected (`has_gate`); and the position of the
-    vehicle's own target."""
+    poses that do not fit the tracked target are rejected (`is_gate_enabled`); and the position of
+    the vehicle's own target."""
 
     level_filter: FilterSetup
     world_filter: FilterSetup
     pose_setup: PoseSetup
-    has_gate: bool
+    is_gate_enabled: bool
     own_target: OwnTargetPosition
 
     def select_filter(self, is_in_world_frame: bool) -> FilterSetup:
@@ -61,10 +61,10 @@ class TrackedFrame:
     pattern (`rival`), None if there is none; and whether the pose was accepted as the target's
     (`verdict`, the decision of the gate).
 
-    `measured.poses_by_track` is empty if the gate rejects the frame's pose.
+    `marker_poses.poses_by_track` is empty if the gate rejects the frame's pose.
     """
 
-    measured: MeasuredMarkers
+    marker_poses: MarkerPoses
     tracks: dict[str, MarkerTrack]
     verdict: GateVerdict
     lock: TargetLock | None = None
@@ -73,7 +73,7 @@ class TrackedFrame:
 
 def update_tracks(
     state: PipelineState,
-    measured: MeasuredMarkers,
+    marker_poses: MarkerPoses,
     t_s: float,
     attitude: VehicleState | None,
     is_in_world_frame: bool,
@@ -82,16 +82,18 @@ def update_tracks(
     """Return the tracks after a frame, updated with the poses that the gate accepts."""
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
-        name: track_measurement(pose, attitude, is_in_world_frame, filter_setup, setup.pose_setup)
-        for name, pose in measured.poses_by_track.items()
+        name: make_track_measurement(
+            pose, attitude, is_in_world_frame, filter_setup, setup.pose_setup
+        )
+        for name, pose in marker_poses.poses_by_track.items()
     }
     old = state.tracks if state.are_tracks_in_world_frame == is_in_world_frame else {}
-    frame_pose, verdict = None, GateVerdict(accepted=True, rival=state.rival)
-    pose = measured.most_certain_pose
+    frame_pose, verdict = None, GateVerdict(is_accepted=True, rival=state.rival)
+    pose = marker_poses.most_certain_pose
     if measurements and pose is not None:
-        name = next(n for n, each in measured.poses_by_track.items() if each is pose)
+        name = next(n for n, each in marker_poses.poses_by_track.items() if each is pose)
         whole = pose.source == "joint" or (
-            len(measured.poses) > 1 and not measured.are_markers_contradicting
+            len(marker_poses.poses) > 1 and not marker_poses.do_markers_contradict
         )
         frame_pose = FramePose(
             t_s,
@@ -105,42 +107,42 @@ def update_tracks(
             place_m = state.lock.track.x[POSITION]
             looks = not is_in_world_frame or is_in_view(place_m, attitude, setup.pose_setup)
             frame_pose = replace(frame_pose, is_locked_target_in_view=looks)
-        if setup.has_gate:
+        if setup.is_gate_enabled:
             verdict = judge_pose(state.lock, state.rival, frame_pose, filter_setup)
         # A locked target stays locked, however far the estimate's world frame has drifted
         # meanwhile.
-        goes_on = not verdict.restarts_track or verdict.restarts_for_locked_target
-        goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
+        goes_on = not verdict.restarts_track or verdict.restarts_at_locked_target
+        goes_on = goes_on and drop_expired_lock_and_rival(state.lock, None, t_s)[0] is not None
         another = (
             None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose_setup)
         )
-        if another is not None and verdict.accepted:
-            verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
-    if not verdict.accepted:
-        measured, measurements = replace(measured, poses_by_track={}), {}
+        if another is not None and verdict.is_accepted:
+            verdict = GateVerdict(False, rival=state.rival, reason=another, is_foreign_target=True)
+    if not verdict.is_accepted:
+        marker_poses, measurements = replace(marker_poses, poses_by_track={}), {}
     begun = {} if verdict.restarts_track else old
     stepped = {
         n: step_track(begun.get(n), measurements.get(n), t_s, filter_setup)
         for n in {**begun, **measurements}
     }
     tracks = {n: track for n, track in stepped.items() if track is not None}
-    if not setup.has_gate:
-        return TrackedFrame(measured, tracks, verdict)
-    lock, rival = drop_expired(state.lock, verdict.rival, t_s)
-    if frame_pose is not None and verdict.accepted and tracks:
+    if not setup.is_gate_enabled:
+        return TrackedFrame(marker_poses, tracks, verdict)
+    lock, rival = drop_expired_lock_and_rival(state.lock, verdict.rival, t_s)
+    if frame_pose is not None and verdict.is_accepted and tracks:
         most_certain = min(tracks.values(), key=lambda t: (t.unseen_frames, float(np.trace(t.P))))
         lock = update_lock(lock, most_certain, frame_pose, verdict)
-    return TrackedFrame(measured, tracks, verdict, lock, rival)
+    return TrackedFrame(marker_poses, tracks, verdict, lock, rival)
 
 
 # --- Gate: does a pose belong to the locked target? ---
-# A picture cannot distinguish another target, or a marker of another size, from the target, but the
+# An image cannot distinguish another target, or a marker of another size, from the target, but the
 # target does not jump. A pose that contradicts the lock by more than noise, motion and drift
 # explain belongs to a rival and updates no filter.
 #
 # The lock changes to a rival seen with both markers: at once if the lock never was; otherwise, if
 # both are equally far away, after `REACQUIRE_S` in which the target was not seen although its
-# position is in the picture. It changes to any rival that was seen more often than a lock of only a
+# position is in the image. It changes to any rival that was seen more often than a lock of only a
 # few frames.
 #
 # A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
@@ -157,7 +159,7 @@ def update_tracks(
 #
 # While something is seen at the lock's position, the search continues there and ignores a complete
 # target elsewhere. If the state estimate jumps, the target seems to jump in the world, but not in
-# the picture.
+# the image.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
@@ -168,7 +170,7 @@ MIN_RIVAL_ONLY_S = 0.3
 has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
 LOCK_TIMEOUT_S = 10.0
 """Time after which a lock in the world frame expires, s."""
-ESTABLISHED_FRAMES = 5
+MIN_ESTABLISHED_TRACK_FRAMES = 5
 """Number of frames below which a lock yields to a rival that was seen more often."""
 
 _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, the target did not"
@@ -184,20 +186,20 @@ _POSITION_AXES: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _MIN_ROTATION_TO_REPORT_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-# largest share of the squared misfit that the better of two explanations may leave
-_MAX_MISFIT_RATIO_TO_ALTERNATIVE = 0.25
+# largest share of the squared innovation that the better of two explanations may leave
+_MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
     """A frame's pose and its measurement for the filter, with whether both markers contributed and
-    whether the position of the target that is followed is in the picture
+    whether the position of the target that is followed is in the image
     (`is_locked_target_in_view`). `is_attitude_unknown` is True if the camera is used alone, without
     a vehicle."""
 
     t_s: float
     pose: MarkerPose
-    measured: Measurement
+    measurement: TrackMeasurement
     is_in_world_frame: bool
     has_both_markers: bool
     is_locked_target_in_view: bool = True
@@ -208,16 +210,16 @@ class FramePose:
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
     restart at the pose, and whether they restart for the target followed so far
-    (`restarts_for_locked_target`) instead of for the rival.
+    (`restarts_at_locked_target`) instead of for the rival.
 
-    `rival` is the rival track after this frame; `text` explains a rejection or a restart.
+    `rival` is the rival track after this frame; `reason` explains a rejection or a restart.
     """
 
-    accepted: bool
+    is_accepted: bool
     restarts_track: bool = False
-    restarts_for_locked_target: bool = False
+    restarts_at_locked_target: bool = False
     rival: RivalTrack | None = None
-    text: str = ""
+    reason: str = ""
     is_foreign_target: bool = False  # another vehicle's target, by its position
 
 
@@ -230,48 +232,52 @@ def judge_pose(
     """Decide whether a frame's pose belongs to the target that is followed (`lock`), to a competing
     target-like pattern (`rival`), or to neither, which begins a new rival; lock and rival are None
     if there is none. A pose without a lock is accepted."""
-    lock, rival = drop_expired(lock, rival, frame_pose.t_s)
+    lock, rival = drop_expired_lock_and_rival(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
     if lock is None or lock.is_in_world_frame != frame_pose.is_in_world_frame:
-        return GateVerdict(accepted=True)
+        return GateVerdict(is_accepted=True)
     if frame_pose.t_s <= lock.track.t_s:  # the tracks are newer
-        return GateVerdict(accepted=False, rival=rival)
+        return GateVerdict(is_accepted=False, rival=rival)
     if rival is None and _is_clearly_consistent(lock.track, frame_pose, filter_setup):
-        return GateVerdict(accepted=True)
-    misfit = _compute_misfit(lock.track, frame_pose, filter_setup)
-    rival_misfit = None if rival is None else _compute_misfit(rival.track, frame_pose, filter_setup)
+        return GateVerdict(is_accepted=True)
+    innovation = _compute_innovation(lock.track, frame_pose, filter_setup)
+    rival_misfit = (
+        None if rival is None else _compute_innovation(rival.track, frame_pose, filter_setup)
+    )
     theirs = rival_misfit is not None and rival_misfit.squared_mahalanobis <= _MAX_GATE_CHI2
-    if misfit.squared_mahalanobis <= _MAX_GATE_CHI2 and not (
+    if innovation.squared_mahalanobis <= _MAX_GATE_CHI2 and not (
         theirs
         and rival_misfit is not None
-        and rival_misfit.log_likelihood_cost < misfit.log_likelihood_cost
+        and rival_misfit.log_likelihood_cost < innovation.log_likelihood_cost
     ):
-        return GateVerdict(accepted=True, rival=rival)
-    if not theirs and _matches_last_view(lock, frame_pose, misfit.measured_minus_predicted_yaw_xyz):
+        return GateVerdict(is_accepted=True, rival=rival)
+    if not theirs and _matches_last_view(lock, frame_pose, innovation.yaw_xyz):
         return GateVerdict(
-            accepted=True,
+            is_accepted=True,
             restarts_track=True,
-            restarts_for_locked_target=True,
-            text=_ESTIMATE_JUMPED_TEXT,
+            restarts_at_locked_target=True,
+            reason=_ESTIMATE_JUMPED_TEXT,
         )
-    if not theirs and _matches_previous_track(
-        lock, frame_pose, misfit.measured_minus_predicted_yaw_xyz, filter_setup
-    ):
+    if not theirs and _matches_previous_track(lock, frame_pose, innovation.yaw_xyz, filter_setup):
         return GateVerdict(
-            accepted=True,
+            is_accepted=True,
             restarts_track=True,
-            restarts_for_locked_target=True,
-            text=_PREVIOUS_POSE_WRONG_TEXT,
+            restarts_at_locked_target=True,
+            reason=_PREVIOUS_POSE_WRONG_TEXT,
         )
-    seen = _update_rival(rival if theirs else None, frame_pose, misfit, filter_setup)
+    seen = _update_rival(rival if theirs else None, frame_pose, innovation, filter_setup)
     if _is_rival_accepted(lock, seen, frame_pose):
-        text = f"target reacquired {misfit.distance_m:.2f} m from its expected position"
-        return GateVerdict(accepted=True, restarts_track=True, text=text)
-    return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
+        text = f"target reacquired {innovation.distance_m:.2f} m from its expected position"
+        return GateVerdict(is_accepted=True, restarts_track=True, reason=text)
+    return GateVerdict(
+        is_accepted=False,
+        rival=seen,
+        reason=f"not the tracked target: {seen.relative_position_text}",
+    )
 
 
-def drop_expired(
+def drop_expired_lock_and_rival(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
     """Return lock and rival, each replaced by None if it has not been seen for too long at `t_s`: a
@@ -318,7 +324,7 @@ def update_lock(
 ) -> TargetLock:
     """Return the lock after the gate accepted `frame_pose`. `track` is the track that this pose
     updated."""
-    anew = verdict.restarts_track and not verdict.restarts_for_locked_target
+    anew = verdict.restarts_track and not verdict.restarts_at_locked_target
     before = (
         None
         if lock is None or anew or lock.is_in_world_frame != frame_pose.is_in_world_frame
@@ -339,19 +345,16 @@ def update_lock(
 
 
 @dataclass(frozen=True, eq=False)
-class _Misfit:
+class _Innovation:
     """A pose as measured minus its prediction in the track's frame, (yaw, x, y, z), rad and m,
     (4,), and the covariance `S` (4, 4) of that difference."""
 
-    measured_minus_predicted_yaw_xyz: Array
+    yaw_xyz: Array
     S: Array
 
     @cached_property
     def squared_mahalanobis(self) -> float:
-        return float(
-            self.measured_minus_predicted_yaw_xyz
-            @ np.linalg.solve(self.S, self.measured_minus_predicted_yaw_xyz)
-        )
+        return float(self.yaw_xyz @ np.linalg.solve(self.S, self.yaw_xyz))
 
     @property
     def log_likelihood_cost(self) -> float:
@@ -361,42 +364,42 @@ class _Misfit:
 
     @property
     def distance_m(self) -> float:
-        return float(np.linalg.norm(self.measured_minus_predicted_yaw_xyz[1:]))
+        return float(np.linalg.norm(self.yaw_xyz[1:]))
 
 
-def _compute_misfit(
+def _compute_innovation(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
-) -> _Misfit:
-    wanted, measured = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measured
+) -> _Innovation:
+    wanted, measurement = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measurement
     # The largest drift counts as three standard deviations.
     drift_m = (
         min(filter_setup.max_target_speed_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
     )
-    residual = measured.z - wanted.x[MEASURED]
+    residual = measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     # A constant error shifts both.
     error_shifts = (
-        wanted.shift_per_constant_error[MEASURED]
-        if measured.shift_per_constant_error is None
-        else measured.shift_per_constant_error - wanted.shift_per_constant_error[MEASURED]
+        wanted.shift_per_bias_sigma[MEASURED]
+        if measurement.shift_per_bias_sigma is None
+        else measurement.shift_per_bias_sigma - wanted.shift_per_bias_sigma[MEASURED]
     )
-    R = filter_setup.R if measured.R is None else measured.R
+    R = filter_setup.R if measurement.R is None else measurement.R
     S = (
         wanted.P[MEASURED, MEASURED]
         + drift_m**2 * _POSITION_AXES
         + R
         + error_shifts @ error_shifts.T
     )
-    return _Misfit(residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_range_m(frame_pose)) ** 2))
+    return _Innovation(residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_range_m(frame_pose)) ** 2))
 
 
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
     """True if errors that no covariance models, of lens, print and latency, already explain the
-    misfit, as in most frames: a fast check that saves the full one."""
+    innovation, as in most frames: a fast check that saves the full one."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
-    residual = frame_pose.measured.z - wanted.x[MEASURED]
+    residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))
     return float(residual @ residual) <= _MAX_GATE_CHI2
@@ -431,7 +434,7 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
     unclaimed = _unmodelled_yaw_xyz_sigma(range_m)
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, world_residual))
     calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _MAX_GATE_CHI2
-    return calm and seen < _MAX_MISFIT_RATIO_TO_ALTERNATIVE * jumped
+    return calm and seen < _MAX_COST_RATIO_TO_ALTERNATIVE * jumped
 
 
 def _matches_previous_track(
@@ -443,17 +446,14 @@ def _matches_previous_track(
     (4,) is the pose's distance from the present track."""
     if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
-    misfit, unclaimed = (
-        _compute_misfit(lock.track_before_last_pose, frame_pose, filter_setup),
+    innovation, unclaimed = (
+        _compute_innovation(lock.track_before_last_pose, frame_pose, filter_setup),
         _unmodelled_yaw_xyz_sigma(_range_m(frame_pose)),
     )
-    before, now = (
-        float(((o / unclaimed) ** 2).sum())
-        for o in (misfit.measured_minus_predicted_yaw_xyz, residual)
-    )
+    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (innovation.yaw_xyz, residual))
     return (
-        misfit.squared_mahalanobis <= _MAX_GATE_CHI2
-        and before < _MAX_MISFIT_RATIO_TO_ALTERNATIVE * now
+        innovation.squared_mahalanobis <= _MAX_GATE_CHI2
+        and before < _MAX_COST_RATIO_TO_ALTERNATIVE * now
     )
 
 
@@ -463,11 +463,13 @@ def _matches_previous_track(
 def _update_rival(
     previous_rival: RivalTrack | None,
     frame_pose: FramePose,
-    misfit: _Misfit,
+    innovation: _Innovation,
     filter_setup: FilterSetup,
 ) -> RivalTrack:
     if previous_rival is not None:
-        track = step_track(previous_rival.track, frame_pose.measured, frame_pose.t_s, filter_setup)
+        track = step_track(
+            previous_rival.track, frame_pose.measurement, frame_pose.t_s, filter_setup
+        )
         assert track is not None
         whole = previous_rival.frames_with_both_markers + int(frame_pose.has_both_markers)
         return replace(
@@ -477,38 +479,44 @@ def _update_rival(
             frames_with_both_markers=whole,
         )
     turned_rad, farther_m = (
-        abs(float(misfit.measured_minus_predicted_yaw_xyz[0])),
-        float(misfit.measured_minus_predicted_yaw_xyz[3]),
+        abs(float(innovation.yaw_xyz[0])),
+        float(innovation.yaw_xyz[3]),
     )
-    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(misfit.S[3, 3])
-    where = f"{misfit.distance_m:.2f} m away from it"
+    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(innovation.S[3, 3])
+    where = f"{innovation.distance_m:.2f} m away from it"
     if turned_rad > _MIN_ROTATION_TO_REPORT_RAD:
         where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
     if has_different_range:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or it has another size"
     return RivalTrack(
-        track=start_track(frame_pose.measured, frame_pose.t_s, filter_setup),
+        track=start_track(frame_pose.measurement, frame_pose.t_s, filter_setup),
         is_in_world_frame=frame_pose.is_in_world_frame,
-        since_s=frame_pose.t_s,
+        first_seen_s=frame_pose.t_s,
         seen_frames=1,
         frames_with_both_markers=int(frame_pose.has_both_markers),
         has_different_range=has_different_range,
-        text=where,
+        relative_position_text=where,
     )
 
 
 def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
-    if lock.accepted_frames < ESTABLISHED_FRAMES and rival.seen_frames > lock.accepted_frames:
+    if (
+        lock.accepted_frames < MIN_ESTABLISHED_TRACK_FRAMES
+        and rival.seen_frames > lock.accepted_frames
+    ):
         return True
     if frame_pose.is_attitude_unknown and _is_rival_likely_target(lock, rival, frame_pose):
         return True
-    if rival.frames_with_both_markers < ESTABLISHED_FRAMES or not frame_pose.has_both_markers:
+    if (
+        rival.frames_with_both_markers < MIN_ESTABLISHED_TRACK_FRAMES
+        or not frame_pose.has_both_markers
+    ):
         return False
     if not lock.has_both_markers:
         return True
-    unseen_s = frame_pose.t_s - max(rival.since_s, lock.track.t_s)
-    # A position outside the picture is not known to be empty.
+    unseen_s = frame_pose.t_s - max(rival.first_seen_s, lock.track.t_s)
+    # A position outside the image is not known to be empty.
     return (
         (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.has_different_range
@@ -521,19 +529,25 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
     """True if the rival is most likely the target itself, and its distance from the track is due to
     the camera's motion during lost frames: only the rival was seen for `MIN_RIVAL_ONLY_S`, since
     after the last sight of the target, in enough frames and with as many markers as the target."""
-    if rival.since_s < lock.track.t_s or frame_pose.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
+    if (
+        rival.first_seen_s < lock.track.t_s
+        or frame_pose.t_s - rival.first_seen_s < MIN_RIVAL_ONLY_S
+    ):
         return False
     if not lock.has_both_markers:
-        return rival.seen_frames >= ESTABLISHED_FRAMES
-    return frame_pose.has_both_markers and rival.frames_with_both_markers >= ESTABLISHED_FRAMES
+        return rival.seen_frames >= MIN_ESTABLISHED_TRACK_FRAMES
+    return (
+        frame_pose.has_both_markers
+        and rival.frames_with_both_markers >= MIN_ESTABLISHED_TRACK_FRAMES
+    )
 
 
-# --- Expected position of the target in the next picture ---
+# --- Expected position of the target in the next image ---
 # The state estimate provides the vehicle's motion in two ways: as the difference of two positions,
-# and as velocity times time. Each is weighted by its recent errors in the target's own pictures.
+# and as velocity times time. Each is weighted by its recent errors in the target's own images.
 
 
-_MOTION_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each picture replaces
+_MOTION_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each image replaces
 
 
 def expected_corners(
@@ -590,15 +604,16 @@ def update_last_pose(
 
 
 def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup) -> bool:
-    """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
+    """True if a position (3,) in the world is in the image at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (
         position_world_m - attitude.position_m - _vehicle_to_camera_world_m(attitude, setup)
     )
-    # Further off the axis, a lens model may fold back into the picture.
+    # Further off the axis, a lens model may fold back into the image.
     if (
         tvec_m[2] <= 0.0
-        or np.hypot(*tvec_m[:2]) > make_lattice(setup.camera).valid_radius_normalised * tvec_m[2]
+        or np.hypot(*tvec_m[:2])
+        > make_coarse_lattice(setup.camera).valid_radius_normalised * tvec_m[2]
     ):
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), tvec_m, setup.camera)
@@ -614,15 +629,17 @@ class _CameraDisplacements(NamedTuple):
 
 
 def _camera_displacements_m(
-    then: VehicleState, now: VehicleState, setup: PoseSetup
+    previous: VehicleState, current: VehicleState, setup: PoseSetup
 ) -> _CameraDisplacements:
     """Return the camera's displacement between two attitudes, computed in both ways."""
-    turned_m = _vehicle_to_camera_world_m(now, setup) - _vehicle_to_camera_world_m(then, setup)
-    stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
-    if now.velocity_mps is None or then.velocity_mps is None:
+    turned_m = _vehicle_to_camera_world_m(current, setup) - _vehicle_to_camera_world_m(
+        previous, setup
+    )
+    stepped_m = turned_m + np.subtract(current.position_m, previous.position_m)
+    if current.velocity_mps is None or previous.velocity_mps is None:
         return _CameraDisplacements(stepped_m, stepped_m)
-    half_s = 0.5 * (now.t_s - then.t_s)
-    flown_m = turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
+    half_s = 0.5 * (current.t_s - previous.t_s)
+    flown_m = turned_m + half_s * np.add(current.velocity_mps, previous.velocity_mps)
     return _CameraDisplacements(stepped_m, flown_m)
 
 

@@ -89,16 +89,16 @@ def check_camera_matrix(K: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture. `t_s` is its time of exposure on the loop's clock. A source computes it as the
+    """One image. `t_s` is its time of exposure on the loop's clock. A source computes it as the
     time of arrival, `t_arrival_s`, minus the profile's `camera.latency_s`. Only
     `perchctl.perception` subtracts the additional latency measured in flight and half the time of a
     field.
 
     `image` is grey, uint8, shape (height, width); `step` also accepts BGR, (height, width, 3).
 
-    `picture_kind` is the kind of the picture: ``whole`` for one exposure, ``woven`` for two fields,
-    ``top`` or ``bottom`` for one field of a woven picture at full height, None if not classified
-    yet (`perchctl.vision.fields`). `repeated`: the source returned the previous picture again,
+    `picture_kind` is the kind of the image: ``whole`` for one exposure, ``woven`` for two fields,
+    ``top`` or ``bottom`` for one field of a woven image at full height, None if not classified
+    yet (`perchctl.vision.fields`). `repeated`: the source returned the previous image again,
     which is not a measurement. `encoded` is the source's JPEG, from which `cv2.imdecode` with
     IMREAD_GRAYSCALE and IMREAD_IGNORE_ORIENTATION yields exactly `image`; None if there is none, or
     if the image was changed.
@@ -114,7 +114,7 @@ class Frame:
 
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
-    """Return a contiguous 8-bit grey picture, (height, width), from an array in grey, BGR or BGRA
+    """Return a contiguous 8-bit grey image, (height, width), from an array in grey, BGR or BGRA
     with 8 or 16 bits. Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue(
@@ -153,7 +153,7 @@ class Detection:
         rolling_shutter_error_shift_px: change (4, 2) of the corners by one standard deviation of
             the error of the readout time, which is common to both markers; None: no such error.
         cov_px2: covariance (8, 8) of corners inferred from a part of the drawing, which may lie
-            outside the picture: in pixels of a pinhole camera, with x and y of each corner
+            outside the image: in pixels of a pinhole camera, with x and y of each corner
             alternating.
         row_jitter_sigma_px: standard deviation due to the jitter of rows in analogue video.
         horizontal_side_extra_sigma_px: additional standard deviation of sides along the rows, if
@@ -179,8 +179,8 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """How far white has grown over black at all edges of a picture, `white_growth_px` (positive: a
-    marker's black square looks smaller), its standard deviation, px, and the number of pictures
+    """How far white has grown over black at all edges of an image, `white_growth_px` (positive: a
+    marker's black square looks smaller), its standard deviation, px, and the number of images
     since it was measured."""
 
     white_growth_px: float
@@ -256,9 +256,9 @@ class MarkerPose:
         rms_reprojection_px: RMS distance of the projected from the measured corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        print_error_shifts_m: shift of `e_m` by one standard deviation of the print's size and of
-            the sheet's curl, (3, 2). Included in `sigma_m` and `xyz_yaw_cov`, but identical in
-            every frame.
+        shift_per_print_error_sigma_m: shift of `e_m` by one standard deviation of the print's size
+            and of the sheet's curl, (3, 2). Included in `sigma_m` and `xyz_yaw_cov`, but identical
+            in every frame.
         rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
     """
 
@@ -273,7 +273,7 @@ class MarkerPose:
     rms_reprojection_px: float
     chi2: float = 0.0
     xyz_yaw_cov: Array | None = None
-    print_error_shifts_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
+    shift_per_print_error_sigma_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
     rvec_tvec_cov: Array | None = None
 
 
@@ -283,7 +283,7 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. Column k of `shift_per_constant_error` (8, 4) is the change of the state by one standard
+    motion. Column k of `shift_per_bias_sigma` (8, 4) is the change of the state by one standard
     deviation of constant error k: the vehicle's roll and pitch, the print's size and curl.
     `unseen_frames` counts the frames since the last measurement.
     """
@@ -292,12 +292,12 @@ class MarkerTrack:
     x: Array
     P: Array
     unseen_frames: int = 0
-    shift_per_constant_error: Array = field(default_factory=lambda: np.zeros((8, 4)))
+    shift_per_bias_sigma: Array = field(default_factory=lambda: np.zeros((8, 4)))
 
     @property
-    def state_cov_with_constant_errors(self) -> Array:
+    def state_cov_with_biases(self) -> Array:
         """Covariance (8, 8) of the state, including the constant errors."""
-        return self.P + self.shift_per_constant_error @ self.shift_per_constant_error.T
+        return self.P + self.shift_per_bias_sigma @ self.shift_per_bias_sigma.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,34 +392,34 @@ class RivalTrack:
     Attributes:
         track: its filter.
         is_in_world_frame: True if the track is in the world frame, False if in the level frame.
-        since_s: time of its first frame.
+        first_seen_s: time of its first frame.
         seen_frames, frames_with_both_markers: number of its frames, and of those with both markers.
         has_different_range: True if its range differs from the target's.
-        text: where it is relative to the target, in words.
+        relative_position_text: where it is relative to the target, in words.
     """
 
     track: MarkerTrack
     is_in_world_frame: bool
-    since_s: float
+    first_seen_s: float
     seen_frames: int
     frames_with_both_markers: int
     has_different_range: bool
-    text: str
+    relative_position_text: str
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredMarkers:
+class MarkerPoses:
     """The poses of one frame.
 
     Attributes:
         poses: all poses, by ``joint``, ``large``, ``small``, in this order.
         poses_by_track: the poses that update a track, by the track's name.
-        are_markers_contradicting: True if the two markers contradict each other.
+        do_markers_contradict: True if the two markers contradict each other.
     """
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     poses_by_track: dict[str, MarkerPose] = field(default_factory=dict)
-    are_markers_contradicting: bool = False
+    do_markers_contradict: bool = False
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
@@ -441,7 +441,7 @@ class FieldState:
         is_top_first: order of the fields; None until the votes decide.
         frame_periods_s: the last periods between frames.
         last_frame_t_s: time of the last frame.
-        previous_image: picture of the previous frame, unless that frame was whole.
+        previous_image: image of the previous frame, unless that frame was whole.
     """
 
     kind: PictureKind | None = None
@@ -461,7 +461,7 @@ class PipelineState:
     are_tracks_in_world_frame: bool = (
         False  # frame of the tracks: world of the state estimate, or level
     )
-    measured: MeasuredMarkers = MeasuredMarkers()  # poses of the newest frame
+    marker_poses: MarkerPoses = MarkerPoses()  # poses of the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last_detections: Detections | None = None
     last_pose: LastPose | None = None  # the last pose
@@ -483,7 +483,7 @@ class PipelineOutput:
     frames_with_contradicting_markers: int = (
         0  # number of successive frames with contradicting markers
     )
-    picture_kind: PictureKind = "whole"  # kind of the picture
+    picture_kind: PictureKind = "whole"  # kind of the image
     lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
     is_foreign_target: bool = False  # this frame showed another vehicle's target, by its position
 

@@ -12,12 +12,12 @@ from perchctl.geometry import Array
 from perchctl.vision import MARKERS, Frame
 from perchctl.vision.markers.detect import (
     CORNER_METHODS,
-    CornerFindings,
     CornerMethod,
-    Prior,
-    make_prior,
+    CornerResults,
+    DetectionPrior,
+    make_detection_prior,
 )
-from perchctl.vision.markers.detector import Picture
+from perchctl.vision.markers.detector import DetectorInput
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -50,19 +50,19 @@ class View:
         return render(*self.pose, blur_px=self.blur_px, noise=self.noise)
 
     @property
-    def picture(self) -> Picture:
-        return Picture(self.image, None, SETUP, CAMERA)
+    def picture(self) -> DetectorInput:
+        return DetectorInput(self.image, None, SETUP, CAMERA)
 
     @property
-    def prior(self) -> Prior:
+    def prior(self) -> DetectionPrior:
         """What is known if the last picture showed both markers at their predicted corners."""
         frame = Frame(0, 0.0, self.image)
         if self.off_px is None:
-            return make_prior(frame, None, SETUP, CAMERA)
+            return make_detection_prior(frame, None, SETUP, CAMERA)
         at = both(self.pose, self.off_px)
         large, small = (Detection(name, at[name], 0.1, True) for name in MARKERS)
         before = Detections(-1, -1 / 30, large=large, small=small)
-        return make_prior(frame, before, SETUP, CAMERA, at)
+        return make_detection_prior(frame, before, SETUP, CAMERA, at)
 
 
 def _view(method: str, marker: MarkerName, pose: tuple[Array, Array], **looks: float) -> View:
@@ -81,9 +81,9 @@ VIEWS = (
 """One for each of `CORNER_METHODS`, in its order."""
 
 
-def findings(view: View) -> list[tuple[CornerMethod, CornerFindings]]:
+def findings(view: View) -> list[tuple[CornerMethod, CornerResults]]:
     """The methods that are used in the view, each with all that was found up to it."""
-    picture, prior, found = view.picture, view.prior, CornerFindings()
+    picture, prior, found = view.picture, view.prior, CornerResults()
     steps = []
     for method in CORNER_METHODS:
         if method.should_run(picture, prior, found):

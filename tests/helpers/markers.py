@@ -14,9 +14,9 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import MARKERS, Frame, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import add_partly_visible, refine_expected_markers
-from perchctl.vision.markers.detector import Picture, make_detector_setup
-from perchctl.vision.markers.pattern import Pattern
+from perchctl.vision.markers.detect import add_partly_visible_markers, refine_expected_markers
+from perchctl.vision.markers.detector import DetectorInput, make_detector_setup
+from perchctl.vision.markers.pattern import MarkerPattern
 from perchctl.vision.types import MarkerName
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -46,12 +46,12 @@ def waved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def followed(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],
-    patterns: dict[MarkerName, Pattern] = SETUP.patterns,
+    patterns: dict[MarkerName, MarkerPattern] = SETUP.patterns,
     hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """What is where it is expected, wholly or partly."""
-    picture = Picture(image, hidden, replace(SETUP, patterns=patterns), CAMERA)
-    return add_partly_visible(picture, expected, refine_expected_markers(picture, expected))
+    picture = DetectorInput(image, hidden, replace(SETUP, patterns=patterns), CAMERA)
+    return add_partly_visible_markers(picture, expected, refine_expected_markers(picture, expected))
 
 
 def box(cx: float, cy: float, side: float) -> Array:

@@ -25,7 +25,7 @@ from perchctl.vision.filter import (
     VX,
     YAW,
     YAW_RATE,
-    Measurement,
+    TrackMeasurement,
     X,
     Y,
     Z,
@@ -34,7 +34,7 @@ from perchctl.vision.filter import (
     step_track,
 )
 from perchctl.vision.pipeline import step_detections
-from perchctl.vision.target_selection import track_measurement
+from perchctl.vision.target_selection import make_track_measurement
 from perchctl.vision.types import MarkerTrack
 from tests.helpers.seen import seen_from
 
@@ -67,12 +67,12 @@ steps = st.lists(
 def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> None:
     setup = make_filter(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85, noise="fixed"))
     z0 = np.array([0.1, 0.2, -0.1, 0.5])
-    track: MarkerTrack | None = start_track(Measurement(z0), 0.0, setup)
+    track: MarkerTrack | None = start_track(TrackMeasurement(z0), 0.0, setup)
     x, P, t = np.zeros(8), setup.P0.copy(), 0.0
     x[[0, 2, 4, 6]] = z0
     for dt, was_seen, z in steps:
         t += dt
-        track = step_track(track, Measurement(np.array(z)) if was_seen else None, t, setup)
+        track = step_track(track, TrackMeasurement(np.array(z)) if was_seen else None, t, setup)
         F = np.eye(8)
         F[[0, 2, 4, 6], [1, 3, 5, 7]] = t - (t - dt)
         if not was_seen:
@@ -98,7 +98,7 @@ def test_yaw_follows_across_the_wrap(start: float, rate: float) -> None:
     track = None
     for k in range(40):
         yaw = wrap_rad(start + rate * k / 30)
-        track = step_track(track, Measurement(np.array([yaw, 0.0, 0.0, 0.5])), k / 30, SETUP)
+        track = step_track(track, TrackMeasurement(np.array([yaw, 0.0, 0.0, 0.5])), k / 30, SETUP)
     assert -math.pi < track.x[YAW] <= math.pi
     assert abs(wrap_rad(float(track.x[YAW]) - yaw)) < 0.15
     assert track.x[YAW_RATE] == pytest.approx(rate, abs=0.4)
@@ -115,31 +115,31 @@ def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
         assert np.allclose(track.x[POSITION], position)
     assert step_track(track, None, (CONFIG.n_max + 1) / 30, SETUP) is None
     again = step_track(
-        track, Measurement(np.array([0.0, 1.0, 2.0, 3.0])), (CONFIG.n_max + 1) / 30, SETUP
+        track, TrackMeasurement(np.array([0.0, 1.0, 2.0, 3.0])), (CONFIG.n_max + 1) / 30, SETUP
     )
     assert again.unseen_frames == 0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_measurement_that_is_not_finite_counts_as_unseen(bad: float) -> None:
-    start = start_track(Measurement(np.zeros(4)), 0.0, SETUP)
-    track = step_track(start, Measurement(np.array([0.0, bad, 0.0, 0.5])), 0.03, SETUP)
+    start = start_track(TrackMeasurement(np.zeros(4)), 0.0, SETUP)
+    track = step_track(start, TrackMeasurement(np.array([0.0, bad, 0.0, 0.5])), 0.03, SETUP)
     assert track.unseen_frames == 1
     assert np.isfinite(track.x).all()
-    assert step_track(None, Measurement(np.array([bad, 0, 0, 0])), 0.0, SETUP) is None
+    assert step_track(None, TrackMeasurement(np.array([bad, 0, 0, 0])), 0.0, SETUP) is None
 
 
 @pytest.mark.parametrize("t_s", [0.0, -0.5, math.nan])
 def test_a_frame_that_is_not_newer_changes_nothing(t_s: float) -> None:
-    start = start_track(Measurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
-    assert step_track(start, Measurement(np.ones(4)), t_s, SETUP) is start
+    start = start_track(TrackMeasurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
+    assert step_track(start, TrackMeasurement(np.ones(4)), t_s, SETUP) is start
     assert step_track(start, None, t_s, SETUP) is start
 
 
 @pytest.mark.parametrize("t_s", [1.5, -1.5])
 def test_a_long_gap_starts_afresh(t_s: float) -> None:
-    start = start_track(Measurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
-    track = step_track(start, Measurement(np.ones(4)), t_s, SETUP)
+    start = start_track(TrackMeasurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
+    track = step_track(start, TrackMeasurement(np.ones(4)), t_s, SETUP)
     assert np.allclose(track.x[[YAW, X, Y, Z]], 1.0)
     assert np.array_equal(track.P, SETUP.P0)
     assert step_track(start, None, t_s, SETUP) is None
@@ -159,20 +159,20 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     steps = np.array([0.0, *velocity_mps]) / 30.0
     track: MarkerTrack | None = None
     for k in range(20):
-        track = step_track(track, Measurement(place + k * steps, R), k / 30.0, setup)
+        track = step_track(track, TrackMeasurement(place + k * steps, R), k / 30.0, setup)
     jumped = place + 20 * steps + jump
-    track = step_track(track, Measurement(jumped, R), 20 / 30.0, setup)
+    track = step_track(track, TrackMeasurement(jumped, R), 20 / 30.0, setup)
     assert np.allclose(track.x[MEASURED], jumped)
     assert np.abs(track.x[RATES]).max() == 0.0
     sigma_m = np.sqrt(track.P.diagonal()[POSITION])
     assert (sigma_m > 0.9 * np.abs(jump_m) - 0.01).all()
-    confirmed = step_track(track, Measurement(jumped + steps, R), 21 / 30.0, setup)
+    confirmed = step_track(track, TrackMeasurement(jumped + steps, R), 21 / 30.0, setup)
     assert np.sqrt(confirmed.P.diagonal()[POSITION]).max() < 0.002
     # In the world of a state estimate a camera's motion is known.
     world, there = make_filter(KalmanConfig(), is_world_frame=True), None
     for k in range(20):
-        there = step_track(there, Measurement(place, R), k / 30.0, world)
-    there = step_track(there, Measurement(place + jump, R), 20 / 30.0, world)
+        there = step_track(there, TrackMeasurement(place, R), k / 30.0, world)
+    there = step_track(there, TrackMeasurement(place + jump, R), 20 / 30.0, world)
     assert not np.allclose(there.x[MEASURED], place + jump)
 
 
@@ -280,8 +280,8 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
             "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
             xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
-        found = track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
-        return found.z, found.shift_per_constant_error[:, TILTS]
+        found = make_track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
+        return found.z, found.shift_per_bias_sigma[:, TILTS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

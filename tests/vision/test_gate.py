@@ -22,11 +22,11 @@ from perchctl.vision import (
     VehicleState,
     estimate,
 )
-from perchctl.vision.filter import Measurement, X, make_filter
+from perchctl.vision.filter import TrackMeasurement, X, make_filter
 from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
-    ESTABLISHED_FRAMES,
     LOCK_TIMEOUT_S,
+    MIN_ESTABLISHED_TRACK_FRAMES,
     MIN_RIVAL_ONLY_S,
     REACQUIRE_S,
     FramePose,
@@ -159,7 +159,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     )  # fmt: skip
     z = np.array([off_rad, *off_m])
     sight = FramePose(
-        0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
+        0.03, pose, TrackMeasurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
     )
     constants = make_filter(KalmanConfig(), is_world_frame=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
@@ -167,7 +167,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
         track=track, pose=pose, is_in_world_frame=True, accepted_frames=9, has_both_markers=True
     )
     if _is_clearly_consistent(track, sight, constants):
-        assert judge_pose(lock, rival, sight, constants).accepted
+        assert judge_pose(lock, rival, sight, constants).is_accepted
 
 
 @pytest.mark.parametrize(("x_m", "in_world"), [(-0.02, False), (-0.45, False), (-0.02, True)])
@@ -180,14 +180,14 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     pose = MarkerPose(
         "joint", 0.1, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, np.ones(3), 1.0, 0.0
     )
-    measured = Measurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
+    measured = TrackMeasurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
     sight = FramePose(0.1, pose, measured, in_world, True)
     lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
     verdict = judge_pose(lock, None, sight, make_filter(KalmanConfig(), in_world))
-    assert verdict.accepted is (x_m == -0.02 and not in_world)
-    assert verdict.restarts_for_locked_target is verdict.accepted
+    assert verdict.is_accepted is (x_m == -0.02 and not in_world)
+    assert verdict.restarts_at_locked_target is verdict.is_accepted
     again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
-    assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).accepted
+    assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).is_accepted
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:
@@ -312,8 +312,8 @@ def test_a_clock_that_was_set_back_begins_anew(watch: Watch) -> None:
 def test_both_markers_overrule_a_lock_on_one(watch: Watch) -> None:
     """What was locked on was perhaps never the target."""
     watch.show(20, markers=("large",), scale=0.5)
-    outputs = watch.show(ESTABLISHED_FRAMES + 1)
-    assert measured(outputs) == [False] * (ESTABLISHED_FRAMES - 1) + [True] * 2
+    outputs = watch.show(MIN_ESTABLISHED_TRACK_FRAMES + 1)
+    assert measured(outputs) == [False] * (MIN_ESTABLISHED_TRACK_FRAMES - 1) + [True] * 2
 
 
 def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:

@@ -343,8 +343,8 @@ def test_a_jump_of_the_estimates_world_spoils_one_picture() -> None:
     """The vehicle has not moved: what follows is expected where it is."""
     flight = Flight(1, 1e-4, 5e-3)
     found = []
-    for k, error_px in enumerate(errors_px(flight, 60)):
-        found.append(error_px)
+    for k, reprojection_error_px in enumerate(errors_px(flight, 60)):
+        found.append(reprojection_error_px)
         if k == 40:
             flight.jump_m = np.array([0.1, 0.0, 0.0])
     assert found[41] > 20.0

@@ -39,7 +39,7 @@ from perchctl.vision import (
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import is_pair_inconsistent
 from perchctl.vision.pose import target_normal_cam
-from perchctl.vision.target_selection import track_measurement
+from perchctl.vision.target_selection import make_track_measurement
 from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -330,25 +330,27 @@ def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     true, doubtful = setup_of(size_sigma=0.0, curl_per_m=0.0), setup_of(size_sigma=0.02)
     constants = make_filter(KalmanConfig())
     known, told = (
-        track_measurement(solved(["large", "small"], setup), None, False, constants, setup)
+        make_track_measurement(solved(["large", "small"], setup), None, False, constants, setup)
         for setup in (true, doubtful)
     )
     assert known.R is not None
     assert told.R is not None
     assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
-    assert np.linalg.norm(told.shift_per_constant_error[1:, PRINT]) > 0.02 * 0.3
+    assert np.linalg.norm(told.shift_per_bias_sigma[1:, PRINT]) > 0.02 * 0.3
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------
 
 
 Build = Callable[..., Pipeline]
-Picture = Callable[[Array, Array, int], NDArray[np.uint8]]
+DetectorInput = Callable[[Array, Array, int], NDArray[np.uint8]]
 TRUE_PRINT = TargetConfig(size_sigma=0.0, curl_per_m=0.0)
 BINS_M = ((0.05, 0.09), (0.1, 0.18), (0.2, 0.4), (0.5, 1.0))
 
 
-def squared(setup: Pipeline, low_m: float, high_m: float, picture: Picture, count: int) -> float:
+def squared(
+    setup: Pipeline, low_m: float, high_m: float, picture: DetectorInput, count: int
+) -> float:
     """Mean squared error of (x, y, z, yaw) in units of its spread, a degree of freedom."""
     rng = np.random.default_rng(4)
     found = []

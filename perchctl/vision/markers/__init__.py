@@ -1,1 +1,1 @@
-"""Detect the target's two markers in a picture, with corners accurate to 0.01 px."""
+"""Detect the target's two markers in an image, with corners accurate to 0.01 px."""

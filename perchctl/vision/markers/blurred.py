@@ -1,13 +1,13 @@
-"""Blurred search: find markers in pictures that are too blurred for any search to decode them.
+"""Blurred search: find markers in images that are too blurred for any search to decode them.
 
 Near an expected marker, the fit starts at the shift s at which a blurred template T of the marker's
-drawing correlates best with the picture I:
+drawing correlates best with the image I:
 
     max of  sum (I(x+s) - mean I) (T(x) - mean T) / (|I - mean I| |T - mean T|)
 
 Without an expectation, the fits start at the quadrilaterals whose cells correlate best with the
-drawing. Any start is safe because the photometric fit must verify it (`has_matching_drawing`,
-`has_distinctive_bits`) and measures the corners.
+drawing. Any start is safe because the photometric fit must verify it (`is_alignment_confirmed`,
+`excludes_other_codewords`) and measures the corners.
 
 The result is wrong where the photometric fit is (`perchctl.vision.markers.photometric_fit`). It is
 empty if another codeword would look the same, or if the marker is further from its expected
@@ -28,56 +28,55 @@ from perchctl.vision.markers.corners import (
     RefinedCorners,
     apply_homography,
     homography_to_centred_square,
-    is_inside_picture,
+    is_inside_image,
     mean_side_px,
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.detector import Picture, make_quad_detector
+from perchctl.vision.markers.detector import DetectorInput, make_quad_detector
 from perchctl.vision.markers.edge_fit import (
     CLIPPED_CORNER_SIGMA_PX,
     CLIPPED_GREY,
     MIN_CLIPPED_FRACTION,
 )
-from perchctl.vision.markers.pattern import MIN_MARKER_SIDE_PX, Pattern, correlate_pattern
-from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
+from perchctl.vision.markers.pattern import MIN_MARKER_SIDE_PX, MarkerPattern, correlate_pattern
+from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
 _START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
 # largest error of an expected position
 _MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
-_MIN_START_CORRELATION = 0.5
+_MIN_QUAD_CORRELATION = 0.5
 # minimum at an expected position; textures seldom reach it, and each costs a fit
 _MIN_EXPECTED_MARKER_CORRELATION = 0.45
-_MAX_CANDIDATES = 3
+_MAX_QUADS_TO_FIT = 3
 _CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # grey of areas with unknown content
 _MAX_DUPLICATE_DISTANCE_SIDES = (
     0.15  # distance, as a share of a side, of candidates that count as one
 )
-_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
+_CERTAIN_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
-    picture: Picture,
+    detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    start_blur_counter: int | None = None,
+    initial_blur_frame_counter: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first marker found near its expected corners (4, 2) px; empty if none is found.
 
-    `start_blur_counter` is a counter that the caller increases with each frame, so that the fits
-    start with little blur (even) and much blur (odd) in turn, which saves time; None tries both in
-    this frame.
-    """
-    image, patterns = picture.image, picture.setup.patterns
+    `initial_blur_frame_counter` is a counter that the caller increases with each frame, so that the
+    fits start with little blur (even) and much blur (odd) in turn, which saves time; None tries
+    both in this frame."""
+    image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _START_BLURS_PX
-        if start_blur_counter is None
-        else (_START_BLURS_PX[start_blur_counter % len(_START_BLURS_PX)],)
+        if initial_blur_frame_counter is None
+        else (_START_BLURS_PX[initial_blur_frame_counter % len(_START_BLURS_PX)],)
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
-        if corners is None or not is_inside_picture(corners, image.shape):
+        if corners is None or not is_inside_image(corners, image.shape):
             continue
         if mean_side_px(corners) < MIN_MARKER_SIDE_PX:
             continue
@@ -85,28 +84,28 @@ def find_expected_blurred(
         if correlate_pattern(image, start, patterns[name])[0] < _MIN_EXPECTED_MARKER_CORRELATION:
             continue
         for blur_px in blurs_px:
-            seen = align_marker(picture, name, start, blur_px=blur_px)
+            seen = align_marker(detector_input, name, start, blur_px=blur_px)
             if seen is not None:
                 return {name: seen}
     return {}
 
 
-def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker in the first of the picture's quadrilaterals that the photometric fit
+def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorners]:
+    """Return the marker in the first of the image's quadrilaterals that the photometric fit
     confirms, tried in the order of the correlation of their cells with a marker's; empty if none is
     confirmed."""
-    image, setup = picture.image, picture.setup
+    image, setup = detector_input.image, detector_input.setup
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _rank_quads(image, quads, setup.patterns):
-        seen = align_marker(picture, name, corners_px, blur_px=_FIRST_BLUR_PX)
+        seen = align_marker(detector_input, name, corners_px, blur_px=_FIRST_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
 
 
 def _rank_quads(
-    image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
+    image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, MarkerPattern]
 ) -> list[tuple[MarkerName, Array]]:
     """Return the quadrilaterals (m, 4, 2) whose cells resemble a marker's, best first, without
     duplicates. Their corners are rolled to the marker's orientation."""
@@ -116,7 +115,7 @@ def _rank_quads(
     found: list[tuple[float, MarkerName, Array]] = []
     for name in MARKERS:
         like = np.array([correlate_pattern(image, quad, patterns[name]) for quad in quads])
-        for i in np.flatnonzero(like.max(axis=1) > _MIN_START_CORRELATION):
+        for i in np.flatnonzero(like.max(axis=1) > _MIN_QUAD_CORRELATION):
             roll = int(like[i].argmax())
             found.append((float(like[i, roll]), name, np.roll(quads[i], roll, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
@@ -130,17 +129,19 @@ def _rank_quads(
             for other, there in chosen
         ):
             chosen.append((name, corners_px))
-    return chosen[:_MAX_CANDIDATES]
+    return chosen[:_MAX_QUADS_TO_FIT]
 
 
-def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+def _align_by_correlation(
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
+) -> Array:
     """Return the corners (4, 2) px shifted, all by the same vector, to where the marker's ideal
-    black-and-white pattern (its drawing) correlates best with the picture."""
+    black-and-white pattern (its drawing) correlates best with the image."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _PAPER_REACH_HALF_SIDES
+    half = float(np.abs(corners_px - centre).max()) * _CERTAIN_PAPER_REACH_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -166,10 +167,10 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
 
 
 def _render_template(
-    pattern: Pattern, sample_points_half_sides: Array, side_px: float
+    pattern: MarkerPattern, sample_points_half_sides: Array, side_px: float
 ) -> NDArray[np.float32]:
     """Return the marker's drawing at `sample_points_half_sides` (n, n, 2), in half sides from the
-    marker's centre, blurred for a marker whose side is `side_px` in the picture."""
+    marker's centre, blurred for a marker whose side is `side_px` in the image."""
     n = len(pattern.drawing.cell_whiteness)
     cell = np.floor((sample_points_half_sides + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -177,57 +178,59 @@ def _render_template(
     white = np.where(inside, pattern.drawing.cell_whiteness[cell[..., 1], cell[..., 0]], 1.0)
     if pattern.drawing.small_cell_whiteness is not None:
         white[
-            np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side
+            np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
         ] = _CENTRE_GREY
-    white[np.abs(sample_points_half_sides).max(axis=2) > _PAPER_REACH_HALF_SIDES] = _OUTSIDE_GREY
+    white[np.abs(sample_points_half_sides).max(axis=2) > _CERTAIN_PAPER_REACH_HALF_SIDES] = (
+        _OUTSIDE_GREY
+    )
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
 
-# --- Measure a marker by its drawing, and accept it only if the picture matches beyond doubt ---
+# --- Measure a marker by its drawing, and accept it only if the image matches beyond doubt ---
 
 
 _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
-_CORNER_SIGMA_PER_BLUR = 0.012  # share of the blur: no picture equals its drawing with uniform blur
+_CORNER_SIGMA_PER_BLUR = 0.012  # share of the blur: no image equals its drawing with uniform blur
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
 _MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
 _MAX_BIT_FLIP_FRACTION, _MAX_BIT_FLIP_FRACTION_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06  # share of the side
-_MIN_MOTION_LIMIT_PX = 3.0
+_MIN_MAX_MOTION_FROM_START_PX = 3.0
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # ratio of the mean sides
-_MIN_SHORTEST_TO_LONGEST_SIDE = 0.6  # ratio of the shortest side to the longest
+_MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
 
 
 def align_marker(
-    picture: Picture,
+    detector_input: DetectorInput,
     name: MarkerName,
     start_corners_px: Array,
     max_motion_from_start_sides: float = 0.6,
     blur_px: float = 1.5,
     max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
-    needs_distinctive_bits: bool = True,
+    must_exclude_other_codewords: bool = True,
 ) -> RefinedCorners | None:
-    """Fit a marker's drawing to the picture and return its corners; None unless the picture matches
+    """Fit a marker's drawing to the image and return its corners; None unless the image matches
     the drawing.
 
     The fit starts at `start_corners_px` (4, 2) with a first guess of the blur, `blur_px`.
     `max_motion_from_start_sides` is the largest distance of the fitted corners from those, and
     `max_corner_sigma_sides` their largest standard deviation, both in side lengths. If
-    `needs_distinctive_bits`, the picture must also exclude every other codeword
-    (`has_distinctive_bits`); this is not necessary if the other marker identifies this one.
+    `must_exclude_other_codewords`, the image must also exclude every other codeword
+    (`excludes_other_codewords`); this is not necessary if the other marker identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
         return None
-    image, drawing = picture.image, picture.setup.patterns[name].drawing
-    alignment = align_drawing(image, start_corners_px, drawing, picture.camera, blur_px)
+    image, drawing = detector_input.image, detector_input.setup.patterns[name].drawing
+    alignment = align_drawing(image, start_corners_px, drawing, detector_input.camera, blur_px)
     if (
         alignment is None
-        or not has_matching_drawing(alignment, max_corner_sigma_sides)
-        or (needs_distinctive_bits and not has_distinctive_bits(alignment))
+        or not is_alignment_confirmed(alignment, max_corner_sigma_sides)
+        or (must_exclude_other_codewords and not excludes_other_codewords(alignment))
         or alignment.motion_from_start_px
-        > max(max_motion_from_start_sides * side_px, _MIN_MOTION_LIMIT_PX)
+        > max(max_motion_from_start_sides * side_px, _MIN_MAX_MOTION_FROM_START_PX)
     ):
         return None
     # The square must remain a square of about the same size and orientation.
@@ -236,7 +239,7 @@ def align_marker(
         [alignment.corners_px, start_corners_px],
     )
     if (
-        sides_px.min() < _MIN_SHORTEST_TO_LONGEST_SIDE * sides_px.max()
+        sides_px.min() < _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO * sides_px.max()
         or not _MIN_SIZE_RATIO < float(sides_px.mean()) / side_px < _MAX_SIZE_RATIO
         or np.prod(signed_double_area(np.stack(areas))) <= 0.0
     ):
@@ -256,10 +259,10 @@ def align_marker(
     return RefinedCorners(alignment.corners_px, sigma_px, True)
 
 
-def has_matching_drawing(
-    alignment: Alignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
+def is_alignment_confirmed(
+    alignment: DrawingAlignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
 ) -> bool:
-    """True if the picture matches the fitted drawing and determines its corners well enough.
+    """True if the image matches the fitted drawing and determines its corners well enough.
 
     Where there is no marker, the correlation of the inner pattern stays below 0.72 if its contrast
     is plausible; on a marker, it is above 0.95.
@@ -267,16 +270,16 @@ def has_matching_drawing(
     return (
         alignment.pattern_correlation > _MIN_INNER_CORRELATION
         and alignment.fit_correlation > _MIN_CORRELATION
-        and _MIN_PATTERN_CONTRAST < alignment.pattern_contrast < _MAX_PATTERN_CONTRAST
-        and alignment.cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
+        and _MIN_PATTERN_CONTRAST < alignment.pattern_to_border_contrast < _MAX_PATTERN_CONTRAST
+        and alignment.max_cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
         and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
 
-def has_distinctive_bits(alignment: Alignment) -> bool:
-    """True if flipping any single bit of the codeword would fit the picture clearly worse. In tests
-    with markers of other codewords, `has_matching_drawing` accepted 36 by mistake; each of them had
-    a `bit_flip_fraction` above 0.5."""
+def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
+    """True if flipping any single bit of the codeword would fit the image clearly worse. In tests
+    with markers of other codewords, `is_alignment_confirmed` accepted 36 by mistake; each of them
+    had a `bit_flip_fraction` above 0.5."""
     return (
         alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
         and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA

@@ -1,4 +1,4 @@
-"""Geometry of a marker's square in the picture (sides, area, concentric squares), and its refined
+"""Geometry of a marker's square in the image (sides, area, concentric squares), and its refined
 corners.
 
 The centred square is the marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1), (-1,
@@ -23,11 +23,11 @@ CENTRED_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 
 """Corners of the centred square, -1 to 1, in the marker's own coordinates, (4, 2)."""
 # indices of corner i's neighbours
 NEXT_CORNER, PREVIOUS_CORNER = (np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2]))
-OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+SIDE_OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
 _CENTRED_SQUARE_F32 = CENTRED_SQUARE.astype(np.float32)
 _CENTRED_SQUARE_HOMOGENEOUS: Array = np.column_stack([CENTRED_SQUARE, np.ones(4)])
-_INCREMENT_JACOBIANS: Array = np.array(
+_CORNER_BY_INCREMENT_JACOBIANS: Array = np.array(
     [
         [[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]]
         for u, v in CENTRED_SQUARE
@@ -60,7 +60,7 @@ def projected_corners_jacobian(homography: Array) -> Array:
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
-    return np.asarray((A @ _INCREMENT_JACOBIANS).reshape(8, 8))
+    return np.asarray((A @ _CORNER_BY_INCREMENT_JACOBIANS).reshape(8, 8))
 
 
 def increment_homography(H: Array, homography_increment: Array) -> Array:
@@ -95,38 +95,38 @@ def signed_double_area(corners: Array) -> Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def is_inside_picture(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
-    """True if all corners (4, 2) are at least `margin_px` inside the edges of a picture (h, w)."""
+def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
+    """True if all corners (4, 2) are at least `margin_px` inside the edges of an image (h, w)."""
     h, w = shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
     # NaN yields False.
     return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())
 
 
-def scale_square(
-    corners_px: Array, scaled_to_given_side: float, camera: CameraModel | None = None
-) -> Array:
+def scale_square(corners_px: Array, side_ratio: float, camera: CameraModel | None = None) -> Array:
     """Return the corners (4, 2) px of a square with the same centre and plane as the given one,
-    whose side is `scaled_to_given_side` times the given side; without a camera, lens distortion is
+    whose side is `side_ratio` times the given side; without a camera, lens distortion is
     ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_centred_square(straight),
-        (_CENTRED_SQUARE_F32 * scaled_to_given_side).astype(np.float64),
+        (_CENTRED_SQUARE_F32 * side_ratio).astype(np.float64),
     )
     return found if camera is None else distort_to_px(found, camera)
 
 
-def add_missing_marker(
-    expected_corners_px: Mapping[MarkerName, Array], small_to_large_side: float, camera: CameraModel
+def add_missing_marker_corners(
+    expected_corners_px: Mapping[MarkerName, Array],
+    small_to_large_side_ratio: float,
+    camera: CameraModel,
 ) -> dict[MarkerName, Array]:
     """Return both markers' corners (4, 2) px; a missing marker follows from the other one and
-    `small_to_large_side`, the side of the small marker over that of the large one."""
+    `small_to_large_side_ratio`, the side of the small marker over that of the large one."""
     both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
-        both["small"] = scale_square(both["large"], small_to_large_side, camera)
+        both["small"] = scale_square(both["large"], small_to_large_side_ratio, camera)
     elif "large" not in both and "small" in both:
-        both["large"] = scale_square(both["small"], 1.0 / small_to_large_side, camera)
+        both["large"] = scale_square(both["small"], 1.0 / small_to_large_side_ratio, camera)
     return both
 
 
@@ -150,7 +150,7 @@ class RefinedCorners:
         corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
         is_fitted: True if the corners follow from a fit of lines or of the drawing; False if each
             was located by itself (by OpenCV, or from the other marker), which is less accurate.
-        corrected_edge_shift: how far white has grown over black at all edges of the picture
+        corrected_edge_shift: how far white has grown over black at all edges of the image
             (blooming, gamma), measured on this frame's markers or known before; the corners are
             corrected for it. None: unknown, and not corrected.
         remaining_edge_shift_sigma_px: standard deviation of that growth after the correction.

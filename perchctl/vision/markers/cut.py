@@ -1,11 +1,11 @@
 """Cut-view fit: a target so close, or so far off the axis, that no marker is completely in the
-picture.
+image.
 
 The edges of the whole drawing, of both markers, are located across their predicted positions. A
 part of a drawing does not determine the eight terms of a homography, so the unknowns are those of a
 rigid body. Gauss-Newton finds the rotation w and the translation t, together with the shift d of
 all edges (white over black), from the distances r_k, px, between the drawing's edges and the
-picture's:
+image's:
 
     min sum v_k (r_k - J_k (w, t, d))^2 / sigma^2 + sum ((w, t, d)_j / sigma_j)^2
 
@@ -14,7 +14,7 @@ marker follow by projection, with their covariance (8, 8) px^2.
 
 The result is wrong if the predicted tilt is wrong by much more than its standard deviation, 2 deg,
 and no edge shows it. A part of a drawing resembles many other objects: this fit never starts a
-track, and it counts only if the picture matches the drawing everywhere (correlation above 0.9) and
+track, and it counts only if the image matches the drawing everywhere (correlation above 0.9) and
 three quarters of the edges in view are found.
 
 The unit of length is half the side of the large marker.
@@ -39,33 +39,33 @@ from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     RefinedCorners,
     apply_homography,
-    is_inside_picture,
+    is_inside_image,
 )
 from perchctl.vision.markers.detector import (
+    DetectorInput,
     HiddenMask,
-    Picture,
     is_any_part_hidden,
     make_detector_setup,
 )
 from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS, sample_profiles
-from perchctl.vision.markers.pattern import Drawing, Pattern, render_cells
-from perchctl.vision.markers.photometric_fit import fit_correlation, make_grid
+from perchctl.vision.markers.pattern import MarkerDrawing, MarkerPattern, render_cells
+from perchctl.vision.markers.photometric_fit import fit_correlation, make_sampling_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
-MAX_CUT_FIT_AGE_S = 0.5
+MAX_TRUNCATED_FIT_AGE_S = 0.5
 """Largest time since the target was last measured, s; after it, a visible part of the target is no
 evidence."""
-_MAX_CORNER_TO_PICTURE_EDGE_PX = (
-    40  # from the edge of the picture, where a marker may just have been cut
+_MAX_CORNER_TO_IMAGE_EDGE_PX = (
+    40  # from the edge of the image, where a marker may just have been cut
 )
 # cell of the small marker; if it is smaller, the large marker is in view
 _MIN_SMALL_CELL_PX = 8.0
 _MIN_COARSE_CORRELATION = 0.6  # correlation required at the moved prediction
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # correlation at which no other size is tried
-_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
-_MIN_CORRELATION, _MIN_CUT_GAIN = 0.9, 20.0
+_RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
+_MIN_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
 _MIN_FOUND_POINT_FRACTION = 0.75  # share of the edge points in view
-_MAX_CUT_RESIDUAL_PX = 1.2
+_MAX_TRUNCATED_FIT_RESIDUAL_PX = 1.2
 _MAX_CENTRE_SIGMA_HALF_SIDES = 0.04  # of the centre, in half sides
 _MIN_CORNER_SIGMA_PX = 0.02
 _MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
@@ -76,65 +76,87 @@ _MAX_LENS_INVERSION_ERROR_NORMALISED = (
 _R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 
 
-def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Fill the caches of `fit_cut_markers` before the flight, so that its first call is fast."""
-    _make_target_outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
+def warm_up_truncated_marker_fit(
+    patterns: Mapping[MarkerName, MarkerPattern], camera: CameraModel
+) -> None:
+    """Fill the caches of `fit_truncated_markers` before the flight, so that its first call is
+    fast."""
+    (
+        _make_target_outline(patterns),
+        make_drawing_texture(patterns["large"].drawing),
+        make_coarse_lattice(camera),
+    )
 
 
-def is_target_cut(
+def is_target_truncated(
     expected_corners_px: Mapping[MarkerName, Array],
     shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden by the
+    """True if each expected marker (4, 2) px may be cut by the image's edge or hidden by the
     vehicle's gear."""
     whole = [
         corners
         for corners in expected_corners_px.values()
-        if is_inside_picture(corners, shape, _MAX_CORNER_TO_PICTURE_EDGE_PX)
+        if is_inside_image(corners, shape, _MAX_CORNER_TO_IMAGE_EDGE_PX)
     ]
     return bool(expected_corners_px) and all(is_any_part_hidden(hidden_mask, c) for c in whole)
 
 
-def can_whole_marker_be_in_view(
+def can_complete_marker_be_in_view(
     expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
 ) -> bool:
-    """True if at least one expected marker (4, 2) px may be completely in the picture."""
+    """True if at least one expected marker (4, 2) px may be completely in the image."""
     return any(
-        is_inside_picture(corners, shape, -_MAX_CORNER_TO_PICTURE_EDGE_PX)
+        is_inside_image(corners, shape, -_MAX_CORNER_TO_IMAGE_EDGE_PX)
         for corners in expected_corners_px.values()
     )
 
 
-def fit_cut_markers(
-    picture: Picture, expected_corners_px: Mapping[MarkerName, Array]
+def fit_truncated_markers(
+    detector_input: DetectorInput, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
     """Fit the target's visible part and return one marker's corners from the fit; empty if it
     fails. `expected_corners_px` are the predicted corners (4, 2) px."""
-    image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
+    image, camera, patterns = (
+        detector_input.image,
+        detector_input.camera,
+        detector_input.setup.patterns,
+    )
     drawing = patterns["large"].drawing
-    small_to_large_side, centre = drawing.small_to_large_side, drawing.small_cell_whiteness
-    start = _initial_pose(expected_corners_px, small_to_large_side, camera)
+    small_to_large_side_ratio, centre = (
+        drawing.small_to_large_side_ratio,
+        drawing.small_cell_whiteness,
+    )
+    start = _initial_pose(expected_corners_px, small_to_large_side_ratio, camera)
     if start is None or centre is None:
         return {}
     if (
-        2.0 * small_to_large_side / len(centre) * camera.K[0, 0] / start.t_cam_drawing_half_sides[2]
+        2.0
+        * small_to_large_side_ratio
+        / len(centre)
+        * camera.K[0, 0]
+        / start.t_cam_drawing_half_sides[2]
         < _MIN_SMALL_CELL_PX
     ):
         return {}
-    covered = None if picture.hidden_mask is None else picture.hidden_mask.astype(np.uint8)
-    coarse_picture, texture = make_coarse_picture(image, camera, covered), make_texture(drawing)
-    near = _search_near_pose(start, texture, coarse_picture)
+    covered = (
+        None if detector_input.hidden_mask is None else detector_input.hidden_mask.astype(np.uint8)
+    )
+    coarse_image, texture = make_coarse_image(image, camera, covered), make_drawing_texture(drawing)
+    near = _search_near_pose(start, texture, coarse_image)
     if near is None:
         return {}
     pose_fit = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
     if pose_fit is None or not _is_reliable(pose_fit):
         return {}
-    like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_picture)
-    if like < _MIN_CORRELATION or gain < _MIN_CUT_GAIN:
+    like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
+    if like < _MIN_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
         return {}
     name = _select_measured_marker(pose_fit)
-    corners = _marker_corners(pose_fit, small_to_large_side if name == "small" else 1.0, camera)
+    corners = _marker_corners(
+        pose_fit, small_to_large_side_ratio if name == "small" else 1.0, camera
+    )
     return {} if corners is None else {name: corners}
 
 
@@ -149,20 +171,20 @@ def shows_enough_of_target(
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
     if pose_fit is None or not _is_reliable(pose_fit):
         return False
-    side_to_large_side = (
-        patterns["large"].drawing.small_to_large_side
+    side_to_large_side_ratio = (
+        patterns["large"].drawing.small_to_large_side_ratio
         if _select_measured_marker(pose_fit) == "small"
         else 1.0
     )
-    return _marker_corners(pose_fit, side_to_large_side, camera) is not None
+    return _marker_corners(pose_fit, side_to_large_side_ratio, camera) is not None
 
 
 @lru_cache(maxsize=4)
-def _make_patterns(target: TargetConfig) -> dict[MarkerName, Pattern]:
+def _make_patterns(target: TargetConfig) -> dict[MarkerName, MarkerPattern]:
     return make_detector_setup(DetectorConfig(), target).patterns
 
 
-def _make_target_outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
+def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> TargetOutline:
     large, small = patterns["large"], patterns["small"]
     return make_outline(
         large.drawing,
@@ -177,15 +199,17 @@ def _select_measured_marker(pose_fit: PoseFit) -> MarkerName:
 
 
 def _initial_pose(
-    expected_corners_px: Mapping[MarkerName, Array], small_to_large_side: float, camera: CameraModel
+    expected_corners_px: Mapping[MarkerName, Array],
+    small_to_large_side_ratio: float,
+    camera: CameraModel,
 ) -> RigidPose | None:
     name: MarkerName = "small" if "small" in expected_corners_px else "large"
     rays = undistort_to_normalised(expected_corners_px[name], camera)
     if not np.isfinite(rays).all():
         return None
-    side_to_large_side = small_to_large_side if name == "small" else 1.0
+    side_to_large_side_ratio = small_to_large_side_ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform(
-        (side_to_large_side * CENTRED_SQUARE).astype(np.float32), rays.astype(np.float32)
+        (side_to_large_side_ratio * CENTRED_SQUARE).astype(np.float32), rays.astype(np.float32)
     )
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
@@ -197,13 +221,13 @@ def _initial_pose(
 
 
 def _search_near_pose(
-    start: RigidPose, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
+    start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
-    """Return the pose near `start`, shifted across the picture and along the line of sight, at
-    which the rendered drawing correlates best with the coarse picture; None if it correlates well
+    """Return the pose near `start`, shifted across the image and along the line of sight, at
+    which the rendered drawing correlates best with the coarse image; None if it correlates well
     nowhere."""
-    best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_picture.lattice
-    for growth in _SCALE_CANDIDATES:
+    best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
+    for growth in _RANGE_SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
         wide = render_drawing(
             RigidPose(start.R_cam_drawing, t).H_normalised_drawing,
@@ -211,8 +235,8 @@ def _search_near_pose(
             lattice,
             _SEARCH_RANGE_NODES,
         )
-        mask = coarse_picture.is_visible.astype(np.float32)
-        score = cv2.matchTemplate(wide, coarse_picture.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+        mask = coarse_image.is_visible.astype(np.float32)
+        score = cv2.matchTemplate(wide, coarse_image.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         drift = (
@@ -233,19 +257,19 @@ def _is_reliable(pose_fit: PoseFit) -> bool:
     )
     return (
         pose_fit.found_point_count >= _MIN_FOUND_POINT_FRACTION * pose_fit.visible_point_count
-        and pose_fit.residual_px < _MAX_CUT_RESIDUAL_PX
+        and pose_fit.residual_px < _MAX_TRUNCATED_FIT_RESIDUAL_PX
         and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
     )
 
 
 def _marker_corners(
-    pose_fit: PoseFit, side_to_large_side: float, camera: CameraModel
+    pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners (4, 2) px of the marker whose side is `side_to_large_side` times the large
-    marker's; None if a corner is so far from the optical axis that the lens model is not valid
-    there."""
+    """Return the corners (4, 2) px of the marker whose side is `side_to_large_side_ratio` times the
+    large marker's; None if a corner is so far from the optical axis that the lens model is not
+    valid there."""
     r = (
-        np.column_stack([side_to_large_side * CENTRED_SQUARE, np.zeros(4)])
+        np.column_stack([side_to_large_side_ratio * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
     )
     X = r + pose_fit.pose.t_cam_drawing_half_sides
@@ -269,15 +293,15 @@ def _marker_corners(
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
 
-# --- A reduced picture through a pinhole camera, and the drawing rendered into it ---
+# --- A reduced image through a pinhole camera, and the drawing rendered into it ---
 
 
 FloatImage = NDArray[np.float32]
 
-_LATTICE_COLUMNS = 80  # across the picture, approximately
+_LATTICE_COLUMNS = 80  # across the image, approximately
 _SAMPLES_PER_NODE = 2  # samples per node in both directions
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
-_POINTS_PER_PICTURE_SIDE = 40
+_POINTS_PER_IMAGE_SIDE = 40
 _VALID_RADIUS_FACTOR = 1.02
 _SEARCH_RANGE_NODES = 6  # nodes to each side
 _MIN_PAPER_NODES = 200  # least number of nodes on paper
@@ -285,7 +309,7 @@ _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
 @dataclass(frozen=True, eq=False)
 class CoarseLattice:
-    """A regular grid of nodes in normalised image coordinates, at which pictures are sampled
+    """A regular grid of nodes in normalised image coordinates, at which images are sampled
     without lens distortion.
 
     Attributes:
@@ -293,9 +317,9 @@ class CoarseLattice:
         node_spacing_normalised: distance between neighbouring nodes.
         valid_radius_normalised: distance from the optical axis up to which the lens model is used;
             further out, it may map two directions to the same pixel.
-        map_x_px, map_y_px: maps for cv2.remap: the position of each sample in the reduced picture.
-        reduced_size_px: width and height of the reduced picture.
-        is_in_picture: True for nodes inside the picture, (rows, columns).
+        map_x_px, map_y_px: maps for cv2.remap: the position of each sample in the reduced image.
+        reduced_size_px: width and height of the reduced image.
+        is_in_image: True for nodes inside the image, (rows, columns).
     """
 
     first_node_normalised: Array
@@ -304,13 +328,13 @@ class CoarseLattice:
     map_x_px: FloatImage
     map_y_px: FloatImage
     reduced_size_px: tuple[int, int]
-    is_in_picture: NDArray[np.bool_]
+    is_in_image: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class CoarseUndistortedPicture:
-    """A reduced picture without lens distortion: grey values (rows, columns) at the nodes of a
-    lattice. `is_visible` is True for nodes in the picture that the vehicle does not cover."""
+class CoarseUndistortedImage:
+    """A reduced image without lens distortion: grey values (rows, columns) at the nodes of a
+    lattice. `is_visible` is True for nodes in the image that the vehicle does not cover."""
 
     lattice: CoarseLattice
     grey: FloatImage
@@ -318,10 +342,10 @@ class CoarseUndistortedPicture:
 
 
 @lru_cache(maxsize=8)
-def make_lattice(camera: CameraModel) -> CoarseLattice:
-    """Return the lattice over a camera's picture."""
+def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
+    """Return the lattice over a camera's image."""
     w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _POINTS_PER_PICTURE_SIDE)
+    s = np.linspace(0.0, 1.0, _POINTS_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
     rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
     rays = undistort_to_normalised(rim * (w - 1.0, h - 1.0), camera)
@@ -353,34 +377,36 @@ def make_lattice(camera: CameraModel) -> CoarseLattice:
         map_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
         map_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
         reduced_size_px=size,
-        is_in_picture=inside.reshape(shape).all(axis=(1, 3)),
+        is_in_image=inside.reshape(shape).all(axis=(1, 3)),
     )
 
 
-def make_coarse_picture(
+def make_coarse_image(
     image: NDArray[np.uint8], camera: CameraModel, hidden_mask_u8: NDArray[np.uint8] | None = None
-) -> CoarseUndistortedPicture:
-    """Return the picture without lens distortion, reduced to the nodes of the camera's lattice.
+) -> CoarseUndistortedImage:
+    """Return the image without lens distortion, reduced to the nodes of the camera's lattice.
     Nodes where `hidden_mask_u8` (h, w) is not zero are marked as not visible."""
-    lattice = make_lattice(camera)
-    seen = lattice.is_in_picture
+    lattice = make_coarse_lattice(camera)
+    seen = lattice.is_in_image
     if hidden_mask_u8 is not None:
         covered = (hidden_mask_u8 != 0).astype(np.float32)
         seen = seen & (_sample_at_nodes(covered, lattice) < 1e-3)
-    return CoarseUndistortedPicture(lattice, _sample_at_nodes(image, lattice), seen)
+    return CoarseUndistortedImage(lattice, _sample_at_nodes(image, lattice), seen)
 
 
-def _sample_at_nodes(picture: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice) -> FloatImage:
-    small = cv2.resize(picture, lattice.reduced_size_px, interpolation=cv2.INTER_AREA).astype(
+def _sample_at_nodes(image: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice) -> FloatImage:
+    small = cv2.resize(image, lattice.reduced_size_px, interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
-    fine = cv2.remap(small, lattice.map_x_px, lattice.map_y_px, cv2.INTER_LINEAR)
-    return _downsample(np.asarray(fine, np.float32))
+    fine_image = cv2.remap(small, lattice.map_x_px, lattice.map_y_px, cv2.INTER_LINEAR)
+    return _downsample(np.asarray(fine_image, np.float32))
 
 
-def _downsample(fine: FloatImage) -> FloatImage:
-    rows, columns = (n // _SAMPLES_PER_NODE for n in fine.shape)
-    return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+def _downsample(fine_image: FloatImage) -> FloatImage:
+    rows, columns = (n // _SAMPLES_PER_NODE for n in fine_image.shape)
+    return np.asarray(
+        cv2.resize(fine_image, (columns, rows), interpolation=cv2.INTER_AREA), np.float32
+    )
 
 
 def render_drawing(
@@ -399,7 +425,7 @@ def render_drawing(
     )
     white, T = texture
     M = G @ H @ np.linalg.inv(T)
-    rows, columns = lattice.is_in_picture.shape
+    rows, columns = lattice.is_in_image.shape
     size = (
         _SAMPLES_PER_NODE * (columns + 2 * margin_nodes),
         _SAMPLES_PER_NODE * (rows + 2 * margin_nodes),
@@ -416,7 +442,7 @@ def render_drawing(
 
 
 class DrawingMatch(NamedTuple):
-    """How well the picture matches the drawing: their correlation, 0 to 1, and the picture's
+    """How well the image matches the drawing: their correlation, 0 to 1, and the image's
     contrast from black to white, in grey levels."""
 
     correlation: float
@@ -424,12 +450,12 @@ class DrawingMatch(NamedTuple):
 
 
 def correlate_drawing(
-    H: Array, texture: DrawingTexture, coarse_picture: CoarseUndistortedPicture
+    H: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
-    """Compare the coarse picture with the drawing projected by H (3, 3), under the light that fits
+    """Compare the coarse image with the drawing projected by H (3, 3), under the light that fits
     best."""
-    lattice = coarse_picture.lattice
-    rows, columns = np.nonzero(coarse_picture.is_visible)
+    lattice = coarse_image.lattice
+    rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
         [columns, rows], axis=1
     ).astype(np.float64)
@@ -440,7 +466,7 @@ def correlate_drawing(
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return DrawingMatch(0.0, 0.0)
     white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
-    grey = coarse_picture.grey[rows[on], columns[on]].astype(np.float64)
+    grey = coarse_image.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
@@ -459,7 +485,7 @@ _TEXTURE_SIZE_PX = 320
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class TargetOutline:
     """Points along the edges of the target's drawing.
 
     Attributes:
@@ -480,7 +506,7 @@ class Outline:
 
 
 class DrawingTexture(NamedTuple):
-    """A picture of the target and its white paper: `whiteness` (m, m), 0 to 1, and the homography
+    """An image of the target and its white paper: `whiteness` (m, m), 0 to 1, and the homography
     (3, 3) from the drawing's coordinates to its pixels."""
 
     whiteness: FloatImage
@@ -489,11 +515,11 @@ class DrawingTexture(NamedTuple):
 
 @lru_cache(maxsize=8)
 def make_outline(
-    drawing: Drawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
-) -> Outline:
+    drawing: MarkerDrawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
+) -> TargetOutline:
     """Return the edges of both markers as points. The tolerances are standard deviations of the
     position of a printed edge, in cells."""
-    hidden = _SMALL_MARKER_REACH_HALF_SIDES * drawing.small_to_large_side
+    hidden = _SMALL_MARKER_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
         for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
@@ -502,14 +528,14 @@ def make_outline(
     large = len(edges)
     if drawing.small_cell_whiteness is not None:
         edges += _iterate_cell_edges(
-            drawing.small_cell_whiteness, drawing.small_to_large_side, _POINTS_PER_SMALL_CELL
+            drawing.small_cell_whiteness, drawing.small_to_large_side_ratio, _POINTS_PER_SMALL_CELL
         )
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
     points_per_edge = np.array([len(each) for each in at])
     cell = np.repeat(cells, points_per_edge)
     small = np.repeat(np.arange(len(edges)) >= large, points_per_edge)
-    return Outline(
+    return TargetOutline(
         points_half_sides=np.concatenate(at),
         normal=np.repeat(normals, points_per_edge, axis=0),
         line_index=np.repeat([numbers[name] for name in names], points_per_edge),
@@ -523,9 +549,9 @@ def make_outline(
 
 
 @lru_cache(maxsize=8)
-def make_texture(drawing: Drawing) -> DrawingTexture:
+def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
     """Render the target and its white paper to `PAPER_REACH_LARGE_HALF_SIDES` from the centre."""
-    axis = make_grid(_TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES).node_positions
+    axis = make_sampling_grid(_TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES).node_positions
     wide = render_cells(drawing, axis, PAPER_REACH_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
     more = (len(wide) - _TEXTURE_SIZE_PX) // 2
     scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_HALF_SIDES)
@@ -545,12 +571,12 @@ class _CellEdge(NamedTuple):
 
 
 def _iterate_cell_edges(
-    cell_whiteness: Array, side_to_large_side: float, points_per_edge: int
+    cell_whiteness: Array, side_to_large_side_ratio: float, points_per_edge: int
 ) -> Iterator[_CellEdge]:
     """Yield each edge between a black and a white cell of a marker with `cell_whiteness` (n, n),
-    sampled at `points_per_edge` points. The marker's side is `side_to_large_side` times the large
-    marker's."""
-    width = 2.0 * side_to_large_side / len(cell_whiteness)
+    sampled at `points_per_edge` points. The marker's side is `side_to_large_side_ratio` times the
+    large marker's."""
+    width = 2.0 * side_to_large_side_ratio / len(cell_whiteness)
     s = (
         _EDGE_END_MARGIN_CELLS
         + (1.0 - 2.0 * _EDGE_END_MARGIN_CELLS)
@@ -563,21 +589,21 @@ def _iterate_cell_edges(
         step = padded[:, 1:] - padded[:, :-1]
         for i, j in np.argwhere(step != 0.0).tolist():
             at = np.empty((points_per_edge, 2))
-            at[:, across] = width * j - side_to_large_side
-            at[:, 1 - across] = width * (i + s) - side_to_large_side
+            at[:, across] = width * j - side_to_large_side_ratio
+            at[:, 1 - across] = width * (i + s) - side_to_large_side_ratio
             towards = float(np.sign(step[i, j]))
             normal = (towards, 0.0) if across == 0 else (0.0, towards)
-            yield _CellEdge(at, normal, (side_to_large_side, across, j), width)
+            yield _CellEdge(at, normal, (side_to_large_side_ratio, across, j), width)
 
 
 # --- Pose of the target from the edges in view ---
 # Gauss-Newton rotates and moves the drawing until its edges match those located across them in the
-# picture. The unknowns are those of a rigid body: a part of a drawing does not determine the eight
+# image. The unknowns are those of a rigid body: a part of a drawing does not determine the eight
 # terms of a homography, and an unobserved tilt stays at the prediction. The unit is half the side
 # of the large marker.
 
 
-# Half lengths of the profiles per round. An ascent blurs edges near the picture's border by several
+# Half lengths of the profiles per round. An ascent blurs edges near the image's border by several
 # pixels.
 _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
@@ -633,7 +659,7 @@ class PoseFit:
         pose: the pose of the drawing.
         rotation_translation_cov: covariance (6, 6) of small rotations about (rad) and translations
             along (half sides of the large marker) the camera's x, y, z.
-        visible_point_count: number of edge points in the picture.
+        visible_point_count: number of edge points in the image.
         found_point_count: number of these points at which an edge was found.
         small_marker_point_count: number of found points on the small marker.
         residual_px: RMS distance of the found edges from the drawing's.
@@ -649,7 +675,7 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """Edge points of an outline that are in the picture.
+    """Edge points of an outline that are in the image.
 
     Attributes:
         points_px, normal: points (n, 2) px, and unit normals (n, 2) from black to white.
@@ -666,7 +692,7 @@ class _EdgePoints:
     outline_index: NDArray[np.intp]
 
 
-class _FitStep(NamedTuple):
+class _GaussNewtonStep(NamedTuple):
     """A Gauss-Newton step: the change (7,) of rotation about the camera's axes (rad), translation
     (half sides) and edge shift (px); the inverse (7, 7) of the normal matrix, the weights (n,) of
     the points, and the variance of one point."""
@@ -680,11 +706,11 @@ class _FitStep(NamedTuple):
 def fit_pose(
     image: NDArray[np.uint8],
     start: RigidPose,
-    outline: Outline,
+    outline: TargetOutline,
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
-    """Fit the pose in which the drawing's edges match the picture's; None if the fit fails."""
+    """Fit the pose in which the drawing's edges match the image's; None if the fit fails."""
     pose, pose_and_shift_change_from_start, fit_step, moved_px = start, np.zeros(7), None, math.inf
     for profile_reach_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
         edge_points = _edge_points_in_view(
@@ -698,13 +724,13 @@ def fit_pose(
             * edge_points.px_per_half_side
         )
         profile_half_lengths_px = np.minimum(profile_reach_px, reach_cells_px)
-        edge_from_expected_px, is_edge_found = _measure_offsets(
+        edge_offset_px, is_edge_found = _measure_offsets(
             image, edge_points, profile_half_lengths_px
         )
         if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
             return None
-        fit_step = _solve_step(
-            edge_points, edge_from_expected_px, is_edge_found, pose_and_shift_change_from_start
+        fit_step = _solve_gauss_newton_step(
+            edge_points, edge_offset_px, is_edge_found, pose_and_shift_change_from_start
         )
         if fit_step is None:
             return None
@@ -722,8 +748,10 @@ def fit_pose(
     return _make_pose_fit(pose, fit_step, edge_points, outline)
 
 
-def predict_fit_accuracy(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """Return the result that `fit_pose` would have for a perfect picture taken at that pose; None
+def predict_fit_accuracy(
+    pose: RigidPose, outline: TargetOutline, camera: CameraModel
+) -> PoseFit | None:
+    """Return the result that `fit_pose` would have for a perfect image taken at that pose; None
     if too little of the target is visible."""
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
@@ -731,13 +759,15 @@ def predict_fit_accuracy(pose: RigidPose, outline: Outline, camera: CameraModel)
     n = len(edge_points.outline_index)
     if n < _MIN_EDGE_POINTS:
         return None
-    fit_step = _solve_step(edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    fit_step = _solve_gauss_newton_step(
+        edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7)
+    )
     return None if fit_step is None else _make_pose_fit(pose, fit_step, edge_points, outline)
 
 
 def _edge_points_in_view(
     pose: RigidPose,
-    outline: Outline,
+    outline: TargetOutline,
     profile_reach_px: float,
     shape: tuple[int, ...],
     camera: CameraModel,
@@ -751,7 +781,9 @@ def _edge_points_in_view(
     )
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
-    near = np.flatnonzero(ahead & (np.hypot(*x.T) < make_lattice(camera).valid_radius_normalised))
+    near = np.flatnonzero(
+        ahead & (np.hypot(*x.T) < make_coarse_lattice(camera).valid_radius_normalised)
+    )
     at = distort_to_px(x[near], camera)
     room = profile_reach_px + 1.0
     inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
@@ -794,7 +826,7 @@ def _edge_points_in_view(
 def _measure_offsets(
     image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the distance of each edge in the picture from its expected position along the point's
+    """Return the distance of each edge in the image from its expected position along the point's
     normal, positive towards white, (n,) px, and whether an edge was found."""
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
     grey = sample_profiles(
@@ -810,25 +842,23 @@ def _measure_offsets(
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
     least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
     is_edge_found = (contrast > least) & (total > 0.25 * least)
-    edge_from_expected_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
-    return np.clip(
-        edge_from_expected_px, -profile_half_lengths_px, profile_half_lengths_px
-    ), is_edge_found
+    edge_offset_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
+    return np.clip(edge_offset_px, -profile_half_lengths_px, profile_half_lengths_px), is_edge_found
 
 
-def _solve_step(
+def _solve_gauss_newton_step(
     edge_points: _EdgePoints,
-    edge_from_expected_px: Array,
+    edge_offset_px: Array,
     is_edge_found: NDArray[np.bool_],
     pose_and_shift_change_from_start: Array,
-) -> _FitStep | None:
-    """Return one robust Gauss-Newton step of the seven unknowns of `_FitStep`; None if too few
-    edges count. `edge_from_expected_px` (n,) is the result of `_measure_offsets`. The prior pulls
+) -> _GaussNewtonStep | None:
+    """Return one robust Gauss-Newton step of the seven unknowns of `_GaussNewtonStep`; None if too
+    few edges count. `edge_offset_px` (n,) is the result of `_measure_offsets`. The prior pulls
     `pose_and_shift_change_from_start` (7,), the sum of the previous steps, back to zero."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
-        error = edge_from_expected_px - J @ step
+        error = edge_offset_px - J @ step
         size = np.abs(error)
         scale = max(1.4826 * float(np.median(size[is_edge_found])), _MIN_TUKEY_SCALE_PX)
         weight = (
@@ -841,14 +871,14 @@ def _solve_step(
         N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (
-            J.T @ (weight * edge_from_expected_px) / variance
+            J.T @ (weight * edge_offset_px) / variance
             - _PREDICTION_INFORMATION * pose_and_shift_change_from_start
         )
-    return _FitStep(step, inverse, weight, variance)
+    return _GaussNewtonStep(step, inverse, weight, variance)
 
 
 def _make_pose_fit(
-    pose: RigidPose, fit_step: _FitStep, edge_points: _EdgePoints, outline: Outline
+    pose: RigidPose, fit_step: _GaussNewtonStep, edge_points: _EdgePoints, outline: TargetOutline
 ) -> PoseFit:
     J, (_, inverse, w, variance) = edge_points.J, fit_step
     line = outline.line_index[edge_points.outline_index]

@@ -1,4 +1,4 @@
-"""Detect the corners of the target's two markers in a picture.
+"""Detect the corners of the target's two markers in an image.
 
 `CORNER_METHODS` lists the methods that find corners in the order in which they are tried, with the
 requirements, cost and use of each; ``docs/corners.md`` shows examples of all.
@@ -27,35 +27,35 @@ from perchctl.vision.markers.blurred import align_marker, find_blurred, find_exp
 from perchctl.vision.markers.corners import (
     CORNER_SIGMA_FROM_OTHER_MARKER_PX,
     RefinedCorners,
-    add_missing_marker,
-    is_inside_picture,
+    add_missing_marker_corners,
+    is_inside_image,
     mean_side_px,
     refine_subpix,
     side_lengths_px,
 )
 from perchctl.vision.markers.cut import (
-    MAX_CUT_FIT_AGE_S,
-    can_whole_marker_be_in_view,
-    fit_cut_markers,
-    is_target_cut,
+    MAX_TRUNCATED_FIT_AGE_S,
+    can_complete_marker_be_in_view,
+    fit_truncated_markers,
+    is_target_truncated,
 )
 from perchctl.vision.markers.detector import (
+    DetectorInput,
     DetectorSetup,
-    Picture,
     fill_hidden_pixels,
     is_any_part_hidden,
     make_hidden_mask,
 )
 from perchctl.vision.markers.edge_fit import refine_corners_by_lines
 from perchctl.vision.markers.partial import (
-    PICTURE_MARGIN_PX,
-    IdentifiedBy,
-    fit_partly_visible,
+    IMAGE_MARGIN_PX,
+    IdentificationEvidence,
+    fit_partly_visible_marker,
     is_fully_visible,
 )
 from perchctl.vision.markers.pattern import (
     MIN_MARKER_SIDE_PX,
-    Pattern,
+    MarkerPattern,
     has_matching_cells,
     has_mostly_matching_cells,
     is_correlated_with_pattern,
@@ -74,7 +74,7 @@ from perchctl.vision.types import (
 )
 
 _MIN_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
-# pictures for which a measured shift of all edges is valid, since light changes slowly
+# images for which a measured shift of all edges is valid, since light changes slowly
 _MAX_EDGE_SHIFT_AGE_FRAMES = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
 
@@ -83,40 +83,40 @@ _FoundCorners = dict[MarkerName, RefinedCorners]
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class DetectionPrior:
     """Knowledge about the target before a frame is examined.
 
     Attributes:
         expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
             expected.
-        expected_corners_of_both_markers_px: the same, with a missing marker derived from the other
+        expected_corners_both_markers_px: the same, with a missing marker derived from the other
             one.
         search_mode: the kinds of search for this frame.
-        start_blur_counter: counter that alternates the blur with which blurred fits start (see
-            `find_expected_blurred`).
-        was_target_seen_recently: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame;
-            always False if edge fits are disabled.
-        was_target_cut: `was_target_seen_recently` is True, and no marker can have been completely
-            in that picture.
+        initial_blur_frame_counter: counter that alternates the blur with which blurred fits start
+            (see `find_expected_blurred`).
+        was_target_seen_recently: a marker was found at most `MAX_TRUNCATED_FIT_AGE_S` before this
+            frame; always False if edge fits are disabled.
+        was_target_truncated: `was_target_seen_recently` is True, and no marker can have been
+            completely in that image.
         previous_edge_shift: how far white has grown over black, measured in one of the last frames;
             None: measure it in this one.
         measure_own_target_distance_m: function that returns a marker's distance, m, from where this
             vehicle's own target is believed to be; it chooses one of several targets if none is
-            expected. None: choose by the picture alone.
+            expected. None: choose by the image alone.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
-    expected_corners_of_both_markers_px: Mapping[MarkerName, Array]
+    expected_corners_both_markers_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    start_blur_counter: int | None
+    initial_blur_frame_counter: int | None
     was_target_seen_recently: bool
-    was_target_cut: bool
+    was_target_truncated: bool
     previous_edge_shift: EdgeShift | None
     measure_own_target_distance_m: OwnTargetDistanceFunction | None
 
 
 @dataclass(frozen=True, eq=False)
-class CornerFindings:
+class CornerResults:
     """Results of the methods tried so far: the markers' `corners`, and the raw markers that the
     last search found, `search_result`."""
 
@@ -130,118 +130,154 @@ class CornerMethod:
 
     Attributes:
         name: its heading in ``docs/corners.md``.
-        needs: its requirements.
-        cost_text: typical time for a picture of 640x480 on one core.
-        used_when: `should_run` in words.
-        should_run: function that returns True if the method should be tried on the picture, given
+        requirements: its requirements.
+        cost_text: typical time for an image of 640x480 on one core.
+        condition: `should_run` in words.
+        should_run: function that returns True if the method should be tried on the image, given
             the prior and the findings so far.
         find: function that returns the findings that replace the previous ones.
     """
 
     name: str
-    needs: str
+    requirements: str
     cost_text: str
-    used_when: str
-    should_run: Callable[[Picture, Prior, CornerFindings], bool]
-    find: Callable[[Picture, Prior, CornerFindings], CornerFindings]
+    condition: str
+    should_run: Callable[[DetectorInput, DetectionPrior, CornerResults], bool]
+    find: Callable[[DetectorInput, DetectionPrior, CornerResults], CornerResults]
 
 
-def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+def _is_target_expected(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
     return (
         prior.search_mode != "expected_fits"
-        and bool(prior.expected_corners_of_both_markers_px)
-        and picture.setup.is_line_fit_enabled
+        and bool(prior.expected_corners_both_markers_px)
+        and detector_input.setup.is_line_fit_enabled
     )
 
 
-def _fit_edges(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
+def _fit_edges(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
     return replace(
         found,
         corners=refine_expected_markers(
-            picture, prior.expected_corners_of_both_markers_px, prior.previous_edge_shift
+            detector_input, prior.expected_corners_both_markers_px, prior.previous_edge_shift
         ),
     )
 
 
-def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    return _is_target_expected(picture, prior, found) and not found.corners
+def _has_edge_fit_found_nothing(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
+    return _is_target_expected(detector_input, prior, found) and not found.corners
 
 
-def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
+def _search_half_size(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
     # If no side was found, a close target has usually moved further than a profile reaches.
-    searched = search_half_size(picture, prior.expected_corners_of_both_markers_px)
+    searched = search_half_size(detector_input, prior.expected_corners_both_markers_px)
     if searched is None:
         return found
-    corners = _refine_found(picture, searched)
-    return CornerFindings(corners, searched) if corners else found
+    corners = _refine_found_markers(detector_input, searched)
+    return CornerResults(corners, searched) if corners else found
 
 
-def _is_half_size_search_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    return _is_target_expected(picture, prior, found) and not found.search_result.corners_px
+def _has_half_size_search_found_nothing(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
+    return _is_target_expected(detector_input, prior, found) and not found.search_result.corners_px
 
 
-def _fit_visible_part(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    corners = add_partly_visible(
-        picture, prior.expected_corners_of_both_markers_px, found.corners, prior.previous_edge_shift
+def _fit_visible_part(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
+    corners = add_partly_visible_markers(
+        detector_input,
+        prior.expected_corners_both_markers_px,
+        found.corners,
+        prior.previous_edge_shift,
     )
     return replace(found, corners=corners)
 
 
-def _needs_photometric_fit(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    patterns = picture.setup.patterns
-    return _is_half_size_search_empty(picture, prior, found) and not any(
+def _needs_photometric_fit(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
+    patterns = detector_input.setup.patterns
+    return _has_half_size_search_found_nothing(detector_input, prior, found) and not any(
         is_line_fit_sufficient(r, patterns[name]) for name, r in found.corners.items()
     )
 
 
-def _fit_drawing(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    return replace(found, corners=refine_photometrically(picture, found.corners))
+def _fit_drawing(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
+    return replace(found, corners=refine_photometrically(detector_input, found.corners))
 
 
-def _can_be_cut(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+def _can_be_truncated(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
     if found.corners or not prior.was_target_seen_recently:
         return False
-    return is_target_cut(
-        prior.expected_corners_of_both_markers_px, picture.image.shape, picture.hidden_mask
+    return is_target_truncated(
+        prior.expected_corners_both_markers_px,
+        detector_input.image.shape,
+        detector_input.hidden_mask,
     )
 
 
-def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    return replace(found, corners=fit_cut_markers(picture, prior.expected_corners_px))
+def _fit_truncated_target(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
+    return replace(found, corners=fit_truncated_markers(detector_input, prior.expected_corners_px))
 
 
-def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+def _should_search(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
     if prior.search_mode in ("whole_blurred", "expected_fits"):
         return False
     if not found.corners and (
-        not prior.was_target_cut
-        or can_whole_marker_be_in_view(
-            prior.expected_corners_of_both_markers_px, picture.image.shape
+        not prior.was_target_truncated
+        or can_complete_marker_be_in_view(
+            prior.expected_corners_both_markers_px, detector_input.image.shape
         )
     ):
         return True
-    return _is_marker_missing(picture, found.corners, prior.expected_corners_px)
+    return _is_marker_missing(detector_input, found.corners, prior.expected_corners_px)
 
 
-def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
+def _search(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
     searched = search(
-        picture, prior.expected_corners_px, prior.search_mode, prior.measure_own_target_distance_m
+        detector_input,
+        prior.expected_corners_px,
+        prior.search_mode,
+        prior.measure_own_target_distance_m,
     )
     if len(searched.corners_px) < len(found.corners):
         return replace(found, search_result=searched)
-    return CornerFindings(_refine_found(picture, searched), searched)
+    return CornerResults(_refine_found_markers(detector_input, searched), searched)
 
 
-def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+def _can_be_blurred(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> bool:
     allowed = prior.search_mode not in ("whole_sharp", "expected_window")
-    return not found.corners and allowed and picture.setup.is_line_fit_enabled
+    return not found.corners and allowed and detector_input.setup.is_line_fit_enabled
 
 
-def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    bare = replace(picture, hidden_mask=None)
+def _search_blurred(
+    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+) -> CornerResults:
+    bare = replace(detector_input, hidden_mask=None)
     if prior.expected_corners_px:
         found_corners = find_expected_blurred(
-            bare, prior.expected_corners_px, prior.start_blur_counter
+            bare, prior.expected_corners_px, prior.initial_blur_frame_counter
         )
     else:
         found_corners = find_blurred(bare)
@@ -251,77 +287,78 @@ def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> Co
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
-        needs="an expected marker, whole, with cells of 2.5 px and straight sides",
+        requirements="an expected marker, whole, with cells of 2.5 px and straight sides",
         cost_text="0.7 ms",
-        used_when="the target is expected; after a loss, in three of four pictures",
+        condition="the target is expected; after a loss, in three of four pictures",
         should_run=_is_target_expected,
         find=_fit_edges,
     ),
     CornerMethod(
         name="Half-size search",
-        needs="both markers expected, those in view with sides above 60 px",
+        requirements="both markers expected, those in view with sides above 60 px",
         cost_text="5 ms, with the measurement of what it finds",
-        used_when="the edge fit was tried and found no marker",
-        should_run=_is_edge_fit_empty,
+        condition="the edge fit was tried and found no marker",
+        should_run=_has_edge_fit_found_nothing,
         find=_search_half_size,
     ),
     CornerMethod(
         name="Partial-view fit",
-        needs="an expected marker with cells of 4 px, 60 % of its cells and four of its edges",
+        requirements="an expected marker with cells of 4 px, 60 % of its cells and four of its "
+        "edges",
         cost_text="3 ms for each marker",
-        used_when="the edge fit was tried, and a marker is missing; "
+        condition="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
-        should_run=_is_half_size_search_empty,
+        should_run=_has_half_size_search_found_nothing,
         find=_fit_visible_part,
     ),
     CornerMethod(
         name="Photometric fit",
-        needs="a whole marker with sides of 7 px, and corners to within 0.3 sides",
+        requirements="a whole marker with sides of 7 px, and corners to within 0.3 sides",
         cost_text="1.3 ms for each marker",
-        used_when="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
+        condition="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
         "than 6 px or than six times the blur; not if the half-size search found one",
         should_run=_needs_photometric_fit,
         find=_fit_drawing,
     ),
     CornerMethod(
         name="Cut-view fit",
-        needs="a measurement at most 0.5 s old, and small-marker cells of 8 px",
+        requirements="a measurement at most 0.5 s old, and small-marker cells of 8 px",
         cost_text="7 ms",
-        used_when="nothing was found, and each expected marker may be cut by the picture or hidden",
-        should_run=_can_be_cut,
-        find=_fit_cut_target,
+        condition="nothing was found, and each expected marker may be cut by the picture or hidden",
+        should_run=_can_be_truncated,
+        find=_fit_truncated_target,
     ),
     CornerMethod(
         name="Search",
-        needs="a marker whose bits can be read",
+        requirements="a marker whose bits can be read",
         cost_text="4 to 9 ms, with the measurement of what it finds",
-        used_when="nothing was found, unless the target was cut and still is; or an expected "
+        condition="nothing was found, unless the target was cut and still is; or an expected "
         "marker with sides above 13 px is missing; after a loss, in three of four pictures",
         should_run=_should_search,
         find=_search,
     ),
     CornerMethod(
         name="Blurred search",
-        needs="a whole marker with sides of 7 px that resembles its drawing",
+        requirements="a whole marker with sides of 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
-        used_when="nothing was found; after a loss, in one of four pictures",
+        condition="nothing was found; after a loss, in one of four pictures",
         should_run=_can_be_blurred,
         find=_search_blurred,
     ),
 )
-"""The methods, tried in this order in each picture. With ``detector.refinement: subpix``, only the
+"""The methods, tried in this order in each image. With ``detector.refinement: subpix``, only the
 search is used."""
 
 
-def find_corners(picture: Picture, prior: Prior) -> CornerFindings:
+def find_corners(detector_input: DetectorInput, prior: DetectionPrior) -> CornerResults:
     """Find the markers' corners with each applicable method of `CORNER_METHODS` in turn.
 
     Each method starts from the findings of the methods before it.
     """
-    found = CornerFindings()
+    found = CornerResults()
     for method in CORNER_METHODS:
-        if method.should_run(picture, prior, found):
-            found = method.find(picture, prior, found)
+        if method.should_run(detector_input, prior, found):
+            found = method.find(detector_input, prior, found)
     return found
 
 
@@ -342,7 +379,7 @@ def detect_markers(
     applies all kinds. If no target is expected, `measure_own_target_distance_m` chooses one of
     several. For a frame of two fields, the result is the mean of the fields.
     """
-    prior = make_prior(
+    prior = make_detection_prior(
         frame,
         previous,
         setup,
@@ -357,7 +394,7 @@ def detect_markers(
     return add_marker_flow(_detect(frame, setup, camera, prior), previous)
 
 
-def make_prior(
+def make_detection_prior(
     frame: Frame,
     previous: Detections | None,
     setup: DetectorSetup,
@@ -365,7 +402,7 @@ def make_prior(
     expected_corners_px: Mapping[MarkerName, Array] | None = None,
     frames_without_markers: int | None = None,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
-) -> Prior:
+) -> DetectionPrior:
     """Return the knowledge before the frame; arguments as in `detect_markers`."""
     expected_corners_px = (
         dict(expected_corners_px)
@@ -375,12 +412,12 @@ def make_prior(
     search_mode = _choose_search_mode(
         frames_without_markers, bool(expected_corners_px), setup.is_line_fit_enabled
     )
-    start_blur_counter = None
+    initial_blur_frame_counter = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
-        start_blur_counter = (frames_without_markers + 2) // 4
+        initial_blur_frame_counter = (frames_without_markers + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
-    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_CUT_FIT_AGE_S
+    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_TRUNCATED_FIT_AGE_S
     was_recent = was_recent and setup.is_line_fit_enabled and bool(last)
     previous_edge_shift = None if previous is None else previous.edge_shift
     if previous_edge_shift is not None:
@@ -390,24 +427,27 @@ def make_prior(
             if age < _MAX_EDGE_SHIFT_AGE_FRAMES
             else None
         )
-    return Prior(
+    return DetectionPrior(
         expected_corners_px=expected_corners_px,
-        expected_corners_of_both_markers_px=add_missing_marker(
-            expected_corners_px, setup.small_to_large_side, camera
+        expected_corners_both_markers_px=add_missing_marker_corners(
+            expected_corners_px, setup.small_to_large_side_ratio, camera
         ),
         search_mode=search_mode,
-        start_blur_counter=start_blur_counter,
+        initial_blur_frame_counter=initial_blur_frame_counter,
         was_target_seen_recently=was_recent,
-        was_target_cut=was_recent and not can_whole_marker_be_in_view(last, frame.image.shape),
+        was_target_truncated=was_recent
+        and not can_complete_marker_be_in_view(last, frame.image.shape),
         previous_edge_shift=previous_edge_shift,
         measure_own_target_distance_m=measure_own_target_distance_m,
     )
 
 
-def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prior) -> Detections:
+def _detect(
+    frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: DetectionPrior
+) -> Detections:
     hidden_mask = make_hidden_mask(frame, setup.hidden_mask)
     image = frame.image if hidden_mask is None else fill_hidden_pixels(frame.image, hidden_mask)
-    found = find_corners(Picture(image, hidden_mask, setup, camera), prior)
+    found = find_corners(DetectorInput(image, hidden_mask, setup, camera), prior)
     found_corners = found.corners
     shifts = (r.corrected_edge_shift for r in found_corners.values())
     return Detections(
@@ -445,24 +485,26 @@ def _choose_search_mode(
 
 
 def _is_marker_missing(
-    picture: Picture, found_corners: _FoundCorners, expected_corners_px: Mapping[MarkerName, Array]
+    detector_input: DetectorInput,
+    found_corners: _FoundCorners,
+    expected_corners_px: Mapping[MarkerName, Array],
 ) -> bool:
     return any(
         name not in found_corners
-        and is_inside_picture(corners, picture.image.shape)
+        and is_inside_image(corners, detector_input.image.shape)
         and side_lengths_px(corners).min() > _MIN_SEARCHED_SIDE_PX
-        and not is_any_part_hidden(picture.hidden_mask, corners)
+        and not is_any_part_hidden(detector_input.hidden_mask, corners)
         for name, corners in expected_corners_px.items()
     )
 
 
-def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
+def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
     """Measure the raw corners of a search: by the edge fit, otherwise by subpixel refinement.
     Markers that are not completely in view are measured by the partial-view fit because a search
-    takes the picture's edge for a side. The photometric fit follows where edges do not suffice."""
-    image, setup = picture.image, picture.setup
+    takes the image's edge for a side. The photometric fit follows where edges do not suffice."""
+    image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
-    lines = fit_lines(picture, raw) if setup.is_line_fit_enabled else {}
+    lines = fit_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
     found_corners = {
         name: lines.get(name)
         or refine_subpix(image, corners, setup.patterns[name].border_cells.cells_per_side)
@@ -472,21 +514,28 @@ def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
         return found_corners
     fitted, small = dict(found_corners), found_corners.get("small")
     for name, r in found_corners.items():
-        if r.is_fitted and is_fully_visible(picture, r):
+        if r.is_fitted and is_fully_visible(detector_input, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.is_fitted and small is not None and small.is_fitted:
-            starts.insert(0, picture.corners_from_other_marker_px(small.corners_px, "large"))
-        identified_by: IdentifiedBy = "other" if len(found_corners) == 2 else "bits"
-        tried = (fit_partly_visible(picture, name, start, identified_by) for start in starts)
+            starts.insert(
+                0, detector_input.derive_corners_from_other_marker_px(small.corners_px, "large")
+            )
+        identified_by: IdentificationEvidence = (
+            "other_marker" if len(found_corners) == 2 else "bits"
+        )
+        tried = (
+            fit_partly_visible_marker(detector_input, name, start, identified_by)
+            for start in starts
+        )
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not is_inside_picture(
-            r.corners_px, image.shape, PICTURE_MARGIN_PX
-        ) or is_any_part_hidden(picture.hidden_mask, r.corners_px, 1.0):
+        elif not is_inside_image(r.corners_px, image.shape, IMAGE_MARGIN_PX) or is_any_part_hidden(
+            detector_input.hidden_mask, r.corners_px, 1.0
+        ):
             del fitted[name]
-    return refine_photometrically(picture, fitted, is_from_search=True)
+    return refine_photometrically(detector_input, fitted, is_from_search=True)
 
 
 def _make_detection(
@@ -510,10 +559,10 @@ def _make_detection(
     )
 
 
-# --- Motion of the markers from picture to picture, and their predicted positions ---
+# --- Motion of the markers from image to image, and their predicted positions ---
 
 
-_MEAN_OF_FOUR: Array = np.full(4, 0.25)
+_WEIGHTS_OF_MEAN_OF_FOUR: Array = np.full(4, 0.25)
 _MAX_FLOW_AGE_S = 0.25  # older motion does not predict positions
 
 
@@ -531,19 +580,19 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
     return corners
 
 
-def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with the image velocity, px/s, of its markers' corners since `previous`."""
-    if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_FLOW_AGE_S:
-        return now
+def add_marker_flow(current: Detections, previous: Detections | None) -> Detections:
+    """Return `current` with the image velocity, px/s, of its markers' corners since `previous`."""
+    if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_FLOW_AGE_S:
+        return current
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
-        a, b = previous.get(name), now.get(name)
+        a, b = previous.get(name), current.get(name)
         if a is not None and b is not None:
-            flow[name] = (b.corners_px - a.corners_px) / (now.t_s - previous.t_s)
+            flow[name] = (b.corners_px - a.corners_px) / (current.t_s - previous.t_s)
     if not flow:
-        return now
-    mean = _MEAN_OF_FOUR @ next(iter(flow.values()))
-    return replace(now, flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
+        return current
+    mean = _WEIGHTS_OF_MEAN_OF_FOUR @ next(iter(flow.values()))
+    return replace(current, flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
 
 
 # --- Photometric fits for markers that the edge fit measured poorly or missed ---
@@ -553,7 +602,7 @@ _MIN_ACCURATE_LINE_FIT_CELL_PX = (
     6.0  # from this size on, lines are as accurate as the drawing, and faster
 )
 # the same limit as a ratio of a cell's width to the blur's standard deviation
-_MIN_ACCURATE_LINE_FIT_CELL_BLURS = 6.0
+_MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
 _MAX_ALIGN_MOTION_SIDES = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
 _MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12  # share of the side
@@ -564,17 +613,17 @@ drawing, px."""
 _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
-def is_line_fit_sufficient(corners: RefinedCorners, pattern: Pattern) -> bool:
+def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
     """True if the corners come from an edge fit that is as accurate as a photometric fit: with
     cells of at least 6 px and 6 times the blur."""
     cell_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
     return corners.is_fitted and cell_px >= max(
-        _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_BLURS * corners.blur_px
+        _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO * corners.blur_px
     )
 
 
 def refine_photometrically(
-    picture: Picture, found_corners: _FoundCorners, is_from_search: bool = False
+    detector_input: DetectorInput, found_corners: _FoundCorners, is_from_search: bool = False
 ) -> _FoundCorners:
     """Fit the drawing to each marker in `found_corners` whose edge fit is not accurate enough, and
     add the other marker, located from the one that was found, if it is visible.
@@ -582,17 +631,21 @@ def refine_photometrically(
     If `is_from_search`, a single marker is dropped unless its edge fit is accurate enough or the
     drawing confirms it.
     """
-    image, patterns, better = picture.image, picture.setup.patterns, dict(found_corners)
+    image, patterns, better = (
+        detector_input.image,
+        detector_input.setup.patterns,
+        dict(found_corners),
+    )
     if "small" in better and "large" not in better:
-        large = find_large_around(picture, better["small"])
+        large = find_large_marker_around_small(detector_input, better["small"])
         if large is not None:
             better["large"] = large
     for name in MARKERS:
-        start = _initial_corners(picture, name, better)
+        start = _initial_corners_px(detector_input, name, better)
         if (
             start is None
-            or not is_inside_picture(start, image.shape)
-            or is_any_part_hidden(picture.hidden_mask, start)
+            or not is_inside_image(start, image.shape)
+            or is_any_part_hidden(detector_input.hidden_mask, start)
         ):
             continue
         is_single = _OTHER_MARKER[name] not in better
@@ -601,7 +654,7 @@ def refine_photometrically(
         )
         blur_px = _blur_px(better.get(name))
         exact = align_marker(
-            picture,
+            detector_input,
             name,
             start,
             _MAX_ALIGN_MOTION_SIDES,
@@ -628,19 +681,19 @@ def _blur_px(corners: RefinedCorners | None) -> float:
     )
 
 
-def _initial_corners(
-    picture: Picture, name: MarkerName, found_corners: _FoundCorners
+def _initial_corners_px(
+    detector_input: DetectorInput, name: MarkerName, found_corners: _FoundCorners
 ) -> Array | None:
     this, other = found_corners.get(name), found_corners.get(_OTHER_MARKER[name])
     if this is not None:
         if this.cov_px2 is not None:
             return None  # an obstacle in front of the marker would spoil the drawing, too
         # Small cells matter only if no larger ones were measured.
-        enough = is_line_fit_sufficient(this, picture.setup.patterns[name])
+        enough = is_line_fit_sufficient(this, detector_input.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
         return None if this.is_fitted and enough else this.corners_px
     if name == "small" and other is not None and other.is_fitted:
-        return picture.corners_from_other_marker_px(other.corners_px, "small")
+        return detector_input.derive_corners_from_other_marker_px(other.corners_px, "small")
     return None
 
 
@@ -652,22 +705,24 @@ _MAX_CENTRE_OFFSET_SIDES = 0.12  # share of the small marker's side
 
 
 def fit_lines(
-    picture: Picture,
+    detector_input: DetectorInput,
     start_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Fit the four sides of each marker, starting at `start_corners_px` (4, 2), and return the
     markers with four straight sides. The cells are not examined.
 
-    All markers are fitted together, because blooming and gamma move all edges of a picture by the
+    All markers are fitted together, because blooming and gamma move all edges of an image by the
     same number of pixels. `known_edge_shift` is how far white has grown over black, if measured
     before; None measures it.
     """
     if not start_corners_px:
         return {}
-    rims = [picture.setup.patterns[name].border_cells for name in start_corners_px]
+    rims = [detector_input.setup.patterns[name].border_cells for name in start_corners_px]
     raw = np.array(list(start_corners_px.values()))
-    fitted = refine_corners_by_lines(picture.image, raw, rims, picture.camera, known_edge_shift)
+    fitted = refine_corners_by_lines(
+        detector_input.image, raw, rims, detector_input.camera, known_edge_shift
+    )
     return {
         name: found
         for name, found in zip(start_corners_px, fitted, strict=True)
@@ -676,36 +731,36 @@ def fit_lines(
 
 
 def refine_expected_markers(
-    picture: Picture,
+    detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
+    """Return the expected markers, corners (4, 2) px, whose sides and cells the image confirms,
     measured by edge fits.
 
     Omitted are markers displaced by more than the window around a side reaches on the profiles, the
     scan lines across it (0.85 cells, at most 7 px), cut or hidden markers, and markers with cells
     below 2.5 px. `known_edge_shift` is how far white has grown over black; None measures it.
     """
-    image, patterns = picture.image, picture.setup.patterns
+    image, patterns = detector_input.image, detector_input.setup.patterns
     start_corners_px = {
         name: expected_corners_px[name]
         for name in MARKERS
         if name in expected_corners_px
-        and is_inside_picture(expected_corners_px[name], image.shape, PICTURE_MARGIN_PX)
+        and is_inside_image(expected_corners_px[name], image.shape, IMAGE_MARGIN_PX)
         and side_lengths_px(expected_corners_px[name]).min()
         > _MIN_LINE_FIT_CELL_PX * patterns[name].border_cells.cells_per_side
     }
     return {
         name: found
-        for name, found in fit_lines(picture, start_corners_px, known_edge_shift).items()
-        if is_fully_visible(picture, found)
+        for name, found in fit_lines(detector_input, start_corners_px, known_edge_shift).items()
+        if is_fully_visible(detector_input, found)
         and has_matching_cells(image, found.corners_px, patterns[name])
     }
 
 
-def add_partly_visible(
-    picture: Picture,
+def add_partly_visible_markers(
+    detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     found_corners: _FoundCorners,
     known_edge_shift: EdgeShift | None = None,
@@ -718,22 +773,24 @@ def add_partly_visible(
     """
     start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:
-        start_corners_px["large"] = picture.corners_from_other_marker_px(
+        start_corners_px["large"] = detector_input.derive_corners_from_other_marker_px(
             found_corners["small"].corners_px, "large"
         )
     for name in MARKERS:
         if name in start_corners_px and name not in found_corners:
-            partly = fit_partly_visible(
-                picture, name, start_corners_px[name], "track", known_edge_shift
+            partly = fit_partly_visible_marker(
+                detector_input, name, start_corners_px[name], "track", known_edge_shift
             )
             if partly is not None:
                 found_corners[name] = partly
     if "large" in found_corners and "small" not in found_corners:
         # Too small for lines, but its position follows from the large marker: a similar pattern is
         # enough.
-        small_px = picture.corners_from_other_marker_px(found_corners["large"].corners_px, "small")
+        small_px = detector_input.derive_corners_from_other_marker_px(
+            found_corners["large"].corners_px, "small"
+        )
         if mean_side_px(small_px) > MIN_MARKER_SIDE_PX and is_correlated_with_pattern(
-            picture.image, small_px, picture.setup.patterns["small"]
+            detector_input.image, small_px, detector_input.setup.patterns["small"]
         ):
             found_corners["small"] = RefinedCorners(
                 small_px, CORNER_SIGMA_FROM_OTHER_MARKER_PX, False
@@ -741,30 +798,32 @@ def add_partly_visible(
     return found_corners
 
 
-def find_large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
+def find_large_marker_around_small(
+    detector_input: DetectorInput, small: RefinedCorners
+) -> RefinedCorners | None:
     """Return the large marker around a detected small one; the large one may be partly covered or
-    cut. None if the picture does not confirm it."""
-    image, pattern = picture.image, picture.setup.patterns["large"]
-    start = picture.corners_from_other_marker_px(small.corners_px, "large")
+    cut. None if the image does not confirm it."""
+    image, pattern = detector_input.image, detector_input.setup.patterns["large"]
+    start = detector_input.derive_corners_from_other_marker_px(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        centre = picture.corners_from_other_marker_px(large.corners_px, "small")
+        centre = detector_input.derive_corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_MAX_CENTRE_OFFSET_SIDES * mean_side_px(small.corners_px), 1.0)
 
-    if is_inside_picture(start, image.shape, PICTURE_MARGIN_PX):
+    if is_inside_image(start, image.shape, IMAGE_MARGIN_PX):
         # A small marker yields a rough position only, so the fit is repeated from the first result.
-        found = fit_lines(picture, {"large": start}).get("large")
+        found = fit_lines(detector_input, {"large": start}).get("large")
         if found is not None:
-            found = fit_lines(picture, {"large": found.corners_px}).get("large")
+            found = fit_lines(detector_input, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
-            good = is_fully_visible(picture, found) and is_centred(found)
+            good = is_fully_visible(detector_input, found) and is_centred(found)
             if good and has_mostly_matching_cells(image, start, pattern):
                 return found
-    partly = fit_partly_visible(picture, "large", start, "other")
+    partly = fit_partly_visible_marker(detector_input, "large", start, "other_marker")
     return partly if partly and is_centred(partly) else None
 
 

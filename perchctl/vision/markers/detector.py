@@ -2,7 +2,7 @@
 mask of the vehicle's own gear.
 
 Each marker has a dictionary with its single id, so that no other marker can be mistaken for it (0/1
-correction bits: no false accept in 28 pictures without a target; 0/3: 7 of 28).
+correction bits: no false accept in 28 images without a target; 0/3: 7 of 28).
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision.markers.corners import scale_square
-from perchctl.vision.markers.pattern import Pattern, make_border_cells, make_drawing, make_pattern
+from perchctl.vision.markers.pattern import (
+    MarkerPattern,
+    make_border_cells,
+    make_marker_drawing,
+    make_marker_pattern,
+)
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRRORED_MARKER_ID = 1
@@ -44,17 +49,17 @@ class DetectorSetup:
     """Constants of `detect_markers`, made by `make_detector_setup`.
 
     Attributes:
-        large_and_small_dictionaries: OpenCV's dictionaries, with one marker each.
+        large_and_small_aruco_dictionaries: OpenCV's dictionaries, with one marker each.
         patterns: appearance of both markers.
-        small_to_large_side: side of the small marker over that of the large one.
+        small_to_large_side_ratio: side of the small marker over that of the large one.
         is_line_fit_enabled: if False, markers are only detected by OpenCV and refined by
             `refine_subpix`, without edge fits and photometric fits.
         hidden_mask: True for pixels that the vehicle covers, (h, w).
     """
 
-    large_and_small_dictionaries: tuple[Any, Any]
-    patterns: dict[MarkerName, Pattern]
-    small_to_large_side: float
+    large_and_small_aruco_dictionaries: tuple[Any, Any]
+    patterns: dict[MarkerName, MarkerPattern]
+    small_to_large_side_ratio: float
     is_line_fit_enabled: bool
     hidden_mask: HiddenMask | None = None
 
@@ -63,29 +68,29 @@ def make_detector_setup(
     config: DetectorConfig, target: TargetConfig, static_hidden_mask: HiddenMask | None = None
 ) -> DetectorSetup:
     """Return the setup for a target, with dictionaries that contain only its markers' ids.
-    `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every picture."""
+    `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every image."""
     large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
-    small_to_large_side = target.small.side_m / target.large.side_m
+    small_to_large_side_ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
-        large_and_small_dictionaries=(
+        large_and_small_aruco_dictionaries=(
             _make_dictionary(large_bits, config.correction_bits_large),
             _make_dictionary(small_bits, config.correction_bits_small),
         ),
         patterns={
-            "large": make_pattern(
+            "large": make_marker_pattern(
                 make_border_cells(
                     large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
                 ),
-                make_drawing(large_bits, small_bits, small_to_large_side),
+                make_marker_drawing(large_bits, small_bits, small_to_large_side_ratio),
             ),
-            "small": make_pattern(
+            "small": make_marker_pattern(
                 make_border_cells(
                     small_bits, _PRINT_EDGE_SIGMA_M * (len(small_bits) + 2) / target.small.side_m
                 ),
-                make_drawing(small_bits),
+                make_marker_drawing(small_bits),
             ),
         },
-        small_to_large_side=small_to_large_side,
+        small_to_large_side_ratio=small_to_large_side_ratio,
         is_line_fit_enabled=config.refinement == "line",
         hidden_mask=static_hidden_mask,
     )
@@ -94,7 +99,7 @@ def make_detector_setup(
 def make_aruco_detector(
     setup: DetectorSetup, size_px: tuple[int, int], threshold_windows_px: ThresholdWindowRange
 ) -> Any:
-    """Return OpenCV's marker detector for pictures of `size_px` (width, height);
+    """Return OpenCV's marker detector for images of `size_px` (width, height);
     `threshold_windows_px` is the smallest and the largest window over which the adaptive threshold
     averages."""
     parameters = cv2.aruco.DetectorParameters()
@@ -103,7 +108,7 @@ def make_aruco_detector(
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = threshold_windows_px
     parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
-    return cv2.aruco.ArucoDetector(list(setup.large_and_small_dictionaries), parameters)
+    return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
@@ -116,7 +121,7 @@ def make_quad_detector(setup: DetectorSetup) -> Any:
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
     parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
-    return cv2.aruco.ArucoDetector(list(setup.large_and_small_dictionaries), parameters)
+    return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
 def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
@@ -126,18 +131,18 @@ def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
 
-def _make_dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
+def _make_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
-    if distance > 2 * correction_bits + 1:
+    if distance > 2 * max_correction_bits + 1:
         patterns.append(mirror)
     rows = [cv2.aruco.Dictionary.getByteListFromBits(np.ascontiguousarray(p)) for p in patterns]
     return cv2.aruco.Dictionary(
-        np.ascontiguousarray(np.concatenate(rows)), bits.shape[0], correction_bits
+        np.ascontiguousarray(np.concatenate(rows)), bits.shape[0], max_correction_bits
     )
 
 
-# --- The vehicle's own gear in the picture ---
+# --- The vehicle's own gear in the image ---
 # The gear hides the target. Its pixels are filled from their surroundings, so that no threshold
 # connects the gear to a marker's border; no side or cell is measured there.
 
@@ -146,8 +151,8 @@ HiddenMask = NDArray[np.bool_]
 WHITE_BORDER_REACH_HALF_SIDES = 1.25
 """Half sides from a marker's centre within which any object disturbs the measurement of its
 sides."""
-_MASK_SPREAD_ROWS = 7  # rows of a field's picture to which a covered row contributes
-# reduction factor, and standard deviation of the fill in the reduced picture
+_MASK_SPREAD_ROWS = 7  # rows of a field's image to which a covered row contributes
+# reduction factor, and standard deviation of the fill in the reduced image
 _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
 _MEAN_GREY_FILL_WEIGHT = 1e-4
 
@@ -164,7 +169,7 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
 
 
 def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDArray[np.uint8]:
-    """Return the picture with its hidden pixels filled smoothly from their surroundings."""
+    """Return the image with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
     size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
@@ -206,8 +211,8 @@ def is_any_part_hidden(
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A picture with the setup and camera for measuring markers in it. `hidden_mask` (h, w) is True
+class DetectorInput:
+    """An image with the setup and camera for measuring markers in it. `hidden_mask` (h, w) is True
     where the vehicle covers the view."""
 
     image: NDArray[np.uint8]
@@ -215,14 +220,14 @@ class Picture:
     setup: DetectorSetup
     camera: CameraModel
 
-    def corners_from_other_marker_px(
+    def derive_corners_from_other_marker_px(
         self, other_corners_px: Array, derived_name: MarkerName
     ) -> Array:
         """Return the corners (4, 2) px of the marker `derived_name`, derived from
         `other_corners_px` (4, 2) of the other marker."""
-        scaled_to_given_side = (
-            self.setup.small_to_large_side
+        side_ratio = (
+            self.setup.small_to_large_side_ratio
             if derived_name == "small"
-            else 1.0 / self.setup.small_to_large_side
+            else 1.0 / self.setup.small_to_large_side_ratio
         )
-        return scale_square(other_corners_px, scaled_to_given_side, self.camera)
+        return scale_square(other_corners_px, side_ratio, self.camera)

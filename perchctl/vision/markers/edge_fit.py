@@ -25,7 +25,7 @@ the first two. `refine_corners_by_lines` returns None if a corner moved by more 
 points are 0.6 px off their line, less than half of the profiles count, or the blur fills the
 window.
 
-Lengths are px in the picture; lines and points are in normalised image coordinates.
+Lengths are px in the image; lines and points are in normalised image coordinates.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from perchctl.vision.lens import distort_to_px, undistort_to_normalised
 from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     NEXT_CORNER,
-    OUTWARD_NORMALS,
     PREVIOUS_CORNER,
+    SIDE_OUTWARD_NORMALS,
     RefinedCorners,
     apply_homography,
     homography_from_centred_square,
@@ -89,19 +89,24 @@ def profile_positions(lengths_px: Array) -> Array:
 
 
 def make_side_profiles(
-    starts: Array, ends: Array, positions_along_side: Array, camera: CameraModel
+    side_starts_normalised: Array,
+    side_ends_normalised: Array,
+    positions_along_side: Array,
+    camera: CameraModel,
 ) -> tuple[Array, Array]:
     """Return the points where profiles cross the sides, px, and the unit normals there, to the left
-    of the direction from start to end in the picture (outwards for a marker with clockwise
+    of the direction from start to end in the image (outwards for a marker with clockwise
     corners): each (rows, n, 2).
 
-    `starts`, `ends` (rows, 2) are the normalised ends of the sides; `positions_along_side` (rows,
-    n) come from `profile_positions`. The image of a side through the lens is a smooth curve, so it
-    is computed at five points and interpolated.
-    """
+    `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the normalised ends of the sides;
+    `positions_along_side` (rows, n) come from `profile_positions`. The image of a side through the
+    lens is a smooth curve, so it is computed at five points and interpolated."""
     first, last = positions_along_side[:, :1], positions_along_side[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
-    points = starts[:, None] + at * (ends - starts)[:, None]
+    points = (
+        side_starts_normalised[:, None]
+        + at * (side_ends_normalised - side_starts_normalised)[:, None]
+    )
     nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
     origin = np.matmul(_NODES_TO_VALUES, nodes)
     # As complex numbers x + iy, a quarter turn is a single product.
@@ -114,11 +119,11 @@ def sample_profiles(
     image: NDArray[np.uint8], origin: Array, normal: Array, profile_half_length_px: Array
 ) -> Floats:
     """Return the grey values along the profiles, (rows, n, steps + 1), from -profile_half_length_px
-    to +profile_half_length_px (rows,) about `origin` along `normal`: bilinear, with the picture's
+    to +profile_half_length_px (rows,) about `origin` along `normal`: bilinear, with the image's
     border pixels repeated outside.
 
-    The picture is converted to float, on which OpenCV 5 interpolates at the exact position. Other
-    releases, on 8-bit pictures, round it to 1/32 px, which is as large as the standard deviation
+    The image is converted to float, on which OpenCV 5 interpolates at the exact position. Other
+    releases, on 8-bit images, round it to 1/32 px, which is as large as the standard deviation
     that the edge positions should have.
     """
     h, w = image.shape
@@ -166,7 +171,7 @@ MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
 _MAX_EDGE_OFFSET_PX = 4.0
-_MIN_UPRIGHT_TO_LEVEL_SIDE_VARIANCE = (
+_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = (
     2.0  # ratio of variances of the sides that shows jittering rows
 )
 _MIN_SIDE_SLANT_VARIANCE = (
@@ -183,8 +188,8 @@ CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
 _PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
 _PROFILE_ONES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
-_MEAN_OF_FOUR: Array = np.full(4, 0.25)
-_PARABOLA: Array = SIDE_POSITIONS**2 - (SIDE_POSITIONS**2).mean()
+_WEIGHTS_OF_MEAN_OF_FOUR: Array = np.full(4, 0.25)
+_ZERO_MEAN_PARABOLA: Array = SIDE_POSITIONS**2 - (SIDE_POSITIONS**2).mean()
 _MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
 
 
@@ -236,14 +241,14 @@ def _refine_lines_once(
         np.count_nonzero(outer_edges.profile_greys[:, :, -1] > CLIPPED_GREY, axis=1)
         / PROFILES_PER_SIDE
     )
-    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
+    is_white_clipped = glaring.reshape(-1, 4) @ _WEIGHTS_OF_MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light.
         return _refine_lines_once(image, raw_corners_px, border_cells, camera, None)
     line_coefficients, residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
     if shift is None:
-        corners = _intersect(line_coefficients)
+        corners = _intersect_adjacent_sides(line_coefficients)
         if not is_finite(corners):
             return found
         shift = _measure_edge_shift(
@@ -257,11 +262,11 @@ def _refine_lines_once(
         line_coefficients[:, 2] += _outward_signs(markers, line_coefficients) * (
             applied.white_growth_px / markers.px_per_normalised
         )
-    corners = _intersect(line_coefficients)
+    corners = _intersect_adjacent_sides(line_coefficients)
     if not is_finite(corners):
         return found
     corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
-    accepted = _is_accepted(markers, outer_edges, residual_px, corners_px)
+    accepted = _are_sides_accepted(markers, outer_edges, residual_px, corners_px)
     # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
     independent = np.maximum(
         np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
@@ -320,7 +325,7 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
     return line_coefficients, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
 
 
-def _intersect(line_coefficients: Array) -> Array:
+def _intersect_adjacent_sides(line_coefficients: Array) -> Array:
     """Return the intersections of side i - 1 and side i of each marker, (m, 4, 2), normalised.
     `line_coefficients` (4m, 3) as from `_fit_lines`."""
     sides = line_coefficients.reshape(-1, 4, 3)
@@ -351,10 +356,10 @@ def _measure_edge_shift(
     inner_edges: EdgeData | None,
     line_coefficients: Array,
     residual_px: Array,
-    corners: Array,
+    corners_normalised: Array,
 ) -> EdgeShift | None:
     """Measure how far white has grown over black, px, from the width of a border whose outer edge
-    has the `corners` (m, 4, 2); None if no inner edge was sampled.
+    has the `corners_normalised` (m, 4, 2); None if no inner edge was sampled.
 
     A growth by d moves the border's outer edge in, and its inner edge out, by d. In the marker's
     own scale, whose unit is the outer edge as measured, an inner edge at r then appears at r + d (1
@@ -372,8 +377,10 @@ def _measure_edge_shift(
         float(markers.cell_px[k]),
     )
     r = 1.0 - 2.0 / rim.cells_per_side
-    own = apply_homography(homography_to_centred_square(corners[k]), inner_edges.points_normalised)
-    far = np.matmul(own, OUTWARD_NORMALS[:, :, None])[..., 0] - r
+    own = apply_homography(
+        homography_to_centred_square(corners_normalised[k]), inner_edges.points_normalised
+    )
+    far = np.matmul(own, SIDE_OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = inner_edges.weight * (inner_edges.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
     w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
@@ -386,7 +393,7 @@ def _measure_edge_shift(
         8.0
         * r
         / (3.0 * rim.cells_per_side)
-        * _bow_px(markers, outer_edges, line_coefficients, residual_px)
+        * _side_bow_px(markers, outer_edges, line_coefficients, residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -408,7 +415,7 @@ def _measure_edge_shift(
     )
 
 
-def _bow_px(
+def _side_bow_px(
     markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, residual_px: Array
 ) -> float:
     """Return the bow of the widest marker's sides, px: how far their ends are further out than
@@ -419,9 +426,9 @@ def _bow_px(
         - line_coefficients[four, 2:]
     )
     scale = _outward_signs(markers, line_coefficients)[four] * markers.px_per_normalised[four]
-    mass = np.maximum(outer_edges.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
-    bow_px = scale * ((outer_edges.weight[four] * away) @ _PARABOLA) / mass
-    mean_px = float(bow_px @ _MEAN_OF_FOUR)
+    mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
+    bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
+    mean_px = float(bow_px @ _WEIGHTS_OF_MEAN_OF_FOUR)
     noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
@@ -429,13 +436,13 @@ def _bow_px(
 def _outward_signs(markers: MarkerSides, line_coefficients: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners_normalised
-    out = (corners - (_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
+    out = (corners - (_WEIGHTS_OF_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(
         np.sign(line_coefficients[:, 0] * out[:, 0] + line_coefficients[:, 1] * out[:, 1])
     )
 
 
-def _is_accepted(
+def _are_sides_accepted(
     markers: MarkerSides, outer_edges: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
@@ -445,7 +452,7 @@ def _is_accepted(
     )
     lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
     lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
-        outer_edges.blur_px < 0.9 * outer_edges.window_half_px
+        outer_edges.blur_px < 0.9 * outer_edges.window_half_length_px
     )
     displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
@@ -492,7 +499,7 @@ def _row_jitter_sigma_px(
     still = sum(line_end_variances_px2) / 4.0 - slope * mean
     return (
         math.sqrt(slope)
-        if slope > (_MIN_UPRIGHT_TO_LEVEL_SIDE_VARIANCE - 1.0) * max(still, 0.0)
+        if slope > (_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO - 1.0) * max(still, 0.0)
         else 0.0
     )
 
@@ -510,7 +517,7 @@ class MarkerSides:
     """The sides of m markers before their edges are measured.
 
     Attributes:
-        raw_corners_px: corners (m, 4, 2) in the picture.
+        raw_corners_px: corners (m, 4, 2) in the image.
         border_cells: the cells inside each marker's border.
         corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
         side_lengths_px: lengths (m, 4).
@@ -538,14 +545,14 @@ class EdgeData:
 
     Attributes:
         profile_greys: grey values along the profiles, (rows, n, steps + 1).
-        window_half_px: half length of the window around the edge, (rows,).
+        window_half_length_px: half length of the window around the edge, (rows,).
         points_normalised: edge points in normalised image coordinates, (rows, n, 2).
         weight: weight of each point, 0 for outliers, (rows, n).
         blur_px: standard deviation of the blur, (rows,).
     """
 
     profile_greys: Floats
-    window_half_px: Array
+    window_half_length_px: Array
     points_normalised: Array
     weight: Array
     blur_px: Array
@@ -567,7 +574,7 @@ def prepare_marker_sides(
         return None
     along = corners.take(NEXT_CORNER, axis=1) - corners
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
-    cell_px = sides_px @ _MEAN_OF_FOUR / cells
+    cell_px = sides_px @ _WEIGHTS_OF_MEAN_OF_FOUR / cells
     return MarkerSides(
         raw_corners_px=raw_corners_px,
         border_cells=border_cells,
@@ -614,13 +621,13 @@ def measure_edges(
     ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    window_half_px, profile_half_length_px = (
+    window_half_length_px, profile_half_length_px = (
         each[of] for each in window_and_profile_half_lengths_px(markers.cell_px)
     )
     profile_greys = sample_profiles(image, origin, normal, profile_half_length_px)
     around = find_neighbour_edges(s, markers.border_cells, rim, depth_px.ravel())
     offset_px, weight, blur_px = locate_edges(
-        profile_greys, profile_half_length_px, window_half_px, around
+        profile_greys, profile_half_length_px, window_half_length_px, around
     )
     points = undistort_to_normalised(
         (origin + offset_px[..., None] * normal).reshape(-1, 2), camera
@@ -630,7 +637,11 @@ def measure_edges(
     n = 4 * len(markers.raw_corners_px)
     outer_edges, inner_edges = (
         EdgeData(
-            profile_greys[part], window_half_px[part], points[part], weight[part], blur_px[part]
+            profile_greys[part],
+            window_half_length_px[part],
+            points[part],
+            weight[part],
+            blur_px[part],
         )
         for part in (slice(0, n), slice(n, None))
     )
@@ -640,8 +651,8 @@ def measure_edges(
 def window_and_profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
     """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
     size."""
-    window_half_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
-    return window_half_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
+    window_half_length_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
+    return window_half_length_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def find_neighbour_edges(
@@ -746,7 +757,7 @@ class NeighbourEdges:
 def locate_edges(
     profile_greys: Floats,
     profile_half_length_px: Array,
-    window_half_px: Array,
+    window_half_length_px: Array,
     neighbours: NeighbourEdges,
 ) -> tuple[Array, Array, Array]:
     """Locate the dark-to-bright edge on each profile. Return its offset from the middle of the
@@ -755,20 +766,22 @@ def locate_edges(
 
     Args:
         profile_greys: (rows, n, steps + 1), the profile from -half_px to +half_px.
-        profile_half_length_px, window_half_px: half length of the profiles and of the windows,
-            (rows,).
+        profile_half_length_px, window_half_length_px: half length of the profiles and of the
+            windows, (rows,).
     """
-    profiles = _Profiles(profile_greys, profile_half_length_px, window_half_px, neighbours)
-    edge_offsets_px, usable = profiles.locate_in_wide_window()
-    blur_px2 = np.ones(len(window_half_px), dtype=np.float32)
-    line = weight = _fit_line_to_half_midmeans(edge_offsets_px, usable)
+    profiles = _EdgeProfiles(
+        profile_greys, profile_half_length_px, window_half_length_px, neighbours
+    )
+    edge_offsets_px, is_usable = profiles.locate_in_wide_window()
+    blur_px2 = np.ones(len(window_half_length_px), dtype=np.float32)
+    line = weight = _fit_line_to_half_midmeans(edge_offsets_px, is_usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
         if k == 1 and moved_px < _MAX_WIDE_WINDOW_ERROR_PX:
             continue
-        edge_offsets_px, usable, blur_px2 = profiles.locate_in_narrow_window(line, blur_px2)
+        edge_offsets_px, is_usable, blur_px2 = profiles.locate_in_narrow_window(line, blur_px2)
         centre, weight = _fit_robust_line(
-            edge_offsets_px, usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
+            edge_offsets_px, is_usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
         )
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _MAX_CONVERGED_LINE_CHANGE_PX:
@@ -780,14 +793,14 @@ def locate_edges(
     )
 
 
-class _Profiles:
+class _EdgeProfiles:
     """The gradients along all profiles, and the values that every window over them needs."""
 
     def __init__(
         self,
         profile_greys: Floats,
         profile_half_length_px: Array,
-        window_half_px: Array,
+        window_half_length_px: Array,
         around: NeighbourEdges,
     ) -> None:
         self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
@@ -795,7 +808,7 @@ class _Profiles:
             profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS
         )  # position, (rows, steps)
         self.near, self.depth = (
-            window_half_px.astype(np.float32),
+            window_half_length_px.astype(np.float32),
             around.neighbour_distance_px.astype(np.float32),
         )
         self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
@@ -820,16 +833,16 @@ class _Profiles:
         np.multiply(window[..., 0], self.u, out=window[..., 1])
         moments: Floats = np.maximum(self.gradient, 0.0) @ window
         total = moments[..., 0] * self.can
-        usable = total > (total.dot(_PROFILE_ONES_F32) * self.part)[:, None]
-        return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
+        is_usable = total > (total.dot(_PROFILE_ONES_F32) * self.part)[:, None]
+        return np.divide(moments[..., 1], np.where(is_usable, total, 1.0)), is_usable
 
     def locate_in_narrow_window(
-        self, line: Floats, blur_px2: Floats
+        self, line_offsets_px: Floats, blur_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Locate the edge on each profile again, with a narrow window around the side's `line`
-        (rows, n). Return its offsets, px (rows, n), which profiles are usable, and the variance of
-        the blur, px^2 (rows,)."""
-        relative = self.u[:, None, :] - line[:, :, None]
+        """Locate the edge on each profile again, with a narrow window around the side's line at
+        `line_offsets_px` (rows, n). Return the edge's offsets, px (rows, n), which profiles are
+        usable, and the variance of the blur, px^2 (rows,)."""
+        relative = self.u[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
             np.maximum(_WINDOW_VARIANCE_RATIO * blur_px2, _MIN_WINDOW_VARIANCE_PX2), self.most2
@@ -839,21 +852,21 @@ class _Profiles:
         np.exp(mass, out=mass)
         mass *= self.gradient
         total = (mass @ _SAMPLE_ONES) * self.can
-        usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
+        is_usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
         # Share, position and spread of a neighbour seen through the window.
         wide2 = w2 + blur_px2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
         share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
-        total = np.where(usable, total / (1.0 - share), 1.0)
+        total = np.where(is_usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
         second = (
             mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur_px2 / wide2)[:, None]
         )
-        moment = (second * usable).dot(_PROFILE_ONES_F32)
-        moment /= np.maximum((total * usable).dot(_PROFILE_ONES_F32), 1e-9)
+        moment = (second * is_usable).dot(_PROFILE_ONES_F32)
+        moment /= np.maximum((total * is_usable).dot(_PROFILE_ONES_F32), 1e-9)
         moment = np.minimum(
             np.maximum(moment, _MIN_SECOND_MOMENT_PX2), _MAX_SECOND_MOMENT_RATIO * w2
         )
@@ -861,13 +874,13 @@ class _Profiles:
         # Undo the pull of the window on the centroid.
         centroid = first / total * (1.0 + found2 / w2)[:, None]
         limit = self.near[:, None]
-        return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
+        return line_offsets_px + np.minimum(np.maximum(centroid, -limit), limit), is_usable, found2
 
 
-def _fit_line_to_half_midmeans(edge_offsets_px: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     """Fit a line (rows, n) to each side through the mean of the middle 50 % of the offsets in each
     half of its profiles, so that up to a quarter of a half may be outliers."""
-    halves = np.where(usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
+    halves = np.where(is_usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
         -1, 2, 2 * _QUARTER_PROFILES
     )
     halves.sort(axis=2)
@@ -881,19 +894,19 @@ def _fit_line_to_half_midmeans(edge_offsets_px: Floats, usable: NDArray[np.bool_
 
 
 def _fit_robust_line(
-    edge_offsets_px: Floats, usable: NDArray[np.bool_], rounds: int
+    edge_offsets_px: Floats, is_usable: NDArray[np.bool_], iterations: int
 ) -> tuple[Floats, Floats]:
     """Return straight lines (rows, n) fitted with Tukey's weights, and the weights."""
-    line = median_per_row(edge_offsets_px, usable)[:, None]
-    for _ in range(rounds):
+    line = median_per_row(edge_offsets_px, is_usable)[:, None]
+    for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)
         size /= np.maximum(
-            _TUKEY_CUTOFF_MEDIANS * median_per_row(size, usable), _MIN_TUKEY_CUTOFF_PX
+            _TUKEY_CUTOFF_MEDIANS * median_per_row(size, is_usable), _MIN_TUKEY_CUTOFF_PX
         )[:, None]
         size *= size
         weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
-        weight *= usable
+        weight *= is_usable
         w = weight.dot(_SIDE_POWERS)
         e = (weight * edge_offsets_px).dot(_SIDE_POWERS)
         w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
@@ -904,9 +917,9 @@ def _fit_robust_line(
     return line, weight
 
 
-def median_per_row(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     """Return each row's median over its usable values, (rows,); 0 if it has none."""
-    values = np.where(usable, values, _MEDIAN_NEUTRAL_FILL)
+    values = np.where(is_usable, values, _MEDIAN_NEUTRAL_FILL)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
     return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE, found, 0.0))

@@ -1,10 +1,10 @@
-"""Partial-view fit: measure a marker that is partly invisible because the picture ends in it, light
+"""Partial-view fit: measure a marker that is partly invisible because the image ends in it, light
 glares on it, or the vehicle's own gear covers it.
 
 Four lines need all four sides. Here, the whole square is fitted at once to the visible edges: its
 sides, and the inner edges of its border, which replace a missing side. Gauss-Newton finds the
 increment P of the homography H and the shift d of all edges (white over black) from the distances
-r_k, px, between the square's edges and the picture's:
+r_k, px, between the square's edges and the image's:
 
     min sum w_k (r_k - a_k.P - s_k d)^2 + (d - d_0)^2 / sigma_d^2,    H <- H (I + P)
 
@@ -31,19 +31,19 @@ from perchctl.vision.lens import distort_to_px, pinhole_px, undistort_px, undist
 from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     NEXT_CORNER,
-    OUTWARD_NORMALS,
     PREVIOUS_CORNER,
+    SIDE_OUTWARD_NORMALS,
     RefinedCorners,
     apply_homography,
     homography_from_centred_square,
     increment_homography,
-    is_inside_picture,
+    is_inside_image,
     mean_side_px,
     projected_corners_jacobian,
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.detector import Picture, is_any_part_hidden
+from perchctl.vision.markers.detector import DetectorInput, is_any_part_hidden
 from perchctl.vision.markers.edge_fit import (
     MIN_LINE_SIGMA_PX,
     PROFILES_PER_SIDE,
@@ -59,10 +59,10 @@ from perchctl.vision.markers.edge_fit import (
     window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_CELL_TO_THRESHOLD_PER_CONTRAST,
+    MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST,
     MIN_CONTRAST_GREY,
     MIN_MATCHING_CELL_FRACTION,
-    Pattern,
+    MarkerPattern,
 )
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
@@ -79,31 +79,31 @@ _MAX_MOTION_FROM_START_PX = (
 )
 
 
-def fit_partly_visible(
-    picture: Picture,
+def fit_partly_visible_marker(
+    detector_input: DetectorInput,
     name: MarkerName,
     start_corners_px: Array,
-    identified_by: IdentifiedBy,
+    identified_by: IdentificationEvidence,
     known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
     """Fit the whole marker, starting at `start_corners_px` (4, 2), which may be outside the
-    picture.
+    image.
 
     `identified_by` tells how the marker is known to be this one: by its own cells alone ("bits"),
-    by the prediction ("track") or by the other marker ("other"); it sets how many visible cells
-    must match. `known_edge_shift` is how far white has grown over black, if measured before. None
-    if the visible part does not determine the corners, or if its cells are not the marker's.
+    by the prediction ("track") or by the other marker ("other_marker"); it sets how many visible
+    cells must match. `known_edge_shift` is how far white has grown over black, if measured before.
+    None if the visible part does not determine the corners, or if its cells are not the marker's.
     """
-    pattern, camera = picture.setup.patterns[name], picture.camera
+    pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
         not mean_side_px(start_corners_px) / pattern.border_cells.cells_per_side
         >= MIN_PARTIAL_CELL_PX
     ):
         return None
-    # Enough cells must be in the picture, wherever the fit may end.
-    in_picture = _is_point_in_picture(
+    # Enough cells must be in the image, wherever the fit may end.
+    in_picture = _is_point_in_image(
         _project_sample_points_px(start_corners_px, pattern, camera),
-        picture.image.shape,
+        detector_input.image.shape,
         _MAX_MOTION_FROM_START_PX,
     )
     if not _has_enough_known_cells(_is_cell_known(in_picture, pattern), pattern, identified_by):
@@ -113,7 +113,7 @@ def fit_partly_visible(
         return None
     H = homography_from_centred_square(start)
     for k in range(_PARTIAL_FIT_ITERATIONS):
-        visible_edges = find_visible_edges(picture, H, pattern)
+        visible_edges = find_visible_edges(detector_input, H, pattern)
         if visible_edges is None:
             return None
         A, N, g = _linearize_edges(
@@ -132,26 +132,28 @@ def fit_partly_visible(
         ):
             break
     assert visible_edges is not None
-    residual_px = visible_edges.edge_from_model_px - (step @ A).reshape(
-        visible_edges.edge_from_model_px.shape
+    residual_px = visible_edges.edge_offset_px - (step @ A).reshape(
+        visible_edges.edge_offset_px.shape
     )
     found = _make_refined_corners(H, visible_edges, residual_px, N, pattern, camera)
     if found is None or not _has_matching_visible_cells(
-        picture, found.corners_px, pattern, identified_by
+        detector_input, found.corners_px, pattern, identified_by
     ):
         return None
     return found
 
 
-def is_fully_visible(picture: Picture, found: RefinedCorners) -> bool:
-    """True if no part of the marker is hidden or outside the picture."""
-    margin_px = PICTURE_MARGIN_PX + found.blur_px
-    return is_inside_picture(
-        found.corners_px, picture.image.shape, margin_px
-    ) and not is_any_part_hidden(picture.hidden_mask, found.corners_px)
+def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
+    """True if no part of the marker is hidden or outside the image."""
+    margin_px = IMAGE_MARGIN_PX + corners.blur_px
+    return is_inside_image(
+        corners.corners_px, detector_input.image.shape, margin_px
+    ) and not is_any_part_hidden(detector_input.hidden_mask, corners.corners_px)
 
 
-def _linearize_edges(visible_edges: VisibleEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
+def _linearize_edges(
+    visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
+) -> tuple[Array, Array, Array]:
     """Linearise the edges' offsets, px, in nine unknowns: the increment of the homography (8) and
     the shift of all edges.
 
@@ -160,7 +162,7 @@ def _linearize_edges(visible_edges: VisibleEdges, prior: EdgeShift) -> tuple[Arr
     """
     u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
     nx, ny = (
-        OUTWARD_NORMALS[visible_edges.side_index].T[..., None]
+        SIDE_OUTWARD_NORMALS[visible_edges.side_index].T[..., None]
         * visible_edges.px_per_half_side[:, None]
     )
     A = np.empty((9, *u.shape))
@@ -180,11 +182,11 @@ def _linearize_edges(visible_edges: VisibleEdges, prior: EdgeShift) -> tuple[Arr
         / PROFILES_PER_SIDE,
     )
     weighted = A * (visible_edges.weight * worth[:, None]).ravel()
-    N, g = weighted.dot(A.T), weighted.dot(visible_edges.edge_from_model_px.ravel())
+    N, g = weighted.dot(A.T), weighted.dot(visible_edges.edge_offset_px.ravel())
     # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
-    certain = (0.1 / prior.sigma_px) ** 2
+    certain = (0.1 / edge_shift_prior.sigma_px) ** 2
     N[8, 8] += certain
-    g[8] += certain * prior.white_growth_px
+    g[8] += certain * edge_shift_prior.white_growth_px
     N[range(8), range(8)] += 1e-6
     return A, N, g
 
@@ -194,7 +196,7 @@ def _make_refined_corners(
     visible_edges: VisibleEdges,
     residual_px: Array,
     normal_matrix: Array,
-    pattern: Pattern,
+    pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
     """Return the corners of the marker projected by H (3, 3), with their covariance; None if they
@@ -248,31 +250,34 @@ def _make_refined_corners(
 # --- Identify a marker from its visible cells ---
 
 
-IdentifiedBy = Literal["bits", "track", "other"]
+IdentificationEvidence = Literal["bits", "track", "other_marker"]
 """What identifies a marker: its cells alone, its previous position, or the other marker."""
 _MIN_KNOWN_CELL_FRACTION = 0.6  # share of all cells
 # above white, as a share of the contrast; as bright as possible
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0
 # other codewords differ in two bits
-_MAX_UNKNOWN_BITS: dict[IdentifiedBy, int] = {"bits": 1, "track": 4}
+_MAX_INVISIBLE_BITS: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}
 _MAX_LENS_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse exists
 
 
 def _has_matching_visible_cells(
-    picture: Picture, corners_px: Array, pattern: Pattern, identified_by: IdentifiedBy
+    detector_input: DetectorInput,
+    corners_px: Array,
+    pattern: MarkerPattern,
+    identified_by: IdentificationEvidence,
 ) -> bool:
     """True if the visible cells without glare have their colours. With `identified_by` "bits", at
-    most one inner cell may be invisible, with "track" four; with "other", any number, and a fifth
-    of the visible inner cells may have the wrong colour."""
-    image, hidden_mask = picture.image, picture.hidden_mask
+    most one inner cell may be invisible, with "track" four; with "other_marker", any number, and a
+    fifth of the visible inner cells may have the wrong colour."""
+    image, hidden_mask = detector_input.image, detector_input.hidden_mask
     h, w = image.shape
-    at = _project_sample_points_px(corners_px, pattern, picture.camera)
+    at = _project_sample_points_px(corners_px, pattern, detector_input.camera)
     near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
-    is_sample_visible = _is_point_in_picture(at, image.shape, 0.0)
+    is_sample_visible = _is_point_in_image(at, image.shape, 0.0)
     if hidden_mask is not None:
         is_sample_visible &= ~hidden_mask[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_samples = pattern.is_white[pattern.sample_cell_index]
+    white_samples = pattern.is_cell_white[pattern.sample_cell_index]
     if not (
         (is_sample_visible & white_samples).any() and (is_sample_visible & ~white_samples).any()
     ):
@@ -289,21 +294,23 @@ def _has_matching_visible_cells(
     means = np.bincount(pattern.sample_cell_index, weights=grey * is_sample_visible) / np.maximum(
         count, 1.0
     )
-    known = _is_cell_known(is_sample_visible, pattern)
-    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_white, 1.0, -1.0)
-    wrong = np.count_nonzero(known & (share < MIN_CELL_TO_THRESHOLD_PER_CONTRAST))
+    is_known = _is_cell_known(is_sample_visible, pattern)
+    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_cell_white, 1.0, -1.0)
+    wrong = np.count_nonzero(is_known & (share < MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST))
     most_wrong = 0
-    if identified_by == "other":
+    if identified_by == "other_marker":
         most_wrong = math.floor(
             (1.0 - MIN_MATCHING_CELL_FRACTION)
-            * np.count_nonzero(known & pattern.is_cell_inside_border)
+            * np.count_nonzero(is_known & pattern.is_cell_inside_border)
         )
-    return bool(wrong <= most_wrong) and _has_enough_known_cells(known, pattern, identified_by)
+    return bool(wrong <= most_wrong) and _has_enough_known_cells(is_known, pattern, identified_by)
 
 
-def _project_sample_points_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted picture; NaN
-    outside the lens model. A marker that fills the picture is not a quadrilateral in it."""
+def _project_sample_points_px(
+    corners_px: Array, pattern: MarkerPattern, camera: CameraModel
+) -> Array:
+    """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted image; NaN
+    outside the lens model. A marker that fills the image is not a quadrilateral in it."""
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points), 2), np.nan)
@@ -316,40 +323,44 @@ def _project_sample_points_px(corners_px: Array, pattern: Pattern, camera: Camer
     return np.where(near[:, None], at, np.nan)
 
 
-def _is_point_in_picture(
+def _is_point_in_image(
     points_px: Array, shape: tuple[int, ...], margin_px: float
 ) -> NDArray[np.bool_]:
-    """Return which points (n, 2) are in the picture, or at most `margin_px` outside."""
+    """Return which points (n, 2) are in the image, or at most `margin_px` outside."""
     h, w = shape[:2]
     inside = (points_px >= -margin_px) & (points_px <= (w - 1 + margin_px, h - 1 + margin_px))
     return np.asarray(inside.all(axis=1))
 
 
-def _is_cell_known(is_sample_visible: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
+def _is_cell_known(
+    is_sample_visible: NDArray[np.bool_], pattern: MarkerPattern
+) -> NDArray[np.bool_]:
     """Return which cells (cells,) show at least half of their sample points; `is_sample_visible`
     (n,)."""
-    known: NDArray[np.bool_] = (
+    is_known: NDArray[np.bool_] = (
         np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
         >= 0.5 * pattern.samples_per_cell
     )
-    return known
+    return is_known
 
 
 def _has_enough_known_cells(
-    known: NDArray[np.bool_], pattern: Pattern, identified_by: IdentifiedBy
+    is_known: NDArray[np.bool_], pattern: MarkerPattern, identified_by: IdentificationEvidence
 ) -> bool:
-    most_unknown = len(known) if identified_by == "other" else _MAX_UNKNOWN_BITS[identified_by]
+    most_unknown = (
+        len(is_known) if identified_by == "other_marker" else _MAX_INVISIBLE_BITS[identified_by]
+    )
     return bool(
-        np.count_nonzero(pattern.is_cell_inside_border & ~known) <= most_unknown
-        and np.count_nonzero(known) >= _MIN_KNOWN_CELL_FRACTION * len(known)
+        np.count_nonzero(pattern.is_cell_inside_border & ~is_known) <= most_unknown
+        and np.count_nonzero(is_known) >= _MIN_KNOWN_CELL_FRACTION * len(is_known)
     )
 
 
 # --- The visible edges of a marker: its sides, and the inner edges of its border ---
 
 
-PICTURE_MARGIN_PX = 2.0
-"""Distance to the picture's edge, px, within which blur would need pixels outside the picture."""
+IMAGE_MARGIN_PX = 2.0
+"""Distance to the image's edge, px, within which blur would need pixels outside the image."""
 _MIN_INNER_EDGE_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
 _BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5  # shares of the contrast: black inside, white outside
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
@@ -366,7 +377,7 @@ class VisibleEdges:
 
     Attributes:
         points_half_sides: measured points (rows, n, 2), in half sides from the marker's centre.
-        edge_from_model_px: distance (rows, n) of each measured point from the model's edge,
+        edge_offset_px: distance (rows, n) of each measured point from the model's edge,
             positive out of the marker.
         weight: weight (rows, n) of each profile.
         side_index: index of the edge's side, 0 to 3, (rows,).
@@ -379,7 +390,7 @@ class VisibleEdges:
     """
 
     points_half_sides: Array
-    edge_from_model_px: Array
+    edge_offset_px: Array
     weight: Array
     side_index: NDArray[np.intp]
     centre_distance_half_sides: Array
@@ -388,11 +399,13 @@ class VisibleEdges:
     white_grey: float
 
 
-def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleEdges | None:
+def find_visible_edges(
+    detector_input: DetectorInput, H: Array, pattern: MarkerPattern
+) -> VisibleEdges | None:
     """Return the edges near the square projected by H (3, 3) to pixels; None if too few are
     visible."""
     camera, cells, corners = (
-        picture.camera,
+        detector_input.camera,
         pattern.border_cells.cells_per_side,
         apply_homography(H, CENTRED_SQUARE),
     )
@@ -414,23 +427,26 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     # White is outside the marker, and inside its border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
-    window_half_px, profile_half_length_px = window_and_profile_half_lengths_px(
+    window_half_length_px, profile_half_length_px = window_and_profile_half_lengths_px(
         np.full(len(at), cell_px)
     )
     depth_px = 2.0 * scale_px / cells
     around = find_neighbour_edges(s, [pattern.border_cells], pattern.border_cells, depth_px)
     is_unobstructed = around.can_be_located & _is_profile_in_view(
-        picture, origin, normal, window_half_px
+        detector_input, origin, normal, window_half_length_px
     )
     kept = np.flatnonzero(np.count_nonzero(is_unobstructed, axis=1) >= _MIN_SIDE_WEIGHT_SUM)
     if len(kept) < _MIN_VISIBLE_EDGES:
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, is_unobstructed = origin[kept], normal[kept], is_unobstructed[kept]
-    window_half_px, profile_half_length_px = window_half_px[kept], profile_half_length_px[kept]
-    profile_greys = sample_profiles(picture.image, origin, normal, profile_half_length_px)
+    window_half_length_px, profile_half_length_px = (
+        window_half_length_px[kept],
+        profile_half_length_px[kept],
+    )
+    profile_greys = sample_profiles(detector_input.image, origin, normal, profile_half_length_px)
     lit = _find_clean_profiles(
-        profile_greys, is_unobstructed, window_half_px, profile_half_length_px
+        profile_greys, is_unobstructed, window_half_length_px, profile_half_length_px
     )
     if lit is None:
         return None
@@ -439,7 +455,7 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         depth_px[kept], around.inner_neighbour_count[kept], around.outer_neighbour_count[kept], good
     )
     offset_px, weight, blur_px = locate_edges(
-        profile_greys, profile_half_length_px, window_half_px, around
+        profile_greys, profile_half_length_px, window_half_length_px, around
     )
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT_SUM] = 0.0
@@ -449,34 +465,36 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     )
     if not np.isfinite(own).all():
         return None
-    far = np.einsum("rni,ri->rn", own, OUTWARD_NORMALS[side]) - at[:, None]
+    far = np.einsum("rni,ri->rn", own, SIDE_OUTWARD_NORMALS[side]) - at[:, None]
     return VisibleEdges(
         points_half_sides=own,
-        edge_from_model_px=far * scale_px[:, None],
+        edge_offset_px=far * scale_px[:, None],
         weight=weight,
         side_index=side,
         centre_distance_half_sides=at,
         px_per_half_side=scale_px,
-        blur_per_window_half_length=blur_px / window_half_px,
+        blur_per_window_half_length=blur_px / window_half_length_px,
         white_grey=white,
     )
 
 
 def _is_profile_in_view(
-    picture: Picture, origin: Array, normal: Array, window_half_px: Array
+    detector_input: DetectorInput, origin: Array, normal: Array, window_half_length_px: Array
 ) -> NDArray[np.bool_]:
-    hidden_mask, (h, w) = picture.hidden_mask, picture.image.shape
-    # A profile is in the picture if both of its ends are.
+    hidden_mask, (h, w) = detector_input.hidden_mask, detector_input.image.shape
+    # A profile is in the image if both of its ends are.
     reach, last = (
-        window_half_px[:, None, None] * np.abs(normal),
-        (w - 1 - PICTURE_MARGIN_PX, h - 1 - PICTURE_MARGIN_PX),
+        window_half_length_px[:, None, None] * np.abs(normal),
+        (w - 1 - IMAGE_MARGIN_PX, h - 1 - IMAGE_MARGIN_PX),
     )
-    x_and_y = (origin - reach >= PICTURE_MARGIN_PX) & (origin + reach <= last)
+    x_and_y = (origin - reach >= IMAGE_MARGIN_PX) & (origin + reach <= last)
     seen = x_and_y[..., 0] & x_and_y[..., 1]
     if hidden_mask is not None and seen.any():
         at = (
             origin[:, :, None]
-            + window_half_px[:, None, None, None] * _WINDOW_SAMPLE_OFFSETS * normal[:, :, None]
+            + window_half_length_px[:, None, None, None]
+            * _WINDOW_SAMPLE_OFFSETS
+            * normal[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
         seen &= ~hidden_mask[pixel[..., 1], pixel[..., 0]].any(axis=2)
@@ -486,7 +504,7 @@ def _is_profile_in_view(
 def _find_clean_profiles(
     profile_greys: Floats,
     is_unobstructed: NDArray[np.bool_],
-    window_half_px: Array,
+    window_half_length_px: Array,
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return which profiles (rows, n) change from black to white, and the grey level of white
@@ -495,7 +513,9 @@ def _find_clean_profiles(
     off = max(
         1,
         round(
-            0.5 * SAMPLES_PER_PROFILE * float((0.6 * window_half_px / profile_half_length_px)[0])
+            0.5
+            * SAMPLES_PER_PROFILE
+            * float((0.6 * window_half_length_px / profile_half_length_px)[0])
         ),
     )
     dark, bright = (

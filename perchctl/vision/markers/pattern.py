@@ -1,4 +1,4 @@
-"""Appearance of a marker (rim of its border, cells, drawing), and checks of a picture for these
+"""Appearance of a marker (rim of its border, cells, drawing), and checks of an image for these
 cells at given corners."""
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     apply_homography,
     homography_from_centred_square,
-    is_inside_picture,
+    is_inside_image,
 )
 
 MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a blob
 MIN_CONTRAST_GREY = 10.0  # grey levels
-MIN_CELL_TO_THRESHOLD_PER_CONTRAST = (
+MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = (
     0.1  # margin of a cell to the threshold, as a share of the contrast
 )
 MIN_MATCHING_CELL_FRACTION = 0.8
@@ -52,7 +52,7 @@ class BorderCells:
 
 
 @dataclass(frozen=True, eq=False)
-class Pattern:
+class MarkerPattern:
     """The appearance of a marker.
 
     Attributes:
@@ -65,17 +65,17 @@ class Pattern:
         rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
             rotation of the marker (corners rolled by 0 to 3), with a blur of half a cell, zero-mean
             and of unit norm.
-        is_white: True for a white cell, (cells,).
+        is_cell_white: True for a white cell, (cells,).
         is_cell_inside_border: True for a cell within the border, (cells,).
     """
 
     border_cells: BorderCells
-    drawing: Drawing
+    drawing: MarkerDrawing
     sample_points: Array
     sample_cell_index: NDArray[np.intp]
     samples_per_cell: Array
     rotated_sample_templates: Array
-    is_white: NDArray[np.bool_]
+    is_cell_white: NDArray[np.bool_]
     is_cell_inside_border: NDArray[np.bool_]
 
 
@@ -97,7 +97,7 @@ def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.
     return BorderCells(white, white * second, print_tolerance_cells)
 
 
-def make_pattern(border_cells: BorderCells, drawing: Drawing) -> Pattern:
+def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> MarkerPattern:
     """Return the pattern of a marker. It has sample points in all cells that no central marker
     hides."""
     n = len(drawing.cell_whiteness)
@@ -108,7 +108,7 @@ def make_pattern(border_cells: BorderCells, drawing: Drawing) -> Pattern:
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS))
     free = (
         np.abs(sample_points).max(axis=1)
-        > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side
+        > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side_ratio
     )
     kept = np.unique(owner[free])
     turns, at = [], sample_points[free]
@@ -118,29 +118,29 @@ def make_pattern(border_cells: BorderCells, drawing: Drawing) -> Pattern:
         turns.append(soft / math.sqrt(float(soft @ soft)))
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
     own = np.searchsorted(kept, owner[free]).astype(np.intp)
-    return Pattern(
+    return MarkerPattern(
         border_cells=border_cells,
         drawing=drawing,
         sample_points=np.ascontiguousarray(sample_points[free]),
         sample_cell_index=own,
         samples_per_cell=np.bincount(own).astype(np.float64),
         rotated_sample_templates=np.stack(turns),
-        is_white=drawing.cell_whiteness.ravel()[kept] > 0.5,
+        is_cell_white=drawing.cell_whiteness.ravel()[kept] > 0.5,
         is_cell_inside_border=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
 
 
-def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if the picture clearly has the pattern's colour in every cell."""
+def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
+    """True if the image clearly has the pattern's colour in every cell."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
-    white, black = means[pattern.is_white], means[~pattern.is_white]
+    white, black = means[pattern.is_cell_white], means[~pattern.is_cell_white]
     # The light may vary across the marker, so white and black are medians.
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), MIN_CELL_TO_THRESHOLD_PER_CONTRAST * contrast
+    middle, margin = 0.5 * (high + low), MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST * contrast
     return bool(
         contrast >= MIN_CONTRAST_GREY
         and white.min() > middle + margin
@@ -149,29 +149,29 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def has_mostly_matching_cells(
-    image: NDArray[np.uint8], corners_px: Array, pattern: Pattern
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if the picture has the pattern's colour in more than `MIN_MATCHING_CELL_FRACTION` of the
+    """True if the image has the pattern's colour in more than `MIN_MATCHING_CELL_FRACTION` of the
     cells."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
-    high, low = np.median(means[pattern.is_white]), np.median(means[~pattern.is_white])
-    right = (means > 0.5 * (high + low)) == pattern.is_white
+    high, low = np.median(means[pattern.is_cell_white]), np.median(means[~pattern.is_cell_white])
+    right = (means > 0.5 * (high + low)) == pattern.is_cell_white
     return bool(high - low >= MIN_CONTRAST_GREY and right.mean() > MIN_MATCHING_CELL_FRACTION)
 
 
 def is_correlated_with_pattern(
-    image: NDArray[np.uint8], corners_px: Array, pattern: Pattern
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
     """True if the grey values in the cells correlate clearly with the pattern."""
     return float(correlate_pattern(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
 
 
-def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> Array:
     """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
     rolled by 0 to 3; 0 without contrast."""
-    grey = _read_samples(image, corners_px, pattern)
+    grey = _read_sample_greys(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
     grey -= grey.mean()
@@ -182,8 +182,10 @@ def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Patt
     return np.asarray(pattern.rotated_sample_templates @ grey / spread)
 
 
-def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    grey = _read_samples(image, corners_px, pattern)
+def _cell_means(
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
+) -> Array | None:
+    grey = _read_sample_greys(image, corners_px, pattern)
     if grey is None:
         return None
     return np.asarray(
@@ -191,21 +193,25 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     )
 
 
-def _read_samples(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the sample points; None outside the picture."""
+def _read_sample_greys(
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
+) -> Array | None:
+    """Return the grey values (k,) at the sample points; None outside the image."""
     at = apply_homography(homography_from_centred_square(corners_px), pattern.sample_points)
     # The sample points are inside the corners.
-    if not (is_inside_picture(corners_px, image.shape) or is_inside_picture(at, image.shape)):
+    if not (is_inside_image(corners_px, image.shape) or is_inside_image(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
 
 
-def _sample_blurred_drawing(drawing: Drawing, sample_points: Array) -> Array:
+def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points: Array) -> Array:
     """Return the whiteness of the drawing at the sample points, with a blur of half a cell."""
     n, fine = len(drawing.cell_whiteness), 8
-    sharp = np.kron(np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine)))
-    white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
+    sharp_nodes = np.kron(
+        np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
+    )
+    white = np.asarray(cv2.GaussianBlur(sharp_nodes, (0, 0), 0.5 * fine), dtype=np.float64)
     at = (((sample_points + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
     return np.asarray(white[at[:, 1], at[:, 0]])
 
@@ -219,40 +225,39 @@ BLUR_MARGIN_NODES = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class MarkerDrawing:
     """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
 
     The target's large marker also has the small marker's cells, `small_cell_whiteness`; the side of
-    the small marker over its own, `small_to_large_side`; and half the side of the paper in the
-    marker's coordinates, `paper_half_side` (None: infinite).
-    """
+    the small marker over its own, `small_to_large_side_ratio`; and half the side of the paper in
+    the marker's coordinates, `paper_reach_half_sides` (None: infinite)."""
 
     cell_whiteness: Array
     small_cell_whiteness: Array | None = None
-    small_to_large_side: float = 0.0
-    paper_half_side: float | None = None
+    small_to_large_side_ratio: float = 0.0
+    paper_reach_half_sides: float | None = None
 
     @property
     def photometric_fit_reach_half_sides(self) -> float:
-        """How far the square that the photometric fit compares with the picture extends from the
+        """How far the square that the photometric fit compares with the image extends from the
         marker's centre, in half sides of the marker."""
         return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
-def make_drawing(
+def make_marker_drawing(
     bits: NDArray[np.uint8],
     small_marker_bits: NDArray[np.uint8] | None = None,
-    small_to_large_side: float = 0.0,
-) -> Drawing:
+    small_to_large_side_ratio: float = 0.0,
+) -> MarkerDrawing:
     """Return a marker's drawing from its inner bits, 1 = white. If a small marker is printed in its
-    centre, `small_marker_bits` and `small_to_large_side` describe it."""
+    centre, `small_marker_bits` and `small_to_large_side_ratio` describe it."""
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
-        return Drawing(cells)
-    return Drawing(
+        return MarkerDrawing(cells)
+    return MarkerDrawing(
         cells,
         np.pad(small_marker_bits.astype(np.float64), 1),
-        small_to_large_side,
+        small_to_large_side_ratio,
         1.0 + 2.0 / len(cells),
     )
 
@@ -281,8 +286,8 @@ def _add_margin_nodes(node_positions: Array, half_node_spacing: float) -> Array:
 
 
 @lru_cache(maxsize=64)
-def render_whiteness_and_beyond_paper(
-    drawing: Drawing, nodes_per_side: int
+def render_whiteness_and_off_paper_fraction(
+    drawing: MarkerDrawing, nodes_per_side: int
 ) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing at n by n nodes and the margin around them.
 
@@ -294,13 +299,13 @@ def render_whiteness_and_beyond_paper(
         2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
     )
     paper = render_cells(drawing, node_positions, half_node_spacing)
-    if drawing.paper_half_side is None:
+    if drawing.paper_reach_half_sides is None:
         return (paper,)
     on = _cell_coverage(
         _add_margin_nodes(node_positions, half_node_spacing),
         half_node_spacing,
         1,
-        drawing.paper_half_side,
+        drawing.paper_reach_half_sides,
     )
     return paper, (1.0 - on @ on.T).astype(np.float32)
 
@@ -309,13 +314,13 @@ def render_whiteness_and_beyond_paper(
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
     """Return the whiteness of a black square with the size of a marker that has `cells_per_side`
     cells, at n by n nodes."""
-    return render_whiteness_and_beyond_paper(
-        Drawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
+    return render_whiteness_and_off_paper_fraction(
+        MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
 
 
 def render_cells(
-    drawing: Drawing, node_positions: Array, half_node_spacing: float
+    drawing: MarkerDrawing, node_positions: Array, half_node_spacing: float
 ) -> NDArray[np.float32]:
     """Return the whiteness of the square grid of nodes with the coordinates `node_positions` in
     both directions, and of `BLUR_MARGIN_NODES` additional nodes on all sides."""
@@ -324,14 +329,17 @@ def render_cells(
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
     if drawing.small_cell_whiteness is not None:
         C = _cell_coverage(
-            wide, half_node_spacing, len(drawing.small_cell_whiteness), drawing.small_to_large_side
+            wide,
+            half_node_spacing,
+            len(drawing.small_cell_whiteness),
+            drawing.small_to_large_side_ratio,
         )
         black += C @ (1.0 - drawing.small_cell_whiteness) @ C.T
     return (1.0 - black).astype(np.float32)
 
 
 def blurred_cell_coverage(
-    drawing: Drawing, node_positions: Array, half_node_spacing: float, blur_sigma_nodes: float
+    drawing: MarkerDrawing, node_positions: Array, half_node_spacing: float, blur_sigma_nodes: float
 ) -> Array:
     """Return the fraction of each node's width that each row of cells covers, (n, cells), after a
     Gaussian blur of `blur_sigma_nodes`."""
@@ -353,8 +361,8 @@ def blurred_cell_coverage(
     )
 
 
-def blur_nodes(sharp: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
+def blur_nodes(sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
     """Return the nodes after a Gaussian blur of `blur_sigma_nodes`. The input has a margin of
     `BLUR_MARGIN_NODES` on all sides, and so has the result."""
-    soft = cv2.GaussianBlur(sharp, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
+    soft = cv2.GaussianBlur(sharp_nodes, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

@@ -1,18 +1,18 @@
-"""Photometric fit: fit a marker's drawing to the picture if edges and bits are no longer visible.
+"""Photometric fit: fit a marker's drawing to the image if edges and bits are no longer visible.
 
-If blur has merged the cells, or cells are only a few pixels wide, the picture of the whole marker
+If blur has merged the cells, or cells are only a few pixels wide, the image of the whole marker
 is still its drawing D, blurred and lit. Gauss-Newton finds the homography H together with the
 standard deviation of the blur and the light, at the nodes u of a grid over the marker:
 
     min sum (I(lens(H u)) - [a + b.u + (c + e.u) D + f D (1 - D)])^2,    D blurred by sigma
 
 a, b: black level and its slope; c, e: gain and its slope; f: bend of the tone curve. If the sheet
-ends, the grey beyond it is one more unknown. A picture that still deviates from the drawing, cell
+ends, the grey beyond it is one more unknown. An image that still deviates from the drawing, cell
 by cell, does not show the marker.
 
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
 the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
-same with that blur; `Alignment.bit_flip_fraction` says how close one is.
+same with that blur; `DrawingAlignment.bit_flip_fraction` says how close one is.
 
 Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
 grids are (n, n) nodes, stored as rows of n * n.
@@ -41,16 +41,16 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.pattern import (
     BLUR_MARGIN_NODES,
-    Drawing,
+    MarkerDrawing,
     blur_nodes,
     blurred_cell_coverage,
     render_black_square,
-    render_whiteness_and_beyond_paper,
+    render_whiteness_and_off_paper_fraction,
 )
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID_NODES, _MIN_GRID_NODES = 44, 18
-_NODE_SPACING_PX = 0.8  # picture pixels between nodes
+_NODE_SPACING_PX = 0.8  # image pixels between nodes
 _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 """Number of rounds after which the fit fails unless its correlation reaches
@@ -91,16 +91,16 @@ _INCREMENT_PRIOR_INFORMATION: Array = (
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
-    """Result of fitting a drawing to the picture, with measures of the fit's quality.
+class DrawingAlignment:
+    """Result of fitting a drawing to the image, with measures of the fit's quality.
 
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
-        fit_correlation: correlation of the picture with the fitted drawing.
+        fit_correlation: correlation of the image with the fitted drawing.
         pattern_correlation: correlation of the inner bits with what a plain black square of the
-            same size leaves unexplained in the picture.
-        pattern_contrast: contrast of the inner bits relative to the border's.
-        cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of the
+            same size leaves unexplained in the image.
+        pattern_to_border_contrast: contrast of the inner bits relative to the border's.
+        max_cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of the
             fitted drawing, relative to the contrast of black and white.
         bit_flip_fraction: how far the worst cell has the opposite colour, from 0 (as drawn) to 1
             (wrong bit).
@@ -113,8 +113,8 @@ class Alignment:
     sigma_px: float
     fit_correlation: float
     pattern_correlation: float
-    pattern_contrast: float
-    cell_deviation_per_contrast: float
+    pattern_to_border_contrast: float
+    max_cell_deviation_per_contrast: float
     bit_flip_fraction: float
     bit_flip_fraction_sigma: float
     blur_px: float
@@ -122,12 +122,12 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
+class _NormalEquations:
     """One linearised round of the fit.
 
     Attributes:
         contrast_grey: grey levels from black to white.
-        grey_residual: the picture's grey values minus the drawing's under the light that fits best,
+        grey_residual: the image's grey values minus the drawing's under the light that fits best,
             (n * n,).
         J: derivatives of the drawing's grey values with respect to the unknowns (k, n * n).
         noise_variance_grey2: variance of a residual.
@@ -145,13 +145,13 @@ class _Equations:
 def align_drawing(
     image: NDArray[np.uint8],
     start_corners_px: Array,
-    drawing: Drawing,
+    drawing: MarkerDrawing,
     camera: CameraModel,
     blur_px: float = 1.0,
-) -> Alignment | None:
-    """Fit the drawing to the picture, starting at `start_corners_px` (4, 2) and `blur_px`.
+) -> DrawingAlignment | None:
+    """Fit the drawing to the image, starting at `start_corners_px` (4, 2) and `blur_px`.
 
-    Returns None if the marker leaves the picture, looks different, or the fit diverges.
+    Returns None if the marker leaves the image, looks different, or the fit diverges.
     """
     start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all():
@@ -164,7 +164,7 @@ def align_drawing(
         np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
     )
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
-    grid, H = make_grid(n, reach), homography_from_centred_square(start)
+    grid, H = make_sampling_grid(n, reach), homography_from_centred_square(start)
     node_lens_shift_px = lens_shift_px(grid, H, camera)
     patch = _extract_patch(image, grid, H, node_lens_shift_px)
     if patch is None:
@@ -215,7 +215,7 @@ def align_drawing(
     # Residuals of the last round, whose step was negligible.
     contrast_grey, grey_residual = equations.contrast_grey, equations.grey_residual
     corners_px = distort_px(apply_homography(H, CENTRED_SQUARE).T, camera).T
-    pattern_correlation, pattern_contrast = _measure_inner_pattern_match(
+    pattern_correlation, pattern_to_border_contrast = _measure_inner_pattern_match(
         rendered_drawing, grey, contrast_grey
     )
     nodes_per_independent_sample = _estimate_nodes_per_independent_sample(
@@ -236,13 +236,13 @@ def align_drawing(
         )
         / 8.0
     )
-    return Alignment(
+    return DrawingAlignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
         fit_correlation=fit_correlation(grey, grey_residual),
         pattern_correlation=pattern_correlation,
-        pattern_contrast=pattern_contrast,
-        cell_deviation_per_contrast=_cell_deviation(
+        pattern_to_border_contrast=pattern_to_border_contrast,
+        max_cell_deviation_per_contrast=_cell_deviation(
             grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
         bit_flip_fraction=bit_flip_fraction,
@@ -254,7 +254,7 @@ def align_drawing(
 
 def _linearize_greys(
     grey: Array, rendered_drawing: RenderedDrawing, increment_from_start: Array
-) -> _Equations | None:
+) -> _NormalEquations | None:
     """Return the equations of the next increment; None without contrast. `increment_from_start`
     (8,) is the sum of the increments so far."""
     rows, products = rendered_drawing.illumination_basis
@@ -278,10 +278,10 @@ def _linearize_greys(
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _INCREMENT_PRIOR_INFORMATION
     g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * increment_from_start
-    return _Equations(contrast_grey, grey_residual, J, noise, N, g)
+    return _NormalEquations(contrast_grey, grey_residual, J, noise, N, g)
 
 
-# --- How well the picture matches a fitted drawing ---
+# --- How well the image matches a fitted drawing ---
 
 
 def fit_correlation(grey: Array, grey_residual: Array) -> float:
@@ -293,11 +293,11 @@ def fit_correlation(grey: Array, grey_residual: Array) -> float:
 
 def _measure_bit_flip_fraction(
     rendered_drawing: RenderedDrawing,
-    equations: _Equations,
+    equations: _NormalEquations,
     inverse_normal_matrix: Array,
     nodes_per_independent_sample: float,
 ) -> tuple[float, float]:
-    """Return `bit_flip_fraction` and `bit_flip_fraction_sigma` of an `Alignment`.
+    """Return `bit_flip_fraction` and `bit_flip_fraction_sigma` of an `DrawingAlignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
@@ -351,14 +351,14 @@ def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     return factor
 
 
-def _cell_deviation(relative_residual: Array, grid: Grid, n_cells: int) -> float:
+def _cell_deviation(relative_residual: Array, grid: SamplingGrid, n_cells: int) -> float:
     index, count = _assign_nodes_to_cells(grid, n_cells)
     total = np.bincount(index, weights=relative_residual, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
 
 
 @lru_cache(maxsize=32)
-def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
+def _assign_nodes_to_cells(grid: SamplingGrid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
     """Return the cell number of each node, and the number of nodes in each cell."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
@@ -378,7 +378,7 @@ def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Arra
     homography's increment (8) and the variance of the blur, under the light whose coefficients
     `illumination` (7 or 8,) belong to the rows of `illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
-    (white, changes), *others = drawing.blurred_whiteness_and_beyond_paper
+    (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
     slope = contrast_grey + illumination[GAIN_U] * u + illumination[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
@@ -388,14 +388,14 @@ def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Arra
     return change
 
 
-# --- A grid over a marker in its own coordinates, and the picture at its nodes ---
+# --- A grid over a marker in its own coordinates, and the image at its nodes ---
 
 
 _CHEBYSHEV_NODES = 9  # per side
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class SamplingGrid:
     """Sampling grid on the marker: n by n nodes at `node_positions` (n,) in both directions, in
     half sides from the marker's centre; `uv1` (3, n * n) is (u, v, 1) of each node."""
 
@@ -405,11 +405,11 @@ class Grid:
 
 
 @lru_cache(maxsize=64)
-def make_grid(nodes_per_side: int, half_side: float) -> Grid:
+def make_sampling_grid(nodes_per_side: int, half_side: float) -> SamplingGrid:
     """Return the nodes in the middle of n by n equal parts of a square from -half_side to
     half_side."""
     node_positions = half_side * ((2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0)
-    return Grid(nodes_per_side, node_positions, _grid_coordinates(node_positions))
+    return SamplingGrid(nodes_per_side, node_positions, _grid_coordinates(node_positions))
 
 
 def _grid_coordinates(node_positions: Array) -> Array:
@@ -433,7 +433,7 @@ def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
     return distort_to_px(rays, camera).T
 
 
-def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
+def lens_shift_px(grid: SamplingGrid, H: Array, camera: CameraModel) -> Array:
     """Return the shift of each node by the lens, px (2, n * n), interpolated from a few nodes."""
     uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H, uv1)
@@ -442,7 +442,7 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
+def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
     """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES^2), and the weights (n,
     _CHEBYSHEV_NODES) for the grid's own nodes."""
     reach = float(grid.node_positions[-1])
@@ -455,10 +455,10 @@ def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
 
 
 def _extract_patch(
-    image: NDArray[np.uint8], grid: Grid, H: Array, node_lens_shift_px: Array
+    image: NDArray[np.uint8], grid: SamplingGrid, H: Array, node_lens_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the picture that contains all nodes, and its top left pixel (2, 1); None
-    if a node is outside the picture."""
+    """Return the part of the image that contains all nodes, and its top left pixel (2, 1); None
+    if a node is outside the image."""
     h, w = image.shape
     x, y = project_nodes(H, grid.uv1) + node_lens_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -472,7 +472,7 @@ def _extract_patch(
 
 
 def _sample_patch(
-    patch: NDArray[np.float32], grid: Grid, H: Array, lens_shift_in_patch_px: Array
+    patch: NDArray[np.float32], grid: SamplingGrid, H: Array, lens_shift_in_patch_px: Array
 ) -> Array:
     """Return the grey values (n * n,) of the patch at the nodes projected by H and moved by
     `lens_shift_in_patch_px` (2, n * n): the lens's shift of each node minus the patch's top left
@@ -513,19 +513,21 @@ class RenderedDrawing:
     """A marker's drawing at the nodes of a grid, after a Gaussian blur with a standard deviation of
     `blur_sigma_nodes`."""
 
-    drawing: Drawing
-    grid: Grid
+    drawing: MarkerDrawing
+    grid: SamplingGrid
     blur_sigma_nodes: float
 
     @cached_property
-    def blurred_whiteness_and_beyond_paper(self) -> tuple[tuple[Array, Array], ...]:
-        """The arrays of `render_whiteness_and_beyond_paper` after the blur. Each is a pair: its
-        values at the nodes (n * n,), and their derivatives (9, n * n) with respect to the
+    def blurred_whiteness_and_off_paper_fraction(self) -> tuple[tuple[Array, Array], ...]:
+        """The arrays of `render_whiteness_and_off_paper_fraction` after the blur. Each is a pair:
+        its values at the nodes (n * n,), and their derivatives (9, n * n) with respect to the
         homography's increment (8) and the variance of the blur."""
-        sharp = render_whiteness_and_beyond_paper(self.drawing, self.grid.nodes_per_side)
+        sharp_nodes = render_whiteness_and_off_paper_fraction(
+            self.drawing, self.grid.nodes_per_side
+        )
         return tuple(
             _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions)
-            for each in sharp
+            for each in sharp_nodes
         )
 
     @cached_property
@@ -535,7 +537,7 @@ class RenderedDrawing:
         its slopes, and the bend of the tone curve; the eighth, the grey beyond the paper, exists
         only if the paper ends inside the compared square."""
         u, v, one = self.grid.uv1
-        (white, _), *others = self.blurred_whiteness_and_beyond_paper
+        (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
         return stacked, gram_matrix(stacked)
@@ -565,21 +567,23 @@ class RenderedDrawing:
 
 
 @lru_cache(maxsize=16)
-def render_blurred(drawing: Drawing, nodes_per_side: int, blur_table_index: int) -> RenderedDrawing:
+def render_blurred(
+    drawing: MarkerDrawing, nodes_per_side: int, blur_table_index: int
+) -> RenderedDrawing:
     """Return the drawing at n by n nodes over the compared square, blurred by
     ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes: the blurs form a table, so that results
     can be cached."""
     return RenderedDrawing(
         drawing,
-        make_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),
+        make_sampling_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),
         math.exp(_LOG_BLUR_TABLE_STEP * blur_table_index),
     )
 
 
 def _blur_with_jacobian(
-    sharp: NDArray[np.float32], blur_sigma_nodes: float, node_positions: Array
+    sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float, node_positions: Array
 ) -> tuple[Array, Array]:
-    soft = blur_nodes(sharp, blur_sigma_nodes)
+    soft = blur_nodes(sharp_nodes, blur_sigma_nodes)
     step = float(node_positions[1] - node_positions[0])
     e, n = BLUR_MARGIN_NODES, len(node_positions)
     middle = slice(e, e + n)

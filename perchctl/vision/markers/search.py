@@ -1,12 +1,12 @@
-"""Search for both markers, in a window and then in the whole picture, and choose among the results.
+"""Search for both markers, in a window and then in the whole image, and choose among the results.
 
-OpenCV's ArUco detector thresholds the picture adaptively and decodes the quadrilaterals. Its
-corners are raw: they are about 0.5 px off, mostly inwards, and the picture's edge may be mistaken
+OpenCV's ArUco detector thresholds the image adaptively and decodes the quadrilaterals. Its
+corners are raw: they are about 0.5 px off, mostly inwards, and the image's edge may be mistaken
 for a side. A pixel p' of a window at half size that starts at pixel o is at
 
     p = 2 p' + 1/2 + o
 
-The search fails where blur or the picture's edge hides the bits. Corners are (4, 2) px.
+The search fails where blur or the image's edge hides the bits. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import is_inside_picture, mean_side_px, scale_square
+from perchctl.vision.markers.corners import is_inside_image, mean_side_px, scale_square
 from perchctl.vision.markers.detector import (
     MIRRORED_MARKER_ID,
     OPENCV_THRESHOLD_WINDOWS_PX,
     QUICK_THRESHOLD_WINDOWS_PX,
-    Picture,
+    DetectorInput,
     ThresholdWindowRange,
     make_aruco_detector,
 )
@@ -37,20 +37,20 @@ SearchMode = Literal[
 ]
 """Kinds of search in one frame. At the expected position: by OpenCV in the window around it
 ("expected_window"), by fits to a blurred target ("expected_fits"), or by both ("near_expected"). In
-the whole picture: by OpenCV, which needs a sharp target ("whole_sharp"), or by fits to a blurred
+the whole image: by OpenCV, which needs a sharp target ("whole_sharp"), or by fits to a blurred
 target ("whole_blurred"). "all" is everything."""
-_WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the picture, on each side
+_WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the image, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
-_MAX_WINDOW_FRACTION = 0.8  # share of the picture
+_MAX_WINDOW_FRACTION = 0.8  # share of the image
 _MIN_HALVED_SIDE_PX = 60.0
-"""Side above which markers are found in a picture of half the size, in a quarter of the time,
+"""Side above which markers are found in an image of half the size, in a quarter of the time,
 px."""
 _CENTRE_TOLERANCE_SIDES = 0.35  # share of the small marker's side
 
 
-Window = tuple[slice, slice]
-"""Rows and columns of a part of the picture."""
+ImageWindow = tuple[slice, slice]
+"""Rows and columns of a part of the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,32 +65,40 @@ class FoundMarkers:
 
 
 def search(
-    picture: Picture,
+    detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers with OpenCV's detector, then the whole picture
+    """Search the window around the expected markers with OpenCV's detector, then the whole image
     if the window shows too little.
 
     With `search_mode` "near_expected" or "expected_window", only the window is searched (they
-    differ in the fits to blurred markers that follow); with "whole_sharp", only the whole picture;
+    differ in the fits to blurred markers that follow); with "whole_sharp", only the whole image;
     otherwise both. If several targets are found and none is expected, the one with the smallest
     `measure_own_target_distance_m`, its distance from this vehicle's own target, is chosen.
     """
-    setup, shape = picture.setup, picture.image.shape
+    setup, shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
 
-    def search_part(part: Window, threshold_windows_px: ThresholdWindowRange) -> FoundMarkers:
+    def search_part(part: ImageWindow, threshold_windows_px: ThresholdWindowRange) -> FoundMarkers:
         return _search_once(
-            picture, part, expected_corners_px, threshold_windows_px, measure_own_target_distance_m
+            detector_input,
+            part,
+            expected_corners_px,
+            threshold_windows_px,
+            measure_own_target_distance_m,
         )
 
     if setup.is_line_fit_enabled and expected_corners_px and search_mode != "whole_sharp":
-        quickly = search_half_size(picture, expected_corners_px, measure_own_target_distance_m)
+        quickly = search_half_size(
+            detector_input, expected_corners_px, measure_own_target_distance_m
+        )
         if quickly is not None:
             return quickly
-        window = make_search_window(expected_corners_px, setup.small_to_large_side, shape) or whole
+        window = (
+            make_search_window(expected_corners_px, setup.small_to_large_side_ratio, shape) or whole
+        )
         found = FoundMarkers()
         if len(expected_corners_px) == 2:
             found = search_part(window, QUICK_THRESHOLD_WINDOWS_PX)
@@ -104,47 +112,49 @@ def search(
 
 
 def search_half_size(
-    picture: Picture,
+    detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
     """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
-    shape = picture.image.shape
-    in_view = [quad for quad in expected_corners_px.values() if is_inside_picture(quad, shape)]
+    shape = detector_input.image.shape
+    in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
     if (
         len(expected_corners_px) < 2
         or not in_view
         or min(map(mean_side_px, in_view)) <= _MIN_HALVED_SIDE_PX
     ):
         return None
-    window = make_search_window(expected_corners_px, picture.setup.small_to_large_side, shape)
+    window = make_search_window(
+        expected_corners_px, detector_input.setup.small_to_large_side_ratio, shape
+    )
     window = window or (slice(0, shape[0]), slice(0, shape[1]))
     found = _search_once(
-        picture,
+        detector_input,
         window,
         expected_corners_px,
         QUICK_THRESHOLD_WINDOWS_PX,
         measure_own_target_distance_m,
-        halved=True,
+        is_halved=True,
     )
     return found if len(found.corners_px) >= len(in_view) else None
 
 
 def make_search_window(
     expected_corners_px: Mapping[MarkerName, Array],
-    small_to_large_side: float,
+    small_to_large_side_ratio: float,
     shape: tuple[int, ...],
-) -> Window | None:
-    """Return the part of the picture around the expected markers; None if it is nearly the whole
-    picture, which is then searched instead. `small_to_large_side` is the small marker's side over
-    the large one's. The window contains the whole large marker if that may be in the picture."""
+) -> ImageWindow | None:
+    """Return the part of the image around the expected markers; None if it is nearly the whole
+    image, which is then searched instead. `small_to_large_side_ratio` is the small marker's side
+    over the large one's. The window contains the whole large marker if that may be in the image."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
     else:
         small = expected_corners_px["small"]
         centre = small.mean(axis=0)
-        whole = centre + (small - centre) / small_to_large_side
+        whole = centre + (small - centre) / small_to_large_side_ratio
         inside = (whole >= 0).all() and (whole < (w, h)).all()
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -158,15 +168,15 @@ def make_search_window(
 
 
 def _search_once(
-    picture: Picture,
-    window: Window,
+    detector_input: DetectorInput,
+    window: ImageWindow,
     expected_corners_px: Mapping[MarkerName, Array],
     threshold_windows_px: ThresholdWindowRange,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None,
-    halved: bool = False,
+    is_halved: bool = False,
 ) -> FoundMarkers:
-    setup, part = picture.setup, picture.image[window]
-    if halved:
+    setup, part = detector_input.setup, detector_input.image[window]
+    if is_halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), threshold_windows_px)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
@@ -183,10 +193,13 @@ def _search_once(
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
         # The centre of a pixel at half size is between two pixels.
-        candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
-    targets = len(_pair_markers(candidates, setup.small_to_large_side))
+        candidates[name].append((2.0 * at + 0.5 if is_halved else at) + first)
+    targets = len(_pair_markers(candidates, setup.small_to_large_side_ratio))
     chosen = choose_markers(
-        candidates, expected_corners_px, setup.small_to_large_side, measure_own_target_distance_m
+        candidates,
+        expected_corners_px,
+        setup.small_to_large_side_ratio,
+        measure_own_target_distance_m,
     )
     return FoundMarkers(chosen, is_mirrored_marker_seen, targets)
 
@@ -194,7 +207,7 @@ def _search_once(
 def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
     expected_corners_px: Mapping[MarkerName, Array],
-    small_to_large_side: float,
+    small_to_large_side_ratio: float,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
@@ -206,9 +219,9 @@ def choose_markers(
     if measure_own_target_distance_m is not None and not expected_corners_px:
         candidates = _sort_by_own_target_distance(candidates, measure_own_target_distance_m)
     large, small = candidates["large"], candidates["small"]
-    wholes = _pair_markers(candidates, small_to_large_side)
-    near_large = _nearest_candidate("large", large, expected_corners_px, small_to_large_side)
-    near_small = _nearest_candidate("small", small, expected_corners_px, small_to_large_side)
+    wholes = _pair_markers(candidates, small_to_large_side_ratio)
+    near_large = _nearest_candidate("large", large, expected_corners_px, small_to_large_side_ratio)
+    near_small = _nearest_candidate("small", small, expected_corners_px, small_to_large_side_ratio)
     if wholes:
         _, i, j = wholes[0]
         if expected_corners_px:
@@ -220,7 +233,7 @@ def choose_markers(
         elif measure_own_target_distance_m is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = (
-            _nearest_candidate("large", [large[i]], expected_corners_px, small_to_large_side)
+            _nearest_candidate("large", [large[i]], expected_corners_px, small_to_large_side_ratio)
             is None
         )
         if not (elsewhere and (near_large is not None or near_small is not None)):
@@ -259,12 +272,12 @@ def _sort_by_own_target_distance(
 
 
 def _pair_markers(
-    candidates: Mapping[MarkerName, list[Array]], small_to_large_side: float
+    candidates: Mapping[MarkerName, list[Array]], small_to_large_side_ratio: float
 ) -> list[tuple[float, int, int]]:
     """Return the pairs of markers that form a target: error and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
-        (nesting_error(a, b, small_to_large_side), i, j)
+        (relative_nesting_error(a, b, small_to_large_side_ratio), i, j)
         for i, a in enumerate(large)
         for j, b in enumerate(small)
     ]
@@ -275,21 +288,23 @@ def _pair_markers(
     return list(best.values())
 
 
-def nesting_error(large_px: Array, small_px: Array, small_to_large_side: float) -> float:
-    """Return how far the small marker's corners are from where `small_to_large_side` (side of the
-    small marker over that of the large one) places them inside the large one, divided by the
+def relative_nesting_error(
+    large_corners_px: Array, small_corners_px: Array, small_to_large_side_ratio: float
+) -> float:
+    """Return how far the small marker's corners are from where `small_to_large_side_ratio` (side of
+    the small marker over that of the large one) places them inside the large one, divided by the
     allowed distance: up to 1, the two form a target."""
-    mapped = scale_square(large_px, small_to_large_side)
+    mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
-    return float(np.linalg.norm(mapped - small_px, axis=1).max()) / allowed_px
+    return float(np.linalg.norm(mapped - small_corners_px, axis=1).max()) / allowed_px
 
 
 def _nearest_candidate(
     name: MarkerName,
     quads: list[Array],
     expected_corners_px: Mapping[MarkerName, Array],
-    small_to_large_side: float,
+    small_to_large_side_ratio: float,
 ) -> Array | None:
     if not expected_corners_px or not quads:
         return None
@@ -298,11 +313,11 @@ def _nearest_candidate(
     else:
         other = next(iter(expected_corners_px.values()))
         centre = other.mean(axis=0)
-        guess = centre + (small_to_large_side if name == "small" else 1.0 / small_to_large_side) * (
-            other - centre
-        )
+        guess = centre + (
+            small_to_large_side_ratio if name == "small" else 1.0 / small_to_large_side_ratio
+        ) * (other - centre)
     side_px = max(mean_side_px(guess), 1e-6)
-    reach_px = max(2.0 * side_px * (1.0 if name == "small" else small_to_large_side), 40.0)
+    reach_px = max(2.0 * side_px * (1.0 if name == "small" else small_to_large_side_ratio), 40.0)
     best: Array | None = None
     for quad in quads:
         distance_px = float(np.linalg.norm(quad.mean(axis=0) - guess.mean(axis=0)))

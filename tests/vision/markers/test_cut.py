@@ -22,17 +22,17 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.lens import distort_to_px, undistort_px, undistort_to_normalised
-from perchctl.vision.markers.corners import is_inside_picture
+from perchctl.vision.markers.corners import is_inside_image
 from perchctl.vision.markers.cut import (
-    MAX_CUT_FIT_AGE_S,
+    MAX_TRUNCATED_FIT_AGE_S,
     RigidPose,
-    fit_cut_markers,
     fit_pose,
-    is_target_cut,
+    fit_truncated_markers,
+    is_target_truncated,
     make_outline,
 )
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import Picture
+from perchctl.vision.markers.detector import DetectorInput
 from perchctl.vision.markers.partial import find_visible_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame, waved
@@ -83,7 +83,7 @@ def nothing(found: Detections) -> bool:
 @pytest.mark.parametrize(("name", "off_px"), [("height", 25.0), ("width", -30.0), ("under", 20.0)])
 def test_corners_follow_from_what_is_left(name: str, off_px: float) -> None:
     true = corners("small", POSES[name])
-    assert not is_inside_picture(true, SHAPE)
+    assert not is_inside_image(true, SHAPE)
     found = search_mode(name, off_px=off_px).small
     error = undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)
     assert float(error.ravel() @ np.linalg.solve(found.cov_px2, error.ravel())) < 20.0
@@ -104,8 +104,8 @@ def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(search_mode("height", age_s=MAX_CUT_FIT_AGE_S - 0.01))
-    assert nothing(search_mode("height", age_s=MAX_CUT_FIT_AGE_S + 0.01))
+    assert not nothing(search_mode("height", age_s=MAX_TRUNCATED_FIT_AGE_S - 0.01))
+    assert nothing(search_mode("height", age_s=MAX_TRUNCATED_FIT_AGE_S + 0.01))
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
@@ -168,7 +168,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     found = fit_pose(image, _pose("line"), outline, plain)
     assert found.found_point_count == found.visible_point_count
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
-    assert fit_cut_markers(Picture(image, None, SETUP, plain), expected) == {}
+    assert fit_truncated_markers(DetectorInput(image, None, SETUP, plain), expected) == {}
     assert nothing(search_mode("width", waved(picture("width")))), "nor do edges that fit badly"
 
 
@@ -194,12 +194,12 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     image, mask = gear(picture("height"))
     true = corners("small", BESIDE_HEIGHT)
     expected = both(BESIDE_HEIGHT, 10.0)
-    assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
+    assert fit_truncated_markers(DetectorInput(image, None, SETUP, CAMERA), expected) == {}
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
     fit = fit_pose(image, _pose("height"), outline, CAMERA, own)
     assert fit.found_point_count == fit.visible_point_count
-    found = fit_cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
+    found = fit_truncated_markers(DetectorInput(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
 
@@ -210,11 +210,11 @@ def test_markers_behind_the_gear_are_cut() -> None:
     free, hidden = np.zeros(SHAPE, dtype=bool), np.zeros(SHAPE, dtype=bool)
     x, y = at["small"][0].astype(int)
     hidden[: y + 30, : x + 30] = True
-    assert not is_target_cut(at, SHAPE)
-    assert not is_target_cut(at, SHAPE, free)
-    assert is_target_cut(at, SHAPE, hidden)
-    assert is_target_cut({"small": corners("small", BESIDE_HEIGHT)}, SHAPE, free)
-    assert not is_target_cut({}, SHAPE)
+    assert not is_target_truncated(at, SHAPE)
+    assert not is_target_truncated(at, SHAPE, free)
+    assert is_target_truncated(at, SHAPE, hidden)
+    assert is_target_truncated({"small": corners("small", BESIDE_HEIGHT)}, SHAPE, free)
+    assert not is_target_truncated({}, SHAPE)
 
 
 def _pose(name: str) -> RigidPose:
@@ -232,21 +232,26 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fit_pose(image, _pose("corner"), outline, CAMERA)
     assert found.small_marker_point_count == 0
-    assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
+    assert (
+        fit_truncated_markers(DetectorInput(image, None, SETUP, CAMERA), both(POSES["corner"]))
+        == {}
+    )
 
 
 def test_a_prediction_may_be_off_in_range() -> None:
     rvec, tvec = BESIDE_HEIGHT
     for growth in (0.93, 1.07):
         expected = both((rvec, tvec * (1.0, 1.0, growth)))
-        assert "small" in fit_cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
+        assert "small" in fit_truncated_markers(
+            DetectorInput(picture("height"), None, SETUP, CAMERA), expected
+        )
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
 def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
     """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
     square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
-    seen = Picture(picture("height"), None, SETUP, CAMERA)
+    seen = DetectorInput(picture("height"), None, SETUP, CAMERA)
     assert find_visible_edges(seen, square_px, SETUP.patterns["large"]) is None
 
 

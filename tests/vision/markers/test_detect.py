@@ -14,11 +14,11 @@ from perchctl.vision.markers.detect import (
     average_fields,
     detect_markers,
     find_corners,
-    find_large_around,
+    find_large_marker_around_small,
     refine_expected_markers,
 )
-from perchctl.vision.markers.detector import Picture, make_detector_setup
-from perchctl.vision.markers.search import nesting_error
+from perchctl.vision.markers.detector import DetectorInput, make_detector_setup
+from perchctl.vision.markers.search import relative_nesting_error
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
@@ -56,7 +56,9 @@ def test_a_decoy_of_either_marker_is_dropped() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
     assert (
-        nesting_error(found.large.corners_px, found.small.corners_px, SETUP.small_to_large_side)
+        relative_nesting_error(
+            found.large.corners_px, found.small.corners_px, SETUP.small_to_large_side_ratio
+        )
         < 0.5
     )
 
@@ -132,9 +134,12 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     assert found.small is not None
     assert found.large is None
     seen = refine_expected_markers(
-        Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)}
+        DetectorInput(image, None, SETUP, CAMERA), {"small": corners("small", pose)}
     )
-    assert find_large_around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
+    assert (
+        find_large_marker_around_small(DetectorInput(image, None, SETUP, CAMERA), seen["small"])
+        is None
+    )
 
 
 # --- Motion from picture to picture ------------------------------------------------------------

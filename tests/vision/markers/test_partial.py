@@ -24,12 +24,16 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
-    Picture,
+    DetectorInput,
     is_any_part_hidden,
     make_detector_setup,
     make_hidden_mask,
 )
-from perchctl.vision.markers.partial import IdentifiedBy, find_visible_edges, fit_partly_visible
+from perchctl.vision.markers.partial import (
+    IdentificationEvidence,
+    find_visible_edges,
+    fit_partly_visible_marker,
+)
 from perchctl.vision.markers.search import search
 from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame, waved
@@ -43,12 +47,12 @@ LARGE = SETUP.patterns["large"]
 def partly(
     image: Grey,
     start_corners_px: Array,
-    identified_by: IdentifiedBy,
+    identified_by: IdentificationEvidence,
     hidden: NDArray[np.bool_] | None = None,
 ) -> RefinedCorners | None:
     """The large marker by what is seen of it."""
-    return fit_partly_visible(
-        Picture(image, hidden, SETUP, CAMERA), "large", start_corners_px, identified_by
+    return fit_partly_visible_marker(
+        DetectorInput(image, hidden, SETUP, CAMERA), "large", start_corners_px, identified_by
     )
 
 
@@ -134,7 +138,10 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     """Both markers decoded, but the large one does not look as it should."""
     pose = cut(0.03, 0)
     image = render(*pose, noise=2.0)
-    assert set(search(Picture(image, None, SETUP, CAMERA), {}).corners_px) == {"large", "small"}
+    assert set(search(DetectorInput(image, None, SETUP, CAMERA), {}).corners_px) == {
+        "large",
+        "small",
+    }
     large = MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150)
     other = make_detector_setup(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
     setup = replace(SETUP, patterns={**SETUP.patterns, "large": other})
@@ -174,7 +181,7 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
 
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
-    black = np.flatnonzero(LARGE.is_cell_inside_border & ~LARGE.is_white)[0]
+    black = np.flatnonzero(LARGE.is_cell_inside_border & ~LARGE.is_cell_white)[0]
     spots = apply_homography(
         homography_from_centred_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
     )
@@ -189,12 +196,12 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
 def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
     pose = pose_of(0.02, 0.01, 0.4, 0.3)
     image = render(*pose, markers=(("DICT_4X4_1000", 16, 0.150),))
-    ways: tuple[IdentifiedBy, ...] = ("bits", "track", "other")
+    ways: tuple[IdentificationEvidence, ...] = ("bits", "track", "other_marker")
     for identified_by in ways:
         assert partly(image, corners("large", pose), identified_by) is None
     turned = np.roll(corners("large", pose), 1, axis=0)
     right = render(*pose)
-    assert partly(right, turned, "other") is None
+    assert partly(right, turned, "other_marker") is None
     assert partly(right, corners("large", pose), "bits") is not None
     assert partly(waved(right), corners("large", pose), "bits") is None
 
@@ -244,7 +251,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     assert is_any_part_hidden(covered, TRUE)
     bare, at = render(*POSE, noise=2.0), homography_from_centred_square(undistort_px(TRUE, CAMERA))
     seen = [
-        find_visible_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE)
+        find_visible_edges(DetectorInput(bare, gear, SETUP, CAMERA), at, LARGE)
         for gear in (None, covered)
     ]
     whole, rest = (edges.weight.sum() for edges in seen)

@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, square_corners
 from perchctl.vision.markers.blurred import (
+    excludes_other_codewords,
     find_blurred,
     find_expected_blurred,
-    has_distinctive_bits,
-    has_matching_drawing,
+    is_alignment_confirmed,
 )
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import Picture
-from perchctl.vision.markers.pattern import Drawing, make_drawing
-from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
+from perchctl.vision.markers.detector import DetectorInput
+from perchctl.vision.markers.pattern import MarkerDrawing, make_marker_drawing
+from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_drawing
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
-DRAWINGS: dict[str, Drawing] = {
-    "large": make_drawing(LARGE_BITS, SMALL_BITS, 1.0 / 6.0),
-    "small": make_drawing(SMALL_BITS),
+DRAWINGS: dict[str, MarkerDrawing] = {
+    "large": make_marker_drawing(LARGE_BITS, SMALL_BITS, 1.0 / 6.0),
+    "small": make_marker_drawing(SMALL_BITS),
 }
 SIDES = {"large": 0.150, "small": 0.025}
 
@@ -73,7 +73,7 @@ def test_corners_of_small_and_blurred_markers(
     for seed in range(6):
         image, true = view(name, side_px, seed, blur_px=blur_px, noise=3.0)
         found = align_drawing(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
-        assert has_matching_drawing(found)
+        assert is_alignment_confirmed(found)
         error = found.corners_px - true
         squares.append((error**2).mean())
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
@@ -116,7 +116,7 @@ def test_other_markers_are_not_verified(
     true = project(square_corners(SIDES[name]), *pose, CAMERA)
     for k in range(4):
         found = align_drawing(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
-        assert found is None or not has_matching_drawing(found)
+        assert found is None or not is_alignment_confirmed(found)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ CELLS: Array = SETUP.patterns["small"].drawing.cell_whiteness
 DOTS = 12
 
 
-def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> Alignment:
+def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> DrawingAlignment:
     """The small marker's drawing laid over a picture of these cells."""
     image, corners = picture(cells, cell_px, blur_px, noise, seed)
     found = align_drawing(image, corners, SETUP.patterns["small"].drawing, PINHOLE, blur_px)
@@ -178,7 +178,7 @@ def picture(
 def test_the_marker_itself_is_told_apart(
     cell_px: float, blurs: float, noise: float, seed: int
 ) -> None:
-    assert has_distinctive_bits(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
+    assert excludes_other_codewords(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     image, true = blurry(26.0, 3.0, seed)
     ids = ARUCO.detectMarkers(image)[1]
     assert ids is None or 997 not in ids
-    still = find_blurred(Picture(image, None, SETUP, CAMERA))
+    still = find_blurred(DetectorInput(image, None, SETUP, CAMERA))
     assert np.abs(still["large"].corners_px - true).max() < 0.5
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
@@ -222,7 +222,7 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
 def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> None:
     image, true = blurry(24.0, 3.0, seed)
     way = np.random.default_rng(seed).uniform(-8.0, 8.0, 2)
-    seen = find_expected_blurred(Picture(image, None, SETUP, CAMERA), {"large": true + way})
+    seen = find_expected_blurred(DetectorInput(image, None, SETUP, CAMERA), {"large": true + way})
     assert np.abs(seen["large"].corners_px - true).max() < 0.5
     before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
     found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
@@ -240,5 +240,5 @@ def test_in_blur_nothing_is_taken_for_the_target() -> None:
             image[y : y + side, x : x + side] = 30
             image[y + side // 5 : y + 4 * side // 5, x + side // 5 : x + 4 * side // 5] = 210
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
-        assert find_blurred(Picture(image, None, SETUP, CAMERA)) == {}
-        assert find_expected_blurred(Picture(image, None, SETUP, CAMERA), expected) == {}
+        assert find_blurred(DetectorInput(image, None, SETUP, CAMERA)) == {}
+        assert find_expected_blurred(DetectorInput(image, None, SETUP, CAMERA), expected) == {}

@@ -13,7 +13,7 @@ from perchctl.vision.markers.search import choose_markers
 from tests.helpers.markers import SETUP, box
 from tests.helpers.target_picture import pose_of, render
 
-RATIO = SETUP.small_to_large_side
+RATIO = SETUP.small_to_large_side_ratio
 Build = Callable[..., Pipeline]
 
 
