@@ -261,7 +261,7 @@ class Tracker:
             yield output.lock_note
         if output.detections.markers and not output.poses:
             yield _NO_POSE
-        if output.detections.mirrored:
+        if output.detections.is_mirrored_marker_seen:
             yield mirrored_problem(self._config).sentence
         if output.frames_with_contradicting_markers >= self._disagreement_frames:
             yield _DISAGREE

@@ -94,7 +94,7 @@ class Perception:
             attitude = self.attitude(at) if self.attitude else attitude_at(self.history, at)
             run = self.pipeline.custom_step or step
             self.state, output = run(self.state, picture, attitude, self.pipeline)
-            if output.detections.mirrored:
+            if output.detections.is_mirrored_marker_seen:
                 self._mirrored += 1
             elif output.detections.markers:
                 self._mirrored = 0

@@ -132,27 +132,37 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     """
     skip = (
         frame.picture_kind is None
-        and state.kind == "whole"
-        and state.frames_since_examined + 1 < _COMBING_CHECK_INTERVAL_FRAMES
+        and state.picture_kind == "whole"
+        and state.frames_since_combing_check + 1 < _COMBING_CHECK_INTERVAL_FRAMES
     )
     frame = replace(frame, picture_kind="whole") if skip else classify_fields(frame)
-    skipped = state.frames_since_examined + 1 if skip else 0
+    skipped = state.frames_since_combing_check + 1 if skip else 0
     # Once interlaced, a stream counts as interlaced.
-    kind = state.kind if state.kind == "woven" else frame.picture_kind
+    picture_kind = state.picture_kind if state.picture_kind == "woven" else frame.picture_kind
     frame_periods_s = _update_frame_periods_s(state, frame)
     if frame.picture_kind == "whole":
         new = FieldState(
-            kind, skipped, state.top_first_votes, state.is_top_first, frame_periods_s, frame.t_s
+            picture_kind,
+            skipped,
+            state.top_field_first_votes,
+            state.is_top_field_first,
+            frame_periods_s,
+            frame.t_s,
         )
         return new, (frame,)
     state = _vote_on_field_order(
-        replace(state, kind=kind, frames_since_examined=skipped, frame_periods_s=frame_periods_s),
+        replace(
+            state,
+            picture_kind=picture_kind,
+            frames_since_combing_check=skipped,
+            frame_periods_s=frame_periods_s,
+        ),
         frame,
     )
-    if frame.picture_kind != "woven" or state.is_top_first is None:
+    if frame.picture_kind != "woven" or state.is_top_field_first is None:
         return state, (frame,)
     top, bottom = interpolate_fields(frame)
-    early, late = (top, bottom) if state.is_top_first else (bottom, top)
+    early, late = (top, bottom) if state.is_top_field_first else (bottom, top)
     apart_s = _estimate_frame_period_s(state.frame_periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
@@ -183,10 +193,10 @@ def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...
 
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
-    before, top_first_votes, is_top_first = (
+    before, top_field_first_votes, is_top_field_first = (
         state.previous_image,
-        state.top_first_votes,
-        state.is_top_first,
+        state.top_field_first_votes,
+        state.is_top_field_first,
     )
     near = (
         state.last_frame_t_s is not None
@@ -201,21 +211,21 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        top_first_votes = min(
-            max(top_first_votes + vote, -_MAX_FIELD_ORDER_VOTES), _MAX_FIELD_ORDER_VOTES
+        top_field_first_votes = min(
+            max(top_field_first_votes + vote, -_MAX_FIELD_ORDER_VOTES), _MAX_FIELD_ORDER_VOTES
         )
-    if is_top_first is None and abs(top_first_votes) > _MIN_FIELD_ORDER_VOTES:
-        is_top_first = top_first_votes > 0.0
+    if is_top_field_first is None and abs(top_field_first_votes) > _MIN_FIELD_ORDER_VOTES:
+        is_top_field_first = top_field_first_votes > 0.0
     elif (
-        is_top_first is not None
-        and (top_first_votes if not is_top_first else -top_first_votes)
+        is_top_field_first is not None
+        and (top_field_first_votes if not is_top_field_first else -top_field_first_votes)
         > _MIN_FIELD_ORDER_REVERSAL_VOTES
     ):
-        is_top_first = not is_top_first
+        is_top_field_first = not is_top_field_first
     return replace(
         state,
         last_frame_t_s=frame.t_s,
-        top_first_votes=top_first_votes,
-        is_top_first=is_top_first,
+        top_field_first_votes=top_field_first_votes,
+        is_top_field_first=is_top_field_first,
         previous_image=frame.image,
     )

@@ -238,7 +238,7 @@ def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
             if name not in MARKERS or corners_px.shape != (4, 2) or not 1e-3 <= sigma_px <= 1e3:
                 raise ValueError(f"{name!r}, {corners_px.shape}, sigma {sigma_px}")
             if np.isfinite(corners_px).all():
-                found[name] = Detection(name, corners_px, sigma_px, is_fitted=True)
+                found[name] = Detection(name, corners_px, sigma_px, are_corners_fitted=True)
     except Exception as error:
         raise InvalidValue(
             f"detector.own failed: {error_at(error)}; it must return the corners of large and "

@@ -97,9 +97,11 @@ def estimate_pose(
         prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_SIGMA_RAD)
     else:
         prior = TiltPrior(previous_target_normal_cam, _PREVIOUS_TILT_SIGMA_RAD)
-    max_rms_px = setup.config.max_reprojection_px
-    solution = _refine_from_start(points, start, prior, max_rms_px) or solve_pose(points, prior)
-    if solution is None or not solution.rms_px <= max_rms_px:
+    max_rms_reprojection_px = setup.config.max_reprojection_px
+    solution = _refine_from_start(points, start, prior, max_rms_reprojection_px) or solve_pose(
+        points, prior
+    )
+    if solution is None or not solution.rms_reprojection_px <= max_rms_reprojection_px:
         return None
     pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
     if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
@@ -109,7 +111,7 @@ def estimate_pose(
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
     points = replace(points, allows_for_curl=True)
-    settled = _refine_from_start(points, solution, prior, max_rms_px)
+    settled = _refine_from_start(points, solution, prior, max_rms_reprojection_px)
     if settled is None:
         return pose
     bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
@@ -121,12 +123,19 @@ def estimate_pose(
 
 
 def _refine_from_start(
-    points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, max_rms_px: float
+    points: WeightedCorners,
+    start: PoseCandidate | None,
+    prior: TiltPrior,
+    max_rms_reprojection_px: float,
 ) -> ScoredPose | None:
-    """Return the solution refined from `start` if its RMS error is at most `max_rms_px`, else
-    None."""
+    """Return the solution refined from `start` if its RMS error is at most
+    `max_rms_reprojection_px`, else None."""
     solution = None if start is None else refine_pose(points, start)
-    if solution is None or not solution.rms_px <= max_rms_px or prior.contradicts(solution):
+    if (
+        solution is None
+        or not solution.rms_reprojection_px <= max_rms_reprojection_px
+        or prior.contradicts(solution)
+    ):
         return None
     return solution
 
@@ -141,13 +150,13 @@ def _make_marker_pose(
 ) -> MarkerPose:
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
-    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
+    R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
     cov, chi2, curl = pose_covariance(points, solution)
     e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
     R_level_target = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # derivative of (e, e_yaw) by (rvec, tvec)
     G[:3, 3:] = R_level_cam
-    G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR)
+    G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR_drvec)
     cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by some share is further away by the same share of the distance.
     print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
@@ -163,7 +172,7 @@ def _make_marker_pose(
         e_yaw_rad=yaw_of(R_level_target),
         sigma_m=sigma[:3],
         sigma_yaw_rad=float(sigma[3]),
-        rms_reprojection_px=solution.rms_px,
+        rms_reprojection_px=solution.rms_reprojection_px,
         chi2=chi2,
         xyz_yaw_cov=cov_e,
         shift_per_print_error_sigma_m=print_shift_m,
@@ -175,8 +184,8 @@ def target_covariance_cam(pose: MarkerPose) -> Array:
     """Return the covariance (6, 6) of the target's pose in the camera frame, as small rotations
     (rad) about and translations (m) along the camera's x, y, z, without the errors of the print."""
     assert pose.rvec_tvec_cov is not None
-    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
-    turns = dR.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
+    R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
+    turns = dR_drvec.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
     J = np.eye(6)
     J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
     return np.asarray(J @ pose.rvec_tvec_cov @ J.T)
@@ -198,11 +207,11 @@ def target_normal_cam(pose: MarkerPose) -> Array:
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
-def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR: Array) -> Array:
+def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
     """Return the derivative (3,) of the target's yaw in the level frame with respect to the
-    rotation vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR` (3, 9) is
-    ``dR/drvec``."""
-    dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
+    rotation vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR_drvec` (3, 9) is
+    ``dR_drvec/drvec``."""
+    dx = dR_drvec.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
@@ -235,10 +244,10 @@ class ScoredPose(PoseCandidate):
     and tvec."""
 
     reprojection_error_px: Array
-    jacobian: Array
+    reprojection_jacobian: Array
 
     @property
-    def rms_px(self) -> float:
+    def rms_reprojection_px(self) -> float:
         """Root mean square distance of projected from measured corners, px."""
         flat = self.reprojection_error_px.ravel()
         return math.sqrt(float(flat.dot(flat)) / len(self.reprojection_error_px))
@@ -265,12 +274,14 @@ class TiltPrior:
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the better of the two possible poses of a planar marker; None if neither is valid."""
     candidates = [_refine(points, c) for c in _solve_closed_form(points)]
-    scored = [_score(c, points) for c in candidates if _is_valid(c)]
+    scored = [_score_candidate(c, points) for c in candidates if _is_valid_candidate(c)]
     if not scored:
         return None
-    best = _choose_likeliest(scored, points, prior)
+    best = _choose_most_likely_pose(scored, points, prior)
     if prior.target_normal_cam is None or prior.contradicts(best):
-        best = _choose_likeliest([best, *_find_flipped_candidates(best, points)], points, prior)
+        best = _choose_most_likely_pose(
+            [best, *_find_flipped_candidates(best, points)], points, prior
+        )
     # The unweighted optimum is so close that the errors are linear.
     return refine_pose(points, best) or best
 
@@ -282,8 +293,8 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
     before = math.inf
     W = points.whitening
     for _ in range(_MAX_GAUSS_NEWTON_STEPS):
-        scored = _score(candidate, points)
-        A, error = W.dot(scored.jacobian), W.dot(scored.reprojection_error_px.ravel())
+        scored = _score_candidate(candidate, points)
+        A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
         B, weighed = A, error
         if points.allows_for_curl:
             weight = curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
@@ -299,20 +310,20 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         step = solved[:, 0]
         # reduction of the cost by the step, in squared standard deviations
         gain = float(step.dot(g))
-        moved_px = scored.jacobian.dot(step).reshape(-1, 2)
+        moved_px = scored.reprojection_jacobian.dot(step).reshape(-1, 2)
         small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
         if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
             # Errors are linear in a step of this size.
             reprojection_error_px = scored.reprojection_error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
-            return ScoredPose(rvec, tvec, reprojection_error_px, scored.jacobian)
+            return ScoredPose(rvec, tvec, reprojection_error_px, scored.reprojection_jacobian)
         if gain < 1e-4 + 1e-6 * cost:
             return scored
         candidate, before = (
             PoseCandidate(candidate.rvec - step[:3], candidate.tvec - step[3:]),
             cost,
         )
-        if not _is_valid(candidate):
+        if not _is_valid_candidate(candidate):
             return None
     return None
 
@@ -333,7 +344,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     common to all corners, and a twist of the sheet, but not its curl.
     """
     W = points.whitening
-    A, error = W.dot(scored.jacobian), W.dot(scored.reprojection_error_px.ravel())
+    A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
     curl = _whitened_paper_curl_shift(points, scored)
     weight = curl_weight_matrix(curl) if points.allows_for_curl else None
@@ -358,7 +369,7 @@ def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> A
     curl."""
     target_normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane appears where a target moved along its normal would show it.
-    moved = scored.jacobian[:, 3:].dot(target_normal_cam)[:, None] * points.curl_lift_m
+    moved = scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None] * points.curl_lift_m
     return np.asarray(points.whitening.dot(moved))
 
 
@@ -379,10 +390,10 @@ def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
         return []
     solutions = zip(rvecs, tvecs, strict=True)
     candidates = [PoseCandidate(np.ravel(r), np.ravel(t)) for r, t in solutions]
-    return [candidate for candidate in candidates if _is_valid(candidate)]
+    return [candidate for candidate in candidates if _is_valid_candidate(candidate)]
 
 
-def _is_valid(candidate: PoseCandidate) -> bool:
+def _is_valid_candidate(candidate: PoseCandidate) -> bool:
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(is_finite(rvec) and is_finite(tvec) and tvec[2] > 0.0)
 
@@ -398,11 +409,13 @@ def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
     return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
 
 
-def _score(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
+def _score_candidate(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
     rvec, tvec = candidate.rvec, candidate.tvec
-    projected, jacobian = cv2.projectPoints(points.object_points_m, rvec, tvec, points.K, None)
+    projected, reprojection_jacobian = cv2.projectPoints(
+        points.object_points_m, rvec, tvec, points.K, None
+    )
     error: Array = projected.reshape(-1, 2) - points.image_points_px
-    return ScoredPose(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
+    return ScoredPose(rvec, tvec, error, np.asarray(reprojection_jacobian[:, :6], dtype=np.float64))
 
 
 def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
@@ -418,10 +431,10 @@ def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> lis
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refine(points, PoseCandidate(rvec, scored.tvec))
-    return [_score(turned, points)] if _is_valid(turned) else []
+    return [_score_candidate(turned, points)] if _is_valid_candidate(turned) else []
 
 
-def _choose_likeliest(
+def _choose_most_likely_pose(
     scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior
 ) -> ScoredPose:
     if len(scored) == 1:
@@ -540,7 +553,7 @@ def weigh_corners(
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
             except np.linalg.LinAlgError:  # rounding, for far corners of a cut target
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
-        elif d.is_fitted:
+        elif d.are_corners_fitted:
             spread_px = (
                 d.sigma_px
                 if d.horizontal_side_extra_sigma_px == 0.0

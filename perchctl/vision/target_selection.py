@@ -57,7 +57,7 @@ def marker_to_own_target_m(
 ) -> float:
     """Return `horizontal_distance_to_own_target_m` for a marker's corners (4, 2) px; infinite
     beyond `own_target.max_distance_m`."""
-    seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, is_fitted=False)
+    seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
         _NO_POSE_DISTANCE_M

@@ -146,8 +146,8 @@ class Detection:
     Attributes:
         sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
             default if no line could be fitted.
-        is_fitted: True if the corners follow from a fit of lines or of the drawing, False if each
-            was located by itself.
+        are_corners_fitted: True if the corners follow from a fit of lines or of the drawing, False
+            if each was located by itself.
         remaining_edge_shift_sigma_px: standard deviation of the common outward shift of all edges
             that remains after its correction.
         rolling_shutter_error_shift_px: change (4, 2) of the corners by one standard deviation of
@@ -163,7 +163,7 @@ class Detection:
     marker: MarkerName
     corners_px: Array
     sigma_px: float
-    is_fitted: bool
+    are_corners_fitted: bool
     remaining_edge_shift_sigma_px: float = (
         0.0  # standard deviation of the common outward shift of all edges
     )
@@ -196,7 +196,7 @@ class Detections:
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    mirrored: bool = False  # a marker decoded as its mirror image
+    is_mirrored_marker_seen: bool = False  # a marker decoded as its mirror image
     target_count: int = 0  # complete targets, with both markers, found by a search
     flow_pxps: dict[MarkerName, Array] = field(
         default_factory=dict
@@ -434,20 +434,20 @@ class FieldState:
     """State of the detection of interlacing in a stream.
 
     Attributes:
-        kind: kind of the last frame that was examined for interlacing.
-        frames_since_examined: number of frames since then.
-        top_first_votes: sum of the votes on the order of the fields: positive if the top field
-            seems to be first, negative if the bottom field does.
-        is_top_first: order of the fields; None until the votes decide.
+        picture_kind: kind of the last frame that was examined for interlacing.
+        frames_since_combing_check: number of frames since then.
+        top_field_first_votes: sum of the votes on the order of the fields: positive if the top
+            field seems to be first, negative if the bottom field does.
+        is_top_field_first: order of the fields; None until the votes decide.
         frame_periods_s: the last periods between frames.
         last_frame_t_s: time of the last frame.
         previous_image: image of the previous frame, unless that frame was whole.
     """
 
-    kind: PictureKind | None = None
-    frames_since_examined: int = 0
-    top_first_votes: float = 0.0
-    is_top_first: bool | None = None
+    picture_kind: PictureKind | None = None
+    frames_since_combing_check: int = 0
+    top_field_first_votes: float = 0.0
+    is_top_field_first: bool | None = None
     frame_periods_s: tuple[float, ...] = ()
     last_frame_t_s: float | None = None
     previous_image: NDArray[np.uint8] | None = None

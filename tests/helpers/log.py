@@ -88,7 +88,7 @@ def output(index: int, truth: TargetEstimate, rng: np.random.Generator) -> Pipel
                 marker, truth.t_s, np.zeros(3), np.zeros(3), e_m, e_yaw_rad, np.full(3, sigma),
                 sigma, 0.4,
             )  # fmt: skip
-            found[marker] = Detection(marker, corners_px, 0.1, is_fitted=True)
+            found[marker] = Detection(marker, corners_px, 0.1, are_corners_fitted=True)
     detections = Detections(index, truth.t_s, **found)
     return PipelineOutput(detections=detections, poses=poses, target=truth, stage=truth.stage)
 

@@ -132,7 +132,7 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     """Found from times that jitter, of frames of which some are lost."""
     rng = np.random.default_rng(6)
     _, frames = woven_frames(3)
-    state = FieldState(is_top_first=True)
+    state = FieldState(is_top_field_first=True)
     index = 0
     for k in range(40):
         index += 1 + (rng.random() < 0.1)

@@ -59,7 +59,7 @@ def test_nothing_is_found_where_there_is_no_target(truth: dict[str, Any], build:
     for entry in entries(truth, "none", "decoy_only"):
         output = look(truth, build, entry)
         assert output.target is None, entry["file"]
-        assert not output.detections.mirrored, entry["file"]
+        assert not output.detections.is_mirrored_marker_seen, entry["file"]
 
 
 def test_decoys_do_not_displace_the_target(truth: dict[str, Any], build: Any) -> None:

@@ -51,7 +51,7 @@ class PoseReader:
             return []
         seen = []
         for picture, output in self._perception.process_fields(frame):
-            self.mirrored += output.detections.mirrored and not output.poses
+            self.mirrored += output.detections.is_mirrored_marker_seen and not output.poses
             named = ((name, output.detections.get(name)) for name in MARKERS)
             self.outlines = tuple((name, d.corners_px) for name, d in named if d is not None)
             pose = _best_pose(output, picture.t_s)

@@ -148,8 +148,9 @@ class RefinedCorners:
 
     Attributes:
         corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
-        is_fitted: True if the corners follow from a fit of lines or of the drawing; False if each
-            was located by itself (by OpenCV, or from the other marker), which is less accurate.
+        are_corners_fitted: True if the corners follow from a fit of lines or of the drawing; False
+            if each was located by itself (by OpenCV, or from the other marker), which is less
+            accurate.
         corrected_edge_shift: how far white has grown over black at all edges of the image
             (blooming, gamma), measured on this frame's markers or known before; the corners are
             corrected for it. None: unknown, and not corrected.
@@ -159,7 +160,7 @@ class RefinedCorners:
 
     corners_px: Array
     sigma_px: float
-    is_fitted: bool
+    are_corners_fitted: bool
     remaining_edge_shift_sigma_px: float = 0.0
     blur_px: float = 0.0
     corrected_edge_shift: EdgeShift | None = None
@@ -176,7 +177,7 @@ def refine_subpix(
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
     extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,
-    so that the target seems too far away. The result's `is_fitted` is therefore False.
+    so that the target seems too far away. The result's `are_corners_fitted` is therefore False.
     """
     side_px = float(side_lengths_px(raw_corners_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))

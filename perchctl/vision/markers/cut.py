@@ -154,7 +154,7 @@ def fit_truncated_markers(
     if like < _MIN_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
         return {}
     name = _select_measured_marker(pose_fit)
-    corners = _marker_corners(
+    corners = _project_marker_corners(
         pose_fit, small_to_large_side_ratio if name == "small" else 1.0, camera
     )
     return {} if corners is None else {name: corners}
@@ -176,7 +176,7 @@ def shows_enough_of_target(
         if _select_measured_marker(pose_fit) == "small"
         else 1.0
     )
-    return _marker_corners(pose_fit, side_to_large_side_ratio, camera) is not None
+    return _project_marker_corners(pose_fit, side_to_large_side_ratio, camera) is not None
 
 
 @lru_cache(maxsize=4)
@@ -257,12 +257,12 @@ def _is_reliable(pose_fit: PoseFit) -> bool:
     )
     return (
         pose_fit.found_point_count >= _MIN_FOUND_POINT_FRACTION * pose_fit.visible_point_count
-        and pose_fit.residual_px < _MAX_TRUNCATED_FIT_RESIDUAL_PX
+        and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RESIDUAL_PX
         and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
     )
 
 
-def _marker_corners(
+def _project_marker_corners(
     pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
     """Return the corners (4, 2) px of the marker whose side is `side_to_large_side_ratio` times the
@@ -551,7 +551,9 @@ def make_outline(
 @lru_cache(maxsize=8)
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
     """Render the target and its white paper to `PAPER_REACH_LARGE_HALF_SIDES` from the centre."""
-    axis = make_sampling_grid(_TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES).node_positions
+    axis = make_sampling_grid(
+        _TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES
+    ).node_positions_half_sides
     wide = render_cells(drawing, axis, PAPER_REACH_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
     more = (len(wide) - _TEXTURE_SIZE_PX) // 2
     scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_HALF_SIDES)
@@ -662,7 +664,7 @@ class PoseFit:
         visible_point_count: number of edge points in the image.
         found_point_count: number of these points at which an edge was found.
         small_marker_point_count: number of found points on the small marker.
-        residual_px: RMS distance of the found edges from the drawing's.
+        rms_residual_px: RMS distance of the found edges from the drawing's.
     """
 
     pose: RigidPose
@@ -670,7 +672,7 @@ class PoseFit:
     visible_point_count: int
     found_point_count: int
     small_marker_point_count: int
-    residual_px: float
+    rms_residual_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -899,5 +901,5 @@ def _make_pose_fit(
         small_marker_point_count=int(
             np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_index])
         ),
-        residual_px=math.sqrt(variance),
+        rms_residual_px=math.sqrt(variance),
     )

@@ -147,7 +147,7 @@ class CornerMethod:
 
 
 def _is_target_expected(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     return (
         prior.search_mode != "expected_fits"
@@ -157,10 +157,10 @@ def _is_target_expected(
 
 
 def _fit_edges(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     return replace(
-        found,
+        earlier_results,
         corners=refine_expected_markers(
             detector_input, prior.expected_corners_both_markers_px, prior.previous_edge_shift
         ),
@@ -168,59 +168,67 @@ def _fit_edges(
 
 
 def _has_edge_fit_found_nothing(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
-    return _is_target_expected(detector_input, prior, found) and not found.corners
+    return (
+        _is_target_expected(detector_input, prior, earlier_results) and not earlier_results.corners
+    )
 
 
 def _search_half_size(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    # If no side was found, a close target has usually moved further than a profile reaches.
+    # If no side was earlier_results, a close target has usually moved further than a profile
+    # reaches.
     searched = search_half_size(detector_input, prior.expected_corners_both_markers_px)
     if searched is None:
-        return found
+        return earlier_results
     corners = _refine_found_markers(detector_input, searched)
-    return CornerResults(corners, searched) if corners else found
+    return CornerResults(corners, searched) if corners else earlier_results
 
 
 def _has_half_size_search_found_nothing(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
-    return _is_target_expected(detector_input, prior, found) and not found.search_result.corners_px
+    return (
+        _is_target_expected(detector_input, prior, earlier_results)
+        and not earlier_results.search_result.corners_px
+    )
 
 
 def _fit_visible_part(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     corners = add_partly_visible_markers(
         detector_input,
         prior.expected_corners_both_markers_px,
-        found.corners,
+        earlier_results.corners,
         prior.previous_edge_shift,
     )
-    return replace(found, corners=corners)
+    return replace(earlier_results, corners=corners)
 
 
 def _needs_photometric_fit(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     patterns = detector_input.setup.patterns
-    return _has_half_size_search_found_nothing(detector_input, prior, found) and not any(
-        is_line_fit_sufficient(r, patterns[name]) for name, r in found.corners.items()
+    return _has_half_size_search_found_nothing(detector_input, prior, earlier_results) and not any(
+        is_line_fit_sufficient(r, patterns[name]) for name, r in earlier_results.corners.items()
     )
 
 
 def _fit_drawing(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    return replace(found, corners=refine_photometrically(detector_input, found.corners))
+    return replace(
+        earlier_results, corners=refine_photometrically(detector_input, earlier_results.corners)
+    )
 
 
 def _can_be_truncated(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
-    if found.corners or not prior.was_target_seen_recently:
+    if earlier_results.corners or not prior.was_target_seen_recently:
         return False
     return is_target_truncated(
         prior.expected_corners_both_markers_px,
@@ -230,28 +238,30 @@ def _can_be_truncated(
 
 
 def _fit_truncated_target(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    return replace(found, corners=fit_truncated_markers(detector_input, prior.expected_corners_px))
+    return replace(
+        earlier_results, corners=fit_truncated_markers(detector_input, prior.expected_corners_px)
+    )
 
 
 def _should_search(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     if prior.search_mode in ("whole_blurred", "expected_fits"):
         return False
-    if not found.corners and (
+    if not earlier_results.corners and (
         not prior.was_target_truncated
         or can_complete_marker_be_in_view(
             prior.expected_corners_both_markers_px, detector_input.image.shape
         )
     ):
         return True
-    return _is_marker_missing(detector_input, found.corners, prior.expected_corners_px)
+    return _is_marker_missing(detector_input, earlier_results.corners, prior.expected_corners_px)
 
 
 def _search(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     searched = search(
         detector_input,
@@ -259,20 +269,20 @@ def _search(
         prior.search_mode,
         prior.measure_own_target_distance_m,
     )
-    if len(searched.corners_px) < len(found.corners):
-        return replace(found, search_result=searched)
+    if len(searched.corners_px) < len(earlier_results.corners):
+        return replace(earlier_results, search_result=searched)
     return CornerResults(_refine_found_markers(detector_input, searched), searched)
 
 
 def _can_be_blurred(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     allowed = prior.search_mode not in ("whole_sharp", "expected_window")
-    return not found.corners and allowed and detector_input.setup.is_line_fit_enabled
+    return not earlier_results.corners and allowed and detector_input.setup.is_line_fit_enabled
 
 
 def _search_blurred(
-    detector_input: DetectorInput, prior: DetectionPrior, found: CornerResults
+    detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     bare = replace(detector_input, hidden_mask=None)
     if prior.expected_corners_px:
@@ -281,7 +291,7 @@ def _search_blurred(
         )
     else:
         found_corners = find_blurred(bare)
-    return replace(found, corners=refine_photometrically(bare, found_corners))
+    return replace(earlier_results, corners=refine_photometrically(bare, found_corners))
 
 
 CORNER_METHODS: tuple[CornerMethod, ...] = (
@@ -455,7 +465,7 @@ def _detect(
         t_s=frame.t_s,
         large=_make_detection("large", found_corners, frame.picture_kind),
         small=_make_detection("small", found_corners, frame.picture_kind),
-        mirrored=found.search_result.is_mirrored_marker_seen and not found_corners,
+        is_mirrored_marker_seen=found.search_result.is_mirrored_marker_seen and not found_corners,
         target_count=found.search_result.target_count,
         edge_shift=next((each for each in shifts if each is not None), None),
     )
@@ -514,10 +524,15 @@ def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) ->
         return found_corners
     fitted, small = dict(found_corners), found_corners.get("small")
     for name, r in found_corners.items():
-        if r.is_fitted and is_fully_visible(detector_input, r):
+        if r.are_corners_fitted and is_fully_visible(detector_input, r):
             continue
         starts = [r.corners_px]
-        if name == "large" and not r.is_fitted and small is not None and small.is_fitted:
+        if (
+            name == "large"
+            and not r.are_corners_fitted
+            and small is not None
+            and small.are_corners_fitted
+        ):
             starts.insert(
                 0, detector_input.derive_corners_from_other_marker_px(small.corners_px, "large")
             )
@@ -549,7 +564,7 @@ def _make_detection(
         name,
         r.corners_px,
         r.sigma_px,
-        r.is_fitted,
+        r.are_corners_fitted,
         r.remaining_edge_shift_sigma_px,
         cov_px2=r.cov_px2,
         row_jitter_sigma_px=r.row_jitter_sigma_px,
@@ -616,8 +631,8 @@ _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large
 def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
     """True if the corners come from an edge fit that is as accurate as a photometric fit: with
     cells of at least 6 px and 6 times the blur."""
-    cell_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
-    return corners.is_fitted and cell_px >= max(
+    cell_size_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
+    return corners.are_corners_fitted and cell_size_px >= max(
         _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO * corners.blur_px
     )
 
@@ -674,7 +689,7 @@ def refine_photometrically(
 def _blur_px(corners: RefinedCorners | None) -> float:
     """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
     fitted to them, otherwise `_DEFAULT_BLUR_PX`, which is also the largest guess."""
-    if corners is None or not corners.is_fitted or corners.blur_px <= 0.0:
+    if corners is None or not corners.are_corners_fitted or corners.blur_px <= 0.0:
         return _DEFAULT_BLUR_PX
     return min(
         math.sqrt(max(corners.blur_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX
@@ -691,8 +706,8 @@ def _initial_corners_px(
         # Small cells matter only if no larger ones were measured.
         enough = is_line_fit_sufficient(this, detector_input.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
-        return None if this.is_fitted and enough else this.corners_px
-    if name == "small" and other is not None and other.is_fitted:
+        return None if this.are_corners_fitted and enough else this.corners_px
+    if name == "small" and other is not None and other.are_corners_fitted:
         return detector_input.derive_corners_from_other_marker_px(other.corners_px, "small")
     return None
 
@@ -848,8 +863,16 @@ def average_fields(first: Detections, second: Detections) -> Detections:
             averaged[name] = _average_detections(one, other)
     if not averaged:
         alone = first if first.markers else second
-        return replace(alone, mirrored=alone.mirrored or second.mirrored)
-    return replace(first, large=averaged.get("large"), small=averaged.get("small"), mirrored=False)
+        return replace(
+            alone,
+            is_mirrored_marker_seen=alone.is_mirrored_marker_seen or second.is_mirrored_marker_seen,
+        )
+    return replace(
+        first,
+        large=averaged.get("large"),
+        small=averaged.get("small"),
+        is_mirrored_marker_seen=False,
+    )
 
 
 def _average_detections(a: Detection, b: Detection) -> Detection:
@@ -865,7 +888,7 @@ def _average_detections(a: Detection, b: Detection) -> Detection:
         a.marker,
         (a.corners_px + b.corners_px) / 2.0,
         half(a.sigma_px, b.sigma_px),
-        a.is_fitted and b.is_fitted,
+        a.are_corners_fitted and b.are_corners_fitted,
         max(a.remaining_edge_shift_sigma_px, b.remaining_edge_shift_sigma_px),
         cov_px2=cov_px2,
         row_jitter_sigma_px=half(a.row_jitter_sigma_px, b.row_jitter_sigma_px),

@@ -245,14 +245,14 @@ def _refine_lines_once(
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light.
         return _refine_lines_once(image, raw_corners_px, border_cells, camera, None)
-    line_coefficients, residual_px = _fit_lines(markers, outer_edges)
+    line_coefficients, rms_residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
     if shift is None:
         corners = _intersect_adjacent_sides(line_coefficients)
         if not is_finite(corners):
             return found
         shift = _measure_edge_shift(
-            markers, outer_edges, inner_edges, line_coefficients, residual_px, corners
+            markers, outer_edges, inner_edges, line_coefficients, rms_residual_px, corners
         )
     applied = shift or EdgeShift(
         0.0, edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean()))
@@ -266,35 +266,35 @@ def _refine_lines_once(
     if not is_finite(corners):
         return found
     corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
-    accepted = _are_sides_accepted(markers, outer_edges, residual_px, corners_px)
+    accepted = _are_sides_accepted(markers, outer_edges, rms_residual_px, corners_px)
     # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
     independent = np.maximum(
         np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
     )
     line_end_variances_px2 = (
-        4.0 * _ROBUST_LINE_VARIANCE_FACTOR * residual_px * residual_px / independent
+        4.0 * _ROBUST_LINE_VARIANCE_FACTOR * rms_residual_px * rms_residual_px / independent
     ).tolist()
-    blurs_px, normals_x = outer_edges.blur_px.tolist(), line_coefficients[:, 0].tolist()
+    blurs_px, side_normals_x = outer_edges.blur_px.tolist(), line_coefficients[:, 0].tolist()
     for i, rim in enumerate(border_cells):
         if not accepted[i]:
             continue
         four = slice(4 * i, 4 * i + 4)
         ends, blurs = line_end_variances_px2[four], blurs_px[four]
-        cell_px, blur_px = float(markers.cell_px[i]), sum(blurs) / 4.0
+        cell_size_px, blur_px = float(markers.cell_size_px[i]), sum(blurs) / 4.0
         found[i] = RefinedCorners(
             corners_px=corners_px[i],
             sigma_px=_corner_sigma_px(
-                cell_px,
+                cell_size_px,
                 blur_px,
                 sum(ends) / 4.0,
                 bool(is_white_clipped[i]),
                 rim.print_tolerance_cells,
             ),
-            is_fitted=True,
+            are_corners_fitted=True,
             remaining_edge_shift_sigma_px=applied.sigma_px,
             blur_px=max(blurs),
             corrected_edge_shift=shift,
-            row_jitter_sigma_px=_row_jitter_sigma_px(normals_x[four], ends),
+            row_jitter_sigma_px=_row_jitter_sigma_px(side_normals_x[four], ends),
             sharpest_side_blur_px=min(blurs),
         )
     return found
@@ -355,7 +355,7 @@ def _measure_edge_shift(
     outer_edges: EdgeData,
     inner_edges: EdgeData | None,
     line_coefficients: Array,
-    residual_px: Array,
+    rms_residual_px: Array,
     corners_normalised: Array,
 ) -> EdgeShift | None:
     """Measure how far white has grown over black, px, from the width of a border whose outer edge
@@ -371,10 +371,10 @@ def _measure_edge_shift(
         markers.widest_marker_index,
         edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean())),
     )
-    rim, depth_px, cell_px = (
+    rim, depth_px, cell_size_px = (
         markers.border_cells[k],
         markers.cell_width_across_side_px[k],
-        float(markers.cell_px[k]),
+        float(markers.cell_size_px[k]),
     )
     r = 1.0 - 2.0 / rim.cells_per_side
     own = apply_homography(
@@ -393,7 +393,7 @@ def _measure_edge_shift(
         8.0
         * r
         / (3.0 * rim.cells_per_side)
-        * _side_bow_px(markers, outer_edges, line_coefficients, residual_px)
+        * _side_bow_px(markers, outer_edges, line_coefficients, rms_residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -407,7 +407,9 @@ def _measure_edge_shift(
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
-    variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.print_tolerance_cells * cell_px) ** 2
+    variance += (2.0 * math.exp(-cell_size_px / 2.2)) ** 2 + (
+        rim.print_tolerance_cells * cell_size_px
+    ) ** 2
     prior = prior_px**2
     return EdgeShift(
         white_growth_px=shift * prior / (prior + variance),
@@ -416,7 +418,7 @@ def _measure_edge_shift(
 
 
 def _side_bow_px(
-    markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, residual_px: Array
+    markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, rms_residual_px: Array
 ) -> float:
     """Return the bow of the widest marker's sides, px: how far their ends are further out than
     their middles. 0 if noise may explain it."""
@@ -429,7 +431,7 @@ def _side_bow_px(
     mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
     bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
     mean_px = float(bow_px @ _WEIGHTS_OF_MEAN_OF_FOUR)
-    noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
+    noise_px = 0.25 * math.sqrt(float((rms_residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
 
@@ -443,25 +445,27 @@ def _outward_signs(markers: MarkerSides, line_coefficients: Array) -> Array:
 
 
 def _are_sides_accepted(
-    markers: MarkerSides, outer_edges: EdgeData, residual_px: Array, corners_px: Array
+    markers: MarkerSides, outer_edges: EdgeData, rms_residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
         _PROFILE_ONES_F32
     )
-    lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
+    lines = (rms_residual_px < _MAX_RESIDUAL_PX) & (
+        inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE
+    )
     lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
         outer_edges.blur_px < 0.9 * outer_edges.window_half_length_px
     )
     displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
-    good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
-    return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
+    good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_size_px > _MIN_CELL_PX)
+    return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_size_px)))
 
 
 def _corner_sigma_px(
-    cell_px: float,
+    cell_size_px: float,
     blur_px: float,
     line_end_variance_px2: float,
     is_white_clipped: bool,
@@ -470,26 +474,27 @@ def _corner_sigma_px(
     blur_px = max(blur_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = (
-        _NEIGHBOUR_BEND * blur_px * math.exp(-cell_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
+        _NEIGHBOUR_BEND
+        * blur_px
+        * math.exp(-cell_size_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
     )
     reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_px**3
     clipped_px = CLIPPED_CORNER_SIGMA_PX if is_white_clipped else 0.0
     # Printed edges deviate from their nominal positions.
-    print_px = print_tolerance_cells * cell_px
+    print_px = print_tolerance_cells * cell_size_px
     noise_px = max(math.sqrt(line_end_variance_px2), MIN_LINE_SIGMA_PX)
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
 def _row_jitter_sigma_px(
-    normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
+    side_normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
 ) -> float:
     """Return the standard deviation, px, of corners due to the jitter of rows in analogue video; 0
     if it is not significant. Jitter moves upright sides only.
 
-    `normals_x` are the x components of the four sides' unit normals, and `line_end_variances_px2`
-    the variances of the ends of the lines fitted to them.
-    """
-    upright = [x * x for x in normals_x]
+    `side_normals_x` are the x components of the four sides' unit normals, and
+    `line_end_variances_px2` the variances of the ends of the lines fitted to them."""
+    upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
     if aspect <= _MIN_SIDE_SLANT_VARIANCE:
@@ -522,7 +527,7 @@ class MarkerSides:
         corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
         side_lengths_px: lengths (m, 4).
         cell_width_across_side_px: width (m, 4) of the border across each side.
-        cell_px: mean width of a cell, (m,).
+        cell_size_px: mean width of a cell, (m,).
         widest_marker_index: index of the marker with the widest cells.
         winding: direction of the corners, +1 or -1, (m,).
         px_per_normalised: pixels per unit of normalised coordinates along each side, (4m,).
@@ -533,7 +538,7 @@ class MarkerSides:
     corners_normalised: Array
     side_lengths_px: Array
     cell_width_across_side_px: Array
-    cell_px: Array
+    cell_size_px: Array
     widest_marker_index: int
     winding: Array
     px_per_normalised: Array
@@ -574,7 +579,7 @@ def prepare_marker_sides(
         return None
     along = corners.take(NEXT_CORNER, axis=1) - corners
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
-    cell_px = sides_px @ _WEIGHTS_OF_MEAN_OF_FOUR / cells
+    cell_size_px = sides_px @ _WEIGHTS_OF_MEAN_OF_FOUR / cells
     return MarkerSides(
         raw_corners_px=raw_corners_px,
         border_cells=border_cells,
@@ -582,8 +587,8 @@ def prepare_marker_sides(
         side_lengths_px=sides_px,
         # The inner row is one cell further in, along the neighbouring sides.
         cell_width_across_side_px=0.5 * across_px / cells[:, None],
-        cell_px=cell_px,
-        widest_marker_index=int(cell_px.argmax()),
+        cell_size_px=cell_size_px,
+        widest_marker_index=int(cell_size_px.argmax()),
         winding=turn,
         px_per_normalised=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
@@ -603,7 +608,9 @@ def measure_edges(
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest_marker_index
     rim = markers.border_cells[widest]
-    with_inner_edges = with_inner_edges and float(markers.cell_px[widest]) > _MIN_EDGE_SHIFT_CELL_PX
+    with_inner_edges = (
+        with_inner_edges and float(markers.cell_size_px[widest]) > _MIN_EDGE_SHIFT_CELL_PX
+    )
     if with_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
         inner = apply_homography(
@@ -622,7 +629,7 @@ def measure_edges(
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
     window_half_length_px, profile_half_length_px = (
-        each[of] for each in window_and_profile_half_lengths_px(markers.cell_px)
+        each[of] for each in window_and_profile_half_lengths_px(markers.cell_size_px)
     )
     profile_greys = sample_profiles(image, origin, normal, profile_half_length_px)
     around = find_neighbour_edges(s, markers.border_cells, rim, depth_px.ravel())
@@ -648,11 +655,11 @@ def measure_edges(
     return outer_edges, inner_edges if with_inner_edges else None
 
 
-def window_and_profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
+def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Array]:
     """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
     size."""
-    window_half_length_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
-    return window_half_length_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
+    window_half_length_px = np.minimum(np.maximum(0.85 * cell_size_px, 1.5), 7.0)
+    return window_half_length_px, np.minimum(np.maximum(1.5 * cell_size_px, 1.75), 7.0)
 
 
 def find_neighbour_edges(

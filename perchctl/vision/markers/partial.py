@@ -224,13 +224,13 @@ def _make_refined_corners(
         apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera
     )
     side_px = mean_side_px(pinhole)
-    cell_px = side_px / pattern.border_cells.cells_per_side
+    cell_size_px = side_px / pattern.border_cells.cells_per_side
     # The square alone; `remaining_edge_shift_sigma_px` covers the uncertainty of the shift of all
     # edges.
     J = projected_corners_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
-    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_px) ** 2
-    cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
+    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_size_px) ** 2
+    cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_size_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
     if not (vaguest_px < _MAX_CORNER_SIGMA_SIDES * side_px and np.isfinite(corners_px).all()):
         return None
@@ -238,7 +238,7 @@ def _make_refined_corners(
     return RefinedCorners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
-        is_fitted=True,
+        are_corners_fitted=True,
         remaining_edge_shift_sigma_px=min(
             max(shift_sigma_px, _MIN_EDGE_SHIFT_SIGMA_PX),
             edge_shift_prior_sigma_px(visible_edges.white_grey),
@@ -313,8 +313,10 @@ def _project_sample_points_px(
     outside the lens model. A marker that fills the image is not a quadrilateral in it."""
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
-        return np.full((len(pattern.sample_points), 2), np.nan)
-    undistorted = apply_homography(homography_from_centred_square(rays), pattern.sample_points)
+        return np.full((len(pattern.sample_points_half_sides), 2), np.nan)
+    undistorted = apply_homography(
+        homography_from_centred_square(rays), pattern.sample_points_half_sides
+    )
     at = distort_to_px(undistorted, camera)
     near = (
         np.abs(undistort_to_normalised(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
@@ -412,8 +414,8 @@ def find_visible_edges(
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
-    cell_px = float(sides_px.mean()) / cells
-    rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _MIN_INNER_EDGE_CELL_PX else (1.0,)
+    cell_size_px = float(sides_px.mean()) / cells
+    rings = (1.0, 1.0 - 2.0 / cells) if cell_size_px > _MIN_INNER_EDGE_CELL_PX else (1.0,)
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H
@@ -428,7 +430,7 @@ def find_visible_edges(
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
     window_half_length_px, profile_half_length_px = window_and_profile_half_lengths_px(
-        np.full(len(at), cell_px)
+        np.full(len(at), cell_size_px)
     )
     depth_px = 2.0 * scale_px / cells
     around = find_neighbour_edges(s, [pattern.border_cells], pattern.border_cells, depth_px)

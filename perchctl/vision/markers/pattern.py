@@ -58,8 +58,8 @@ class MarkerPattern:
     Attributes:
         border_cells: cells inside the border.
         drawing: all cells.
-        sample_points: points (n, 2) at which cells are read, in the marker's coordinates (see
-            `perchctl.vision.markers.corners`).
+        sample_points_half_sides: points (n, 2) at which cells are read, in the marker's coordinates
+            (see `perchctl.vision.markers.corners`).
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
         rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
@@ -71,7 +71,7 @@ class MarkerPattern:
 
     border_cells: BorderCells
     drawing: MarkerDrawing
-    sample_points: Array
+    sample_points_half_sides: Array
     sample_cell_index: NDArray[np.intp]
     samples_per_cell: Array
     rotated_sample_templates: Array
@@ -104,14 +104,14 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    sample_points = (centres[:, None] + _SAMPLE_OFFSETS * 2.0 / n).reshape(-1, 2)
+    sample_points_half_sides = (centres[:, None] + _SAMPLE_OFFSETS * 2.0 / n).reshape(-1, 2)
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS))
     free = (
-        np.abs(sample_points).max(axis=1)
+        np.abs(sample_points_half_sides).max(axis=1)
         > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side_ratio
     )
     kept = np.unique(owner[free])
-    turns, at = [], sample_points[free]
+    turns, at = [], sample_points_half_sides[free]
     for _ in range(4):
         soft = _sample_blurred_drawing(drawing, at)
         soft -= soft.mean()
@@ -121,7 +121,7 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
     return MarkerPattern(
         border_cells=border_cells,
         drawing=drawing,
-        sample_points=np.ascontiguousarray(sample_points[free]),
+        sample_points_half_sides=np.ascontiguousarray(sample_points_half_sides[free]),
         sample_cell_index=own,
         samples_per_cell=np.bincount(own).astype(np.float64),
         rotated_sample_templates=np.stack(turns),
@@ -197,7 +197,9 @@ def _read_sample_greys(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array | None:
     """Return the grey values (k,) at the sample points; None outside the image."""
-    at = apply_homography(homography_from_centred_square(corners_px), pattern.sample_points)
+    at = apply_homography(
+        homography_from_centred_square(corners_px), pattern.sample_points_half_sides
+    )
     # The sample points are inside the corners.
     if not (is_inside_image(corners_px, image.shape) or is_inside_image(at, image.shape)):
         return None
@@ -205,14 +207,14 @@ def _read_sample_greys(
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
 
 
-def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points: Array) -> Array:
+def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Array) -> Array:
     """Return the whiteness of the drawing at the sample points, with a blur of half a cell."""
     n, fine = len(drawing.cell_whiteness), 8
     sharp_nodes = np.kron(
         np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
     )
     white = np.asarray(cv2.GaussianBlur(sharp_nodes, (0, 0), 0.5 * fine), dtype=np.float64)
-    at = (((sample_points + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
+    at = (((sample_points_half_sides + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
     return np.asarray(white[at[:, 1], at[:, 0]])
 
 
@@ -263,25 +265,32 @@ def make_marker_drawing(
 
 
 def _cell_coverage(
-    node_positions: Array, half_node_spacing: float, n_cells: int, square_half_side: float
+    node_positions_half_sides: Array,
+    half_node_spacing: float,
+    n_cells: int,
+    square_half_side: float,
 ) -> Array:
     """Return the fraction of each node's interval (half the spacing to each side) that each cell
     covers, (nodes, cells), along one axis. Nodes and cells are in half sides from the marker's
     centre; the cells fill a square from -square_half_side to square_half_side."""
     edges = square_half_side * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = (
-        node_positions[:, None] - half_node_spacing,
-        node_positions[:, None] + half_node_spacing,
+        node_positions_half_sides[:, None] - half_node_spacing,
+        node_positions_half_sides[:, None] + half_node_spacing,
     )
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
     return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node_spacing))
 
 
-def _add_margin_nodes(node_positions: Array, half_node_spacing: float) -> Array:
+def _add_margin_nodes(node_positions_half_sides: Array, half_node_spacing: float) -> Array:
     """Return the axis with `BLUR_MARGIN_NODES` additional nodes at both ends."""
     more = 2.0 * half_node_spacing * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
-        [node_positions[0] - more[::-1], node_positions, node_positions[-1] + more]
+        [
+            node_positions_half_sides[0] - more[::-1],
+            node_positions_half_sides,
+            node_positions_half_sides[-1] + more,
+        ]
     )
 
 
@@ -295,14 +304,14 @@ def render_whiteness_and_off_paper_fraction(
     compared square, a second array contains the fraction of each node beyond the paper.
     """
     half_node_spacing = drawing.photometric_fit_reach_half_sides / nodes_per_side
-    node_positions: Array = half_node_spacing * (
+    node_positions_half_sides: Array = half_node_spacing * (
         2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
     )
-    paper = render_cells(drawing, node_positions, half_node_spacing)
+    paper = render_cells(drawing, node_positions_half_sides, half_node_spacing)
     if drawing.paper_reach_half_sides is None:
         return (paper,)
     on = _cell_coverage(
-        _add_margin_nodes(node_positions, half_node_spacing),
+        _add_margin_nodes(node_positions_half_sides, half_node_spacing),
         half_node_spacing,
         1,
         drawing.paper_reach_half_sides,
@@ -320,11 +329,12 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 
 
 def render_cells(
-    drawing: MarkerDrawing, node_positions: Array, half_node_spacing: float
+    drawing: MarkerDrawing, node_positions_half_sides: Array, half_node_spacing: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness of the square grid of nodes with the coordinates `node_positions` in
-    both directions, and of `BLUR_MARGIN_NODES` additional nodes on all sides."""
-    wide = _add_margin_nodes(node_positions, half_node_spacing)
+    """Return the whiteness of the square grid of nodes with the coordinates
+    `node_positions_half_sides` in both directions, and of `BLUR_MARGIN_NODES` additional nodes on
+    all sides."""
+    wide = _add_margin_nodes(node_positions_half_sides, half_node_spacing)
     C = _cell_coverage(wide, half_node_spacing, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
     if drawing.small_cell_whiteness is not None:
@@ -339,12 +349,15 @@ def render_cells(
 
 
 def blurred_cell_coverage(
-    drawing: MarkerDrawing, node_positions: Array, half_node_spacing: float, blur_sigma_nodes: float
+    drawing: MarkerDrawing,
+    node_positions_half_sides: Array,
+    half_node_spacing: float,
+    blur_sigma_nodes: float,
 ) -> Array:
     """Return the fraction of each node's width that each row of cells covers, (n, cells), after a
     Gaussian blur of `blur_sigma_nodes`."""
     wide = _cell_coverage(
-        _add_margin_nodes(node_positions, half_node_spacing),
+        _add_margin_nodes(node_positions_half_sides, half_node_spacing),
         half_node_spacing,
         len(drawing.cell_whiteness),
         1.0,
@@ -357,7 +370,8 @@ def blurred_cell_coverage(
         borderType=cv2.BORDER_REPLICATE,
     )
     return np.asarray(
-        soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(node_positions)], dtype=np.float64
+        soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(node_positions_half_sides)],
+        dtype=np.float64,
     )
 
 

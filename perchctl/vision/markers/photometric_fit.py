@@ -163,7 +163,7 @@ def align_drawing(
     n = int(
         np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
     )
-    node_px, cell_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
+    node_px, cell_size_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
     grid, H = make_sampling_grid(n, reach), homography_from_centred_square(start)
     node_lens_shift_px = lens_shift_px(grid, H, camera)
     patch = _extract_patch(image, grid, H, node_lens_shift_px)
@@ -175,18 +175,21 @@ def align_drawing(
         return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_TABLE_STEP))
 
     def limit_blur_px(blur_px: float) -> float:
-        return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
+        return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_size_px)
 
     rendered_drawing = drawn(limit_blur_px(blur_px))
-    lens_shift_in_patch_px, since_lens_px, increment_from_start = (
+    lens_shift_from_patch_corner_px, since_lens_px, increment_from_start = (
         node_lens_shift_px - first,
         0.0,
         np.zeros(8),
     )
     for k in range(_MAX_ITERATIONS):
         if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
-            lens_shift_in_patch_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
-        grey = _sample_patch(around, grid, H, lens_shift_in_patch_px)
+            lens_shift_from_patch_corner_px, since_lens_px = (
+                lens_shift_px(grid, H, camera) - first,
+                0.0,
+            )
+        grey = _sample_patch(around, grid, H, lens_shift_from_patch_corner_px)
         equations = _linearize_greys(grey, rendered_drawing, increment_from_start)
         if equations is None:
             return None
@@ -207,7 +210,7 @@ def align_drawing(
         squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
         wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = rendered_drawing.blur_sigma_nodes * node_px
-        if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
+        if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_size_px):
             rendered_drawing = drawn(wanted_px)
         elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_LENS_REUSE_MOTION_PX:
             break
@@ -396,11 +399,12 @@ _CHEBYSHEV_NODES = 9  # per side
 
 @dataclass(frozen=True, eq=False)
 class SamplingGrid:
-    """Sampling grid on the marker: n by n nodes at `node_positions` (n,) in both directions, in
-    half sides from the marker's centre; `uv1` (3, n * n) is (u, v, 1) of each node."""
+    """Sampling grid on the marker: n by n nodes at `node_positions_half_sides` (n,) in both
+    directions, in half sides from the marker's centre; `uv1` (3, n * n) is (u, v, 1) of each
+    node."""
 
     nodes_per_side: int
-    node_positions: Array
+    node_positions_half_sides: Array
     uv1: Array
 
 
@@ -408,13 +412,17 @@ class SamplingGrid:
 def make_sampling_grid(nodes_per_side: int, half_side: float) -> SamplingGrid:
     """Return the nodes in the middle of n by n equal parts of a square from -half_side to
     half_side."""
-    node_positions = half_side * ((2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0)
-    return SamplingGrid(nodes_per_side, node_positions, _grid_coordinates(node_positions))
+    node_positions_half_sides = half_side * (
+        (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
+    )
+    return SamplingGrid(
+        nodes_per_side, node_positions_half_sides, _grid_coordinates(node_positions_half_sides)
+    )
 
 
-def _grid_coordinates(node_positions: Array) -> Array:
+def _grid_coordinates(node_positions_half_sides: Array) -> Array:
     """Return u, v and 1 at the crossings of the grid's lines, (3, n * n)."""
-    u, v = np.meshgrid(node_positions, node_positions)
+    u, v = np.meshgrid(node_positions_half_sides, node_positions_half_sides)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
@@ -445,12 +453,12 @@ def lens_shift_px(grid: SamplingGrid, H: Array, camera: CameraModel) -> Array:
 def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
     """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES^2), and the weights (n,
     _CHEBYSHEV_NODES) for the grid's own nodes."""
-    reach = float(grid.node_positions[-1])
+    reach = float(grid.node_positions_half_sides[-1])
     x = chebyshev.chebpts2(_CHEBYSHEV_NODES)
     degree = _CHEBYSHEV_NODES - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
     return _grid_coordinates(reach * x), chebyshev.chebvander(
-        grid.node_positions / reach, degree
+        grid.node_positions_half_sides / reach, degree
     ) @ through
 
 
@@ -472,12 +480,12 @@ def _extract_patch(
 
 
 def _sample_patch(
-    patch: NDArray[np.float32], grid: SamplingGrid, H: Array, lens_shift_in_patch_px: Array
+    patch: NDArray[np.float32], grid: SamplingGrid, H: Array, lens_shift_from_patch_corner_px: Array
 ) -> Array:
     """Return the grey values (n * n,) of the patch at the nodes projected by H and moved by
-    `lens_shift_in_patch_px` (2, n * n): the lens's shift of each node minus the patch's top left
-    pixel."""
-    at = (project_nodes(H, grid.uv1) + lens_shift_in_patch_px).astype(np.float32)
+    `lens_shift_from_patch_corner_px` (2, n * n): the lens's shift of each node minus the patch's
+    top left pixel."""
+    at = (project_nodes(H, grid.uv1) + lens_shift_from_patch_corner_px).astype(np.float32)
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
@@ -526,7 +534,7 @@ class RenderedDrawing:
             self.drawing, self.grid.nodes_per_side
         )
         return tuple(
-            _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions)
+            _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions_half_sides)
             for each in sharp_nodes
         )
 
@@ -562,7 +570,7 @@ class RenderedDrawing:
         """Fraction of each node's width that each row (or column) of cells covers, (n, cells)."""
         half_node = self.drawing.photometric_fit_reach_half_sides / self.grid.nodes_per_side
         return blurred_cell_coverage(
-            self.drawing, self.grid.node_positions, half_node, self.blur_sigma_nodes
+            self.drawing, self.grid.node_positions_half_sides, half_node, self.blur_sigma_nodes
         )
 
 
@@ -581,18 +589,21 @@ def render_blurred(
 
 
 def _blur_with_jacobian(
-    sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float, node_positions: Array
+    sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float, node_positions_half_sides: Array
 ) -> tuple[Array, Array]:
     soft = blur_nodes(sharp_nodes, blur_sigma_nodes)
-    step = float(node_positions[1] - node_positions[0])
-    e, n = BLUR_MARGIN_NODES, len(node_positions)
+    step = float(node_positions_half_sides[1] - node_positions_half_sides[0])
+    e, n = BLUR_MARGIN_NODES, len(node_positions_half_sides)
     middle = slice(e, e + n)
     left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
     up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]
     value = soft[middle, middle]
     du, dv = np.float32(0.5 / step) * (right - left), np.float32(0.5 / step) * (down - up)
     laplace = left + right + up + down - 4.0 * value
-    u, v = node_positions.astype(np.float32), node_positions.astype(np.float32)[:, None]
+    u, v = (
+        node_positions_half_sides.astype(np.float32),
+        node_positions_half_sides.astype(np.float32)[:, None],
+    )
     along = u * du + v * dv
     changes = np.empty((9, n, n))
     for part, one, other in (

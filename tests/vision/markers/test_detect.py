@@ -43,7 +43,7 @@ def test_a_mirrored_picture_is_recognised_and_not_measured(
     picture = render(*pose_of(0.0, 0.0, 0.3, 0.4), markers=markers)
     image = np.ascontiguousarray(np.flip(picture, axis=axis))
     found = detect_markers(frame(image), None, SETUP, CAMERA)
-    assert found.mirrored
+    assert found.is_mirrored_marker_seen
     assert found.large is None
     assert found.small is None
 
@@ -84,7 +84,7 @@ def test_one_wrong_cell_of_the_small_marker_is_corrected_and_no_more() -> None:
 def test_expected_markers_are_verified_and_refined(shift_px: float) -> None:
     seen = followed(render(*POSE, noise=3.0), both(shift_px=shift_px))
     assert set(seen) == {"large", "small"}
-    assert seen["large"].is_fitted
+    assert seen["large"].are_corners_fitted
     assert np.abs(seen["large"].corners_px - corners("large")).max() < 0.1
     assert np.abs(seen["small"].corners_px - corners("small")).max() < 0.4
 
@@ -148,7 +148,7 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
 def test_nothing_is_between_two_targets() -> None:
     """A frame's two fields, of which each shows another one."""
     fields = [
-        Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, is_fitted=True))
+        Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, are_corners_fitted=True))
         for x in (100.0, 400.0)
     ]
     mean = average_fields(*fields)
@@ -171,7 +171,7 @@ def test_each_method_finds_the_corners_in_its_view(view: View) -> None:
     found = {method.name: after for method, after in findings(view)}
     measured = found[view.method].corners[view.marker]
     in_view = ((view.true_px >= 0.0) & (view.true_px <= (639.0, 479.0))).all(axis=1)
-    assert measured.is_fitted
+    assert measured.are_corners_fitted
     assert np.abs(measured.corners_px - view.true_px)[in_view].max() < view.within_px
 
 

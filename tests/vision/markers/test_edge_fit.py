@@ -53,7 +53,7 @@ def errors(noise: float, blur_px: float, cells: int, side_m: float) -> Array:
         true = true_corners(rvec, tvec, side_m)
         raw = inwards(true, 0.5) + np.random.default_rng(index).normal(0.0, 0.3, (4, 2))
         result = refine_corners_by_lines(image, raw[None], [RIMS[cells]], CAMERA)[0]
-        assert result.is_fitted
+        assert result.are_corners_fitted
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         error = result.corners_px - true
@@ -111,7 +111,7 @@ def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
     curled = np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC), np.uint8)
     found = refine_corners_by_lines(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA)[1]
     out = (small - centre) / np.linalg.norm(small - centre, axis=1, keepdims=True)
-    assert found.is_fitted
+    assert found.are_corners_fitted
     assert abs(float(((found.corners_px - small) * out).sum(axis=1).mean())) < 0.08
 
 
@@ -139,7 +139,7 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         for rims, rows in ((RIMS, biases), (closed, raw_biases)):
             result = refine_corners_by_lines(image, true[None], [rims[6]], CAMERA)[0]
-            assert result.is_fitted
+            assert result.are_corners_fitted
             rows.append(((result.corners_px - true) * out).sum(axis=1).mean())
             assert abs(rows[-1]) < 4.0 * np.hypot(
                 result.remaining_edge_shift_sigma_px, result.sigma_px
@@ -154,7 +154,7 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
     for image, most_px in ((noise, 6.5), (np.full_like(noise, 128), 1e-5)):
         assert refine_corners_by_lines(image, raw[None], [RIMS[6]], CAMERA) == [None]
         result = refine_subpix(image, raw, 6)
-        assert not result.is_fitted
+        assert not result.are_corners_fitted
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
         assert result.sigma_px in (DETECTOR_CORNER_SIGMA_PX, SUBPIX_CORNER_SIGMA_PX)
     waves = waved(render(*POSE, noise=2.0))

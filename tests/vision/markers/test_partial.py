@@ -183,7 +183,8 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.is_cell_inside_border & ~LARGE.is_cell_white)[0]
     spots = apply_homography(
-        homography_from_centred_square(true), LARGE.sample_points[LARGE.sample_cell_index == black]
+        homography_from_centred_square(true),
+        LARGE.sample_points_half_sides[LARGE.sample_cell_index == black],
     )
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)

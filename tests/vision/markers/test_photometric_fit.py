@@ -144,25 +144,27 @@ CELLS: Array = SETUP.patterns["small"].drawing.cell_whiteness
 DOTS = 12
 
 
-def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> DrawingAlignment:
+def seen(
+    cells: Array, cell_size_px: float, blur_px: float, noise: float, seed: int
+) -> DrawingAlignment:
     """The small marker's drawing laid over a picture of these cells."""
-    image, corners = picture(cells, cell_px, blur_px, noise, seed)
+    image, corners = picture(cells, cell_size_px, blur_px, noise, seed)
     found = align_drawing(image, corners, SETUP.patterns["small"].drawing, PINHOLE, blur_px)
     assert found is not None
     return found
 
 
 def picture(
-    cells: Array, cell_px: float, blur_px: float, noise: float, seed: int
+    cells: Array, cell_size_px: float, blur_px: float, noise: float, seed: int
 ) -> tuple[Array, Array]:
     fine = np.kron(np.pad(cells, 2, constant_values=1.0), np.ones((DOTS, DOTS)))
-    scale, shift = cell_px / DOTS, 42.3
+    scale, shift = cell_size_px / DOTS, 42.3
     M = np.array([[scale, 0.0, shift], [0.0, scale, shift - 20.0]])
     soft = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), blur_px / scale)
     grey = cv2.warpAffine(soft, M, (160, 120), borderMode=cv2.BORDER_REPLICATE)
     rng = np.random.default_rng(seed)
     noisy = 40.0 + 160.0 * grey + rng.normal(0.0, noise, grey.shape)
-    first, size = 2.0 * cell_px, len(cells) * cell_px
+    first, size = 2.0 * cell_size_px, len(cells) * cell_size_px
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     # A dot's middle is half a dot from its edge.
     corners = unit * size + first + (shift, shift - 20.0) - 0.5 * scale
@@ -170,15 +172,15 @@ def picture(
 
 
 @given(
-    cell_px=st.floats(2.5, 6.0),
+    cell_size_px=st.floats(2.5, 6.0),
     blurs=st.floats(0.3, 0.9),
     noise=st.floats(0.5, 4.0),
     seed=st.integers(0, 99),
 )
 def test_the_marker_itself_is_told_apart(
-    cell_px: float, blurs: float, noise: float, seed: int
+    cell_size_px: float, blurs: float, noise: float, seed: int
 ) -> None:
-    assert excludes_other_codewords(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
+    assert excludes_other_codewords(seen(CELLS, cell_size_px, blurs * cell_size_px, noise, seed))
 
 
 @pytest.mark.parametrize(
