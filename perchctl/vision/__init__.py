@@ -1,13 +1,13 @@
 """Estimate the target from a frame with pure functions: detection, pose, merge and filter.
 
-pipeline: the only path from an image to the target; its memory is a value.
-fields: the two images of an interlaced frame.
-markers: detection of the corners of both markers.
-lens: removal of the lens distortion from corners.
-pose: pose and covariance of the target from its corners.
-merge: the two methods that combine two markers into one target.
-target_selection: choice of the own target among several identical ones.
-tracks: the gate, and the poses that update a filter.
+pipeline: processes one frame, from the image to the target estimate; its state is a value.
+fields: deinterlaces the frames of analogue cameras.
+markers: detects the corners of both markers.
+lens: removes the lens distortion from corners.
+pose: computes the target's pose and its covariance from corners.
+merge: combines the two markers into one target, by one of two methods.
+target_selection: selects the vehicle's own target from several identical ones.
+tracks: gates the poses and updates the filters.
 filter: the paper's Kalman filter.
 types: the values that these modules exchange.
 """

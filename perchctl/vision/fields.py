@@ -26,7 +26,7 @@ GreyImage = NDArray[np.uint8]
 _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
-# a pixel's difference counts above this multiple of the mean difference within the fields
+# a pixel counts if its difference exceeds this multiple of the mean difference within the fields
 _MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
@@ -40,17 +40,19 @@ _ROUNDED_TO_NTSC_OR_PAL_RANGE_S = (0.029, 0.045)  # range of periods that are ro
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
-_MAX_FRAME_GAP_S = 0.25  # s; older images carry no information about the order
+_MAX_FRAME_GAP_S = (
+    0.25  # s; after a longer gap, the previous frame says nothing about the field order
+)
 _MIN_FIELD_ORDER_VOTES = (
     1.0  # sum of votes, each at most 1, that decides the order: two frames at least
 )
-_MAX_FIELD_ORDER_VOTES = 3.0  # limit of the sum, so that a changed order is noticed in time
-_MIN_FIELD_ORDER_REVERSAL_VOTES = 1.0  # sum of votes that reverses an order decided before
+_MAX_FIELD_ORDER_VOTES = 3.0  # limit of the sum, so that a change of the order is detected soon
+_MIN_FIELD_ORDER_REVERSAL_VOTES = 1.0  # sum of votes that reverses an earlier decision
 
 
 def is_combed(image: GreyImage) -> bool:
-    """True if an interlaced image (h, w) shows combing: a row differs more from its neighbours
-    than from the rows of its own field."""
+    """True if the image (h, w) shows interlacing artefacts (combing): its rows differ more from the
+    rows of the other field than from those of their own field."""
     groups, width = len(image) // _ROWS_PER_COMBING_GROUP, image.shape[1]
     if groups == 0:
         return False
@@ -86,7 +88,7 @@ def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
 
 
 def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
-    """Return the field whose first row is `first_row` (0 or 1), interpolated to full height."""
+    """Return the top (`first_row` 0) or bottom (1) field, with the missing rows interpolated."""
     own = image[first_row::2]
     # Row k of the result is between rows k and k + 1 of the field.
     between = cv2.filter2D(
@@ -102,8 +104,8 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
 
 
 def interpolated_edge_sigma_px(blur_px: float) -> float:
-    """Return the standard deviation, px, of the position of a nearly horizontal edge in an
-    interpolated field. `blur_px` is the standard deviation of the edge's blur."""
+    """Return the position error, px (standard deviation), of a nearly horizontal edge in an
+    interpolated field. `blur_px` is the edge's blur (standard deviation)."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_px * blur_px)
 
 
@@ -125,10 +127,10 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the new state, and the images of a stream's frame in time order: the frame itself,
-    or its two fields, a quarter of the frame period before and after the frame's time.
+    """Return the new state, and the images to process in time order: the frame itself, or its two
+    fields. The fields' times are a quarter of the frame period before and after the frame's time.
 
-    Until a frame was found to be woven, only every third frame is examined for combing.
+    Until combing is found in a frame, only every third frame is checked.
     """
     skip = (
         frame.picture_kind is None
@@ -137,7 +139,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     )
     frame = replace(frame, picture_kind="whole") if skip else classify_fields(frame)
     skipped = state.frames_since_combing_check + 1 if skip else 0
-    # Once interlaced, a stream counts as interlaced.
+    # A stream that was interlaced once is treated as interlaced from then on.
     picture_kind = state.picture_kind if state.picture_kind == "woven" else frame.picture_kind
     frame_periods_s = _update_frame_periods_s(state, frame)
     if frame.picture_kind == "whole":

@@ -3,8 +3,8 @@
 The state order is the paper's: yaw, yaw rate, then position and velocity of x, y, z. The time step
 is the actual one: with 15 % late frames, a fixed step gave 0.63 cm RMS, the actual step 0.19 cm.
 
-Constant errors (the vehicle's roll and pitch, the print's size and curl) are consider states: they
-do not change the gain, only the claimed covariance.
+The biases (the vehicle's roll and pitch, the print's size and curl) are consider states: they
+increase the reported covariance but do not change the gain.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
 """Indices of the state."""
 MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
-TILTS, PRINT = slice(0, 2), slice(2, 4)  # columns of the constant errors
+TILTS, PRINT = slice(0, 2), slice(2, 4)  # columns of the biases
 
 MAX_TRACK_GAP_S = 1.0
 """Longest gap between two frames of a track, s."""
@@ -86,11 +86,11 @@ class ProcessNoise:
 
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
-    """The constants of a filter.
+    """Parameters of a track's Kalman filter.
 
     Attributes:
-        R, Q: noise of a measurement (4, 4) and of a step (8, 8): ``k1 I`` and ``k2 I`` of the paper
-            (cm^2, deg^2), converted to SI.
+        R, Q: covariance of the measurement noise (4, 4) and of the process noise per step (8, 8):
+            ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2), converted to SI.
         P0: covariance (8, 8) after the first measurement.
         velocity_factor_per_unseen_frame: factor on the velocity and the yaw rate in a frame without
             a measurement, ``kalman.alpha`` of the profile (equation 3).
@@ -98,9 +98,9 @@ class FilterSetup:
             of the profile.
         acceleration_noise: process noise that replaces Q, while the covariance of each pose
             replaces R; None: Q and R are used.
-        roll_pitch_bias_sigma_rad: constant error of the vehicle's roll and pitch.
-        max_target_speed_mps: largest speed of the target in the track's frame while it is not
-            measured: that of the drift of the world frame, unlimited in the level frame.
+        roll_pitch_bias_sigma_rad: standard deviation of the bias of the vehicle's roll and pitch.
+        max_target_speed_mps: upper limit of the target's speed in the track's frame while there is
+            no measurement: the drift speed of the world frame; infinite in the level frame.
         max_nis_without_restart: largest normalized innovation squared (NIS) of a measurement that
             updates the track; with a larger one, the track restarts.
 
@@ -116,7 +116,7 @@ class FilterSetup:
     velocity_factor_per_unseen_frame: float
     max_unseen_frames: int
     acceleration_noise: ProcessNoise | None = None
-    roll_pitch_bias_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
+    roll_pitch_bias_sigma_rad: float = 0.0  # bias of the vehicle's roll and pitch
     max_target_speed_mps: float = (
         math.inf
     )  # largest speed of the target in its frame without measurements
@@ -128,9 +128,9 @@ class TrackMeasurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
     means the setup's R.
 
-    `shift_per_bias_sigma` (4, 4) has one row for each element of z and one column for each
-    constant error: the vehicle's roll and pitch, the print's size and curl. A column is the change
-    of z by one standard deviation of that error. None means no such errors.
+    `shift_per_bias_sigma` (4, 4) has one row per element of z and one column per bias: the
+    vehicle's roll and pitch, the print's size and curl. A column is the change of z for one
+    standard deviation of that bias. None means no biases.
     """
 
     z: Array
@@ -140,8 +140,8 @@ class TrackMeasurement:
 
 @cache
 def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
-    """Import filterpy's prediction late: it loads much of scipy, which takes a second on a small
-    computer. That would delay the start of every command, or a frame in flight."""
+    """Import filterpy's `predict` only when a filter is made. The import loads much of scipy, which
+    takes a second on a small computer and would delay the start of every command."""
     from filterpy.kalman import predict
 
     loaded: Callable[..., tuple[Array, Array]] = predict
@@ -149,7 +149,7 @@ def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
 
 
 def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
-    """Return the filter's constants. The initial standard deviation of the velocity is 5 cm/s in
+    """Return the filter's parameters. The initial standard deviation of the velocity is 5 cm/s in
     the world frame. In the level frame, it is 30 cm/s, or 1 m/s if ``kalman.noise`` is
     ``measured``."""
     _import_filterpy_predict()  # now, so that no frame waits for it
@@ -191,14 +191,14 @@ def vector_by_tilt_jacobian(vector_m: Array) -> Array:
 
 
 def transition_matrix(dt_s: float) -> Array:
-    """Return the state transition matrix F (8, 8) of the paper's equation 1 over `dt_s`."""
+    """Return the state transition matrix F (8, 8) for a time step `dt_s` (paper, equation 1)."""
     return _IDENTITY_8 + dt_s * _RATE_INTEGRATION_MATRIX
 
 
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
     """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in the
-    track's frame, level (from the gear) or world; the rotation of the level frame moves a distant
-    target further."""
+    track's frame: relative to the gear in level axes, or in the world. The noise grows with the
+    target's distance because rotations of the level frame move a distant target further."""
     noise = setup.acceleration_noise
     if noise is None:
         return setup.Q
@@ -212,7 +212,7 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
 
 
 def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
-    """Return the covariance (4, 4) that one second adds to the rates of yaw, x, y and z."""
+    """Return the process noise of the rates of (yaw, x, y, z) per second, (4, 4)."""
     if noise.level_frame_acceleration_sigma_radps2 == 0.0:
         return noise.rate_noise_cov_per_s
     turned2 = noise.level_frame_acceleration_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
@@ -225,7 +225,7 @@ def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> A
 
 
 def start_track(measurement: TrackMeasurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """Return a track that starts with the measurement at `t_s`."""
+    """Return a new track with the measurement at `t_s` as its initial state."""
     x = np.zeros(8)
     x[MEASURED] = measurement.z
     x[YAW] = wrap_rad(float(measurement.z[0]))
@@ -304,7 +304,7 @@ def _innovation(x: Array, z: Array) -> Array:
 
 
 def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return state and covariance after a measurement, in Joseph form, and the gain (8, 4)."""
+    """Return the updated state, its covariance in Joseph form, and the Kalman gain (8, 4)."""
     off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
     if not regular:  # S is not a covariance, so the measurement has no weight
@@ -326,8 +326,7 @@ def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerT
 
 
 def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
-    """Return the state (8,) with the target's speed limited to `max_target_speed_mps` of the
-    setup."""
+    """Return the state (8,) with the target's speed limited to `setup.max_target_speed_mps`."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.max_target_speed_mps:
         return x
@@ -340,8 +339,8 @@ def _predict_from_state(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen_frames: int, setup: FilterSetup
 ) -> MarkerTrack:
     """Return the track at `t_s` without a measurement: its covariance is predicted over `dt_s`, and
-    its state is predicted from `x` (8,), which replaces the track's own: with slower velocities if
-    the target was not seen."""
+    its state is predicted from `x` (8,) instead of the track's own state. The caller has reduced
+    the velocities in `x` if the target was not seen."""
     x = _limit_target_speed(x, setup)
     F = transition_matrix(dt_s)
     x, P = _import_filterpy_predict()(

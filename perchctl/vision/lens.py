@@ -21,8 +21,8 @@ _ZERO_VECTOR = np.zeros(3)
 def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
-    A point that the lens model cannot image becomes NaN or lies far outside; no exception is
-    raised.
+    A point outside the valid range of the lens model becomes NaN or lies far outside the image; no
+    exception is raised.
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
     if len(points) == 0:

@@ -1,4 +1,4 @@
-"""Combine the markers of one frame into the target, by one of two methods.
+"""Combine the two markers of a frame into one target pose, by one of two methods.
 
 `weights` is the paper's method (section II-A): a pose and a Kalman filter per marker, merged by W.
 `joint` solves the corners of both markers at once and filters that single pose; a marker alone
@@ -69,9 +69,10 @@ def measure_markers(
     config: MergeConfig,
     setup: PoseSetup,
 ) -> MarkerPoses:
-    """Solve the poses of a frame's markers, and choose the tracks that these poses update.
+    """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
+    they update.
 
-    `start_pose` is the last pose of the target, moved by the vehicle's motion since.
+    `start_pose` is the last pose of the target, moved by the vehicle's motion since then.
     `previous_target_normal_cam` (3,) is the target's unit normal, out of the paper, in the last
     pose, in the camera's axes at that time.
     """
@@ -160,9 +161,9 @@ def merge_tracks(
 
 
 def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
-    """Return the target with a covariance that also covers a second possible position: that of a
-    rival, a target-like pattern at a place that contradicts the target's track, with the state
-    `rival_state` (8,). With the difference d between both, the covariance grows by d d^T."""
+    """Increase the target's covariance so that it also covers the position of a rival: a
+    target-like pattern, with the state `rival_state` (8,), whose position contradicts the target's
+    track. With the difference d between the two positions, the covariance grows by d d^T."""
     off = rival_state[_POSITION_AND_YAW] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -185,10 +186,10 @@ frame earlier."""
 
 
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with their corners moved to the frame's time.
+    """Return the detections with their corners moved to where they were at the frame's time.
 
-    With `readout_s` None, the corners stay, and `rolling_shutter_error_shift_px` is their possible
-    shift, for a typical readout time. Otherwise the corners are moved, and
+    If `readout_s` is None, the corners are not moved, and `rolling_shutter_error_shift_px` is their
+    possible shift for a typical readout time. Otherwise the corners are moved, and
     `rolling_shutter_error_shift_px`, `sigma_px` and `cov_px2` include the error of that correction.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
@@ -227,8 +228,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
 
 
 def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
-    """Return the stage (paper, section II-A.2) of a frame from whether its large and its small
-    marker were detected."""
+    """Return which markers a frame shows: its stage in the paper (section II-A.2)."""
     if is_large_detected:
         return VisibleMarkers.BOTH if is_small_detected else VisibleMarkers.LARGE
     return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
@@ -244,8 +244,8 @@ def make_weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Merge (x, y, z, yaw) of both markers, each (4,), by the paper's equation 8. The yaws are
-    merged as angles."""
+    """Return the weighted mean of (x, y, z, yaw) of the two markers, each (4,), by equation 8 of
+    the paper. The mean of the yaw angles is taken on the circle."""
     W = make_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
@@ -256,8 +256,8 @@ def is_pair_inconsistent(
     large: MarkerPose, small: MarkerPose, max_position_difference_m: float
 ) -> bool:
     """True if the positions from the two markers differ on any axis by more than
-    `max_position_difference_m` and by more than four standard deviations. Errors of the print shift
-    both markers alike, so they add no tolerance."""
+    `max_position_difference_m` and by more than four standard deviations. Print errors shift both
+    markers alike, so they do not increase the tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
         np.maximum(p.sigma_m**2 - (p.shift_per_print_error_sigma_m**2).sum(axis=1), 0.0)

@@ -70,11 +70,11 @@ SEVERAL_TARGETS_TEXT = "more than one target in view: perchctl keeps following t
 
 
 class Detector(Protocol):
-    """A detection function that ``detector.own`` in a profile names. It takes a grey image
-    (height, width) and returns a dict with the detected markers, ``large`` and ``small``. Each
-    value is an array of corners (4, 2) px in the order top left, top right, bottom right, bottom
-    left on the paper, or a tuple of corners and their standard deviation, px (0.5 by default). (0,
-    0) is the centre of the top-left pixel."""
+    """Signature of a custom detection function, named by ``detector.own`` in a profile. It takes a
+    grey image (height, width) and returns a dict with the detected markers, ``large`` and
+    ``small``. Each value is an array of corners (4, 2) px in the order top left, top right, bottom
+    right, bottom left on the paper, or a tuple of corners and their standard deviation, px (0.5 by
+    default). (0, 0) is the centre of the top-left pixel."""
 
     def __call__(self, image: NDArray[np.uint8], /) -> Mapping[str, Any]: ...
 
@@ -87,7 +87,8 @@ Step = Callable[
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's constants, made by `make_pipeline`. If set, `custom_step` replaces `step`."""
+    """The pipeline's parameters, created by `make_pipeline`. If set, `custom_step` replaces
+    `step`."""
 
     detector_setup: DetectorSetup
     pose_setup: PoseSetup
@@ -102,7 +103,8 @@ class Pipeline:
 def make_pipeline(
     profile: Profile, camera: CameraModel, hidden_mask: NDArray[np.bool_] | None = None
 ) -> Pipeline:
-    """Return the profile's pipeline for a calibrated camera; several streams may share it.
+    """Return the pipeline for a profile and a calibrated camera. Several image streams may share
+    it.
 
     `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images; None
     reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
@@ -125,7 +127,7 @@ def make_pipeline(
     if detector_setup.is_line_fit_enabled:
         warm_up_truncated_marker_fit(detector_setup.patterns, camera)
     target = profile.target
-    # the position where the vehicle searches for it
+    # the position at which the vehicle searches for the target
     own = OwnTargetPosition(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
         own = OwnTargetPosition(target.expected_xy_m, target.expected_within_m)
@@ -149,8 +151,9 @@ def make_pipeline(
 
 
 def make_camera_only_profile(profile: Profile) -> Profile:
-    """Return the profile for tracking with a camera alone: without mounting and gear, so that poses
-    are in the camera frame, and with a separate pose reported for each marker."""
+    """Return a copy of the profile for tracking with a camera that is not on a vehicle. It has no
+    mounting and no gear, so that poses are in the camera frame, and it reports a separate pose for
+    each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
         update={
@@ -175,11 +178,11 @@ def deinterlace(
 def step(
     state: PipelineState, frame: Frame, attitude: VehicleState | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Process a frame, in grey or colour; return the new state and the frame's output. Raises
-    InvalidValue for an invalid image, or one that does not have the size of the calibration.
+    """Process a frame, in grey or colour, and return the new state and the frame's output. Raises
+    InvalidValue if the image is invalid or does not have the size given in the calibration.
 
-    `attitude` is the vehicle's at the frame's time. Without it, the vehicle is assumed level and at
-    rest, and the filter works in the level frame, whatever `kalman.frame` says.
+    `attitude` is the vehicle's state at the frame's time. If it is None, the vehicle is assumed to
+    be level and at rest, and the filter works in the level frame regardless of `kalman.frame`.
     """
     frame = classify_fields(_convert_to_grey(frame, pipeline.camera))
     expected_corners_px, start_pose = expected_corners(
@@ -188,7 +191,7 @@ def step(
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
-        # The first image is searched by all methods.
+        # All methods search the first image.
         first = (
             state.last_detections is None
             and state.rival is None
@@ -215,7 +218,8 @@ def step(
 
 
 def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
-    """Return the frame in grey. Raises InvalidValue."""
+    """Return the frame with a grey image. Raises InvalidValue if the image is invalid or does not
+    have the camera's size."""
     grey, size_px = to_grey(frame.image), camera.size_px
     if grey is not frame.image:
         frame = replace(frame, image=grey, encoded=None)
@@ -229,7 +233,8 @@ def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
 
 
 def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
-    """Return the detections of `detect`. Raises InvalidValue for values that cannot be corners."""
+    """Run a custom detector and return its detections. Raises InvalidValue if it returns values
+    that cannot be corners."""
     found: dict[MarkerName, Detection] = {}
     try:
         for name, value in dict(detect(frame.image) or {}).items():
@@ -255,8 +260,8 @@ def step_detections(
     start_pose: PoseCandidate | None = None,
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` after the detection. `start_pose` is the expected pose of the target,
-    and `picture_kind` tells whether the image is whole or a field."""
+    """Run the part of `step` that follows detection. `start_pose` is the expected pose of the
+    target, and `picture_kind` says whether the image is a whole frame or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
@@ -320,7 +325,8 @@ def estimate(
     attitude: VehicleState | None,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """Return the target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
+    """Return the target estimate at `t_s`, a time after the newest frame, for the vehicle's
+    `attitude` at that time.
 
     A tracked target is predicted by its filter and by the vehicle's motion. A target that is no
     longer tracked stays at its last position in the world. Returns None before the first

@@ -22,18 +22,22 @@ from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import CameraModel, Detection, MarkerPose, VehicleState
 
-_ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
+_ATTITUDE_TILT_SIGMA_RAD = math.radians(
+    6.0
+)  # combined error of the mounting, the attitude estimate and the ceiling
 _PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
 _MIN_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
-_MAX_CHI2_FRACTION_WITH_CURL = 0.5  # share that may remain if the curl of the sheet is the cause
+_MAX_CHI2_FRACTION_WITH_CURL = (
+    0.5  # largest share of chi-squared that may remain if curl is the cause
+)
 _PoseSource = Literal["large", "small", "joint"]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """The constants of pose estimation: `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
-    (3,) the tip of the gear, and `readout_s` the time from an image's first row to its last (None
-    if unknown)."""
+    """Parameters of pose estimation. `T_body_cam` (4, 4) is the camera mounting, `gear_body_m` (3,)
+    the position of the gear's tip in body axes, and `readout_s` the rolling-shutter readout time
+    from the first to the last image row (None if unknown)."""
 
     config: PoseConfig
     target: TargetConfig
@@ -50,21 +54,23 @@ class PoseSetup:
 
     @cached_property
     def curl_lift_m(self) -> dict[_PoseSource, Array]:
-        """Distance of each corner from the flat sheet, m, for one standard deviation of the sheet's
-        curl: (8, 2), or (16, 2) for ``joint``. The columns are the modes of `curl_lift`; each
-        corner has two equal rows, for its x and y in the image."""
+        """Height of each corner above the flat sheet, m, for one standard deviation of the sheet's
+        curl: (8, 2), or (16, 2) for ``joint``. The columns are the two modes of `curl_lift`. Each
+        corner has two equal rows, one for its x and one for its y in the image."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
-    """Return the corners TL TR BR BL of a marker in its own axes, (4, 3) m, with z = 0."""
+    """Return a marker's corners in its own axes, (4, 3) m with z = 0, in the order top left, top
+    right, bottom right, bottom left."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def R_level_body_of(attitude: VehicleState | None) -> Array:
-    """Return ``R_level_body`` (3, 3); without an attitude, the vehicle is assumed level."""
+    """Return the rotation ``R_level_body`` (3, 3) of an attitude; if it is None, the vehicle is
+    assumed to be level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
 
@@ -76,14 +82,13 @@ def estimate_pose(
     previous_target_normal_cam: Array | None = None,
     start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
-    """Return the pose from one marker's corners, or from both markers' corners at once.
+    """Estimate the target's pose from the corners of one marker, or of both markers jointly.
 
-    `start`, the joint pose of the same frame, is refined with these corners instead of solving from
-    scratch, since it has already chosen between the two tilts that a planar marker allows.
-    Otherwise the vehicle's roll and pitch choose, or, without an attitude, the tilt is chosen whose
-    normal is nearer to `previous_target_normal_cam` (3,). Returns None if the corners yield no
-    pose: no finite solution in front of the camera, or a reprojection error (RMS over the corners)
-    above `pose.max_reprojection_px`.
+    A planar marker allows two tilts (pose ambiguity). If `start`, the joint pose of the same frame,
+    is given, its tilt is kept and only refined. Otherwise the vehicle's roll and pitch resolve the
+    ambiguity. Without an attitude, the tilt with the normal closer to `previous_target_normal_cam`
+    (3,) is chosen. Returns None if the corners yield no pose: no finite solution in front of the
+    camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
     source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
     image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
@@ -107,7 +112,7 @@ def estimate_pose(
     if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
     if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
-        return pose  # sides between interpolated rows look curled
+        return pose  # interpolated rows make sides look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
     points = replace(points, allows_for_curl=True)
@@ -128,8 +133,8 @@ def _refine_from_start(
     prior: TiltPrior,
     max_rms_reprojection_px: float,
 ) -> ScoredPose | None:
-    """Return the solution refined from `start` if its RMS error is at most
-    `max_rms_reprojection_px`, else None."""
+    """Refine `start`; return None if the RMS reprojection error exceeds `max_rms_reprojection_px`
+    or if the tilt contradicts `prior`."""
     solution = None if start is None else refine_pose(points, start)
     if (
         solution is None
@@ -158,7 +163,7 @@ def _make_marker_pose(
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR_drvec)
     cov_e = G.dot(cov).dot(G.T)
-    # A target that is larger by some share is further away by the same share of the distance.
+    # If the print is larger by some percentage, the target is further away by the same percentage.
     print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
     print_shift_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_shift_m.dot(print_shift_m.T)
@@ -182,7 +187,8 @@ def _make_marker_pose(
 
 def target_covariance_cam(pose: MarkerPose) -> Array:
     """Return the covariance (6, 6) of the target's pose in the camera frame, as small rotations
-    (rad) about and translations (m) along the camera's x, y, z, without the errors of the print."""
+    (rad) about and translations (m) along the camera's x, y and z. Print errors are not
+    included."""
     assert pose.rvec_tvec_cov is not None
     R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
     turns = dR_drvec.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
@@ -208,8 +214,8 @@ def target_normal_cam(pose: MarkerPose) -> Array:
 
 
 def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
-    """Return the derivative (3,) of the target's yaw in the level frame with respect to the
-    rotation vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR_drvec` (3, 9) is
+    """Return the gradient (3,) of the target's yaw in the level frame with respect to the rotation
+    vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR_drvec` (3, 9) is
     ``dR_drvec/drvec``."""
     dx = dR_drvec.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
@@ -220,9 +226,9 @@ def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) ->
 
 
 _MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # solutions closer than this are the same
-_MIN_SCORE_SIGMA_PX = 0.05  # lens and print limit the information in smaller residuals
+_MIN_SCORE_SIGMA_PX = 0.05  # lens and print errors make smaller values meaningless
 _MAX_GAUSS_NEWTON_STEPS = 8
-# weight of the claimed spread against the residuals, in degrees of freedom
+# weight of the detections' own standard deviation against the residuals, in degrees of freedom
 _CORNER_SIGMA_PRIOR_DOF = 8.0
 
 _MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # rad and m
@@ -255,8 +261,8 @@ class ScoredPose(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected unit normal of the target, out of the paper, in camera axes, (3,), None if unknown,
-    and its standard deviation."""
+    """Expected direction of the target's unit normal (out of the paper) in camera axes, (3,), and
+    its standard deviation. The normal is None if unknown."""
 
     target_normal_cam: Array | None
     sigma_rad: float
@@ -272,7 +278,8 @@ class TiltPrior:
 
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """Return the better of the two possible poses of a planar marker; None if neither is valid."""
+    """Return the more likely one of the two possible poses of a planar marker; None if neither is
+    valid."""
     candidates = [_refine(points, c) for c in _solve_closed_form(points)]
     scored = [_score_candidate(c, points) for c in candidates if _is_valid_candidate(c)]
     if not scored:
@@ -282,7 +289,7 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
         best = _choose_most_likely_pose(
             [best, *_find_flipped_candidates(best, points)], points, prior
         )
-    # The unweighted optimum is so close that the errors are linear.
+    # The unweighted optimum is close enough for the errors to be linear.
     return refine_pose(points, best) or best
 
 
@@ -329,8 +336,9 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 
 class PoseCovariance(NamedTuple):
-    """Covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and the change
-    of (rvec, tvec), rad and m, (6,), by one standard deviation of the sheet's curl as a bowl."""
+    """Covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and the shift
+    (6,) of (rvec, tvec), rad and m, for one standard deviation of a bowl-shaped curl of the
+    sheet."""
 
     cov: Array
     chi2: float
@@ -340,8 +348,8 @@ class PoseCovariance(NamedTuple):
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
     """Return the covariance of a pose, the chi2 of its corners, and the effect of the sheet's curl.
 
-    The covariance covers the noise of the corners (at least as large as the residuals), shifts
-    common to all corners, and a twist of the sheet, but not its curl.
+    The covariance includes corner noise (at least as large as the residuals), shifts common to all
+    corners, and a twist of the sheet, but not its bowl-shaped curl.
     """
     W = points.whitening
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
@@ -365,23 +373,23 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 
 
 def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """Return the change (2n, 2) of the whitened errors by one standard deviation of each mode of
-    curl."""
+    """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
+    each curl mode."""
     target_normal_cam = rotation_matrix(scored.rvec)[:, 2]
-    # A corner out of the sheet's plane appears where a target moved along its normal would show it.
+    # In the image, a corner above the sheet's plane moves as if the target moved along its normal.
     moved = scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None] * points.curl_lift_m
     return np.asarray(points.whitening.dot(moved))
 
 
 def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> float:
-    """Return the angle between a marker's normal at rotation `rvec` and the normal
-    `expected_normal_cam`, rad."""
+    """Return the angle, rad, between the normal of a marker with rotation `rvec` and
+    `expected_normal_cam`."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_normal_cam))))
 
 
 def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's SQPNP; none for collinear corners."""
+    """Return the pose candidates from OpenCV's SQPNP solver; empty for collinear corners."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_points_m, points.image_points_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -456,10 +464,10 @@ def _choose_most_likely_pose(
 
 
 def curl_lift(object_points_m: Array, paper_curvature_per_m: float) -> Array:
-    """Return the distances of corners (n, 3) from the flat sheet for one standard deviation of each
-    mode of curl: a bowl, with all corners to one side, and a saddle, with neighbouring corners to
-    opposite sides. `paper_curvature_per_m` is the lift per squared distance from the centre. Shape
-    (2n, 2), m, with each corner's row twice, for its x and y."""
+    """Return the height of corners (n, 3) above the flat sheet for one standard deviation of two
+    curl modes: a bowl (all corners on one side) and a saddle (neighbouring corners on opposite
+    sides). `paper_curvature_per_m` is the height per squared distance from the centre. Shape (2n,
+    2), m; each corner has two equal rows, for its x and y."""
     x, y = object_points_m[:, 0], object_points_m[:, 1]
     lift: Array = paper_curvature_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -504,7 +512,7 @@ _SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMN
 
 @dataclass(frozen=True, eq=False)
 class WeightedCorners:
-    """Corners with the weights of their errors.
+    """Corners with the weights of their reprojection errors.
 
     Attributes:
         object_points_m, image_points_px: corners (n, 3) on the target, and (n, 2) in the image of a
@@ -516,8 +524,8 @@ class WeightedCorners:
             black at all edges, `rolling_shutter_error_shift_px` of the detections, and the jitter
             of each detection's rows.
         curl_lift_m: result (2n, 2) of `curl_lift`.
-        allows_for_curl: True if the sheet may be curled, so that corners which curl moves have less
-            weight; False: it is taken for flat.
+        allows_for_curl: True if the sheet may be curled, which reduces the weight of corners that
+            curl would move; False if the sheet is assumed to be flat.
     """
 
     object_points_m: Array
@@ -537,8 +545,8 @@ def weigh_corners(
     K: Array,
     curl_lift_m: Array,
 ) -> WeightedCorners:
-    """Weigh the detections' corners. `image_points_px` are the corners in a pinhole camera K, and
-    `curl_lift_m` is the result of `curl_lift`."""
+    """Compute the weights of the detections' corners. `image_points_px` are the corners in a
+    pinhole camera with matrix K; `curl_lift_m` is the result of `curl_lift`."""
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
@@ -551,7 +559,9 @@ def weigh_corners(
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
-            except np.linalg.LinAlgError:  # rounding, for far corners of a cut target
+            except (
+                np.linalg.LinAlgError
+            ):  # rounding errors for distant corners of a truncated target
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.are_corners_fitted:
             spread_px = (
@@ -567,7 +577,7 @@ def weigh_corners(
         if d.rolling_shutter_error_shift_px is not None:
             error_shifts[rows, 1] = d.rolling_shutter_error_shift_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
-            # As for a line: half to all of its rows shift alike, and they slant.
+            # As for a line: half to all of the rows shift alike, and they tilt.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)
@@ -592,8 +602,8 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
-    """Return the standard deviation, px, of each side's position across it, (4,): larger for a side
-    along the image's rows, because a field has only every second row."""
+    """Return the standard deviation of each side's position perpendicular to it, (4,) px. In a
+    field, it is larger for sides along the image rows because every second row is interpolated."""
     sides = corners.take(_SIDE_END_CORNER_INDICES, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])

@@ -1,4 +1,4 @@
-"""Select the vehicle's own target among several with identical markers.
+"""Select the vehicle's own target from several targets with identical markers.
 
 The own target is the one closest to its position in the profile, in the world frame of the state
 estimate, or otherwise the one closest to the upward axis through the gear. This choice is made
@@ -29,9 +29,9 @@ _RAW_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
 @dataclass(frozen=True)
 class OwnTargetPosition:
-    """Position `xy_world_m` of the vehicle's own target in the world frame of the state estimate;
-    None if unknown: the target nearest to the axis above the gear is taken. A target further than
-    `max_distance_m` from a known position belongs to another vehicle."""
+    """Position `xy_world_m` of the vehicle's own target in the world frame of the state estimate.
+    If it is None (unknown), the target closest to the upward axis through the gear is selected. A
+    target further than `max_distance_m` from a known position belongs to another vehicle."""
 
     xy_world_m: tuple[float, float] | None = None
     max_distance_m: float = math.inf
@@ -55,8 +55,8 @@ def marker_to_own_target_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return `horizontal_distance_to_own_target_m` for a marker's corners (4, 2) px; infinite
-    beyond `own_target.max_distance_m`."""
+    """Return the horizontal distance, m, of a marker with corners (4, 2) px from the own target's
+    position; infinite beyond `own_target.max_distance_m`."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
@@ -71,8 +71,8 @@ def marker_to_own_target_m(
 def horizontal_distance_to_own_target_m(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
-    """Return the horizontal distance of a seen target from the own target's position; from the gear
-    if that is unknown."""
+    """Return the horizontal distance of a detected target from the position of the vehicle's own
+    target, or from the gear if that position is unknown."""
     if own_target.xy_world_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -82,8 +82,8 @@ def horizontal_distance_to_own_target_m(
 def refusal_text(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
-    """Return the message that a pose is another vehicle's target; None if it may be the own
-    target."""
+    """Return the message that a detected target belongs to another vehicle; None if it may be this
+    vehicle's own target."""
     if attitude is None or own_target.xy_world_m is None:
         return None
     distance_m = horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
@@ -136,8 +136,8 @@ def make_track_measurement(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> TrackMeasurement:
-    """Return a pose as a measurement for the filter, in the world or the level frame."""
-    z, lever_m = np.empty(4), pose.e_m  # an error of the tilt turns the lever
+    """Convert a pose to a filter measurement in the world frame or the level frame."""
+    z, lever_m = np.empty(4), pose.e_m  # a tilt error rotates the lever arm
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if is_in_world_frame:
         assert attitude is not None
@@ -173,9 +173,9 @@ def gear_to_target_shift_per_bias_sigma_m(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> Array:
-    """Return the change (3, 4) of the vector from gear to target, in level axes, by one standard
-    deviation of each constant error: `target_shift_per_bias_sigma_m` (3, 4) of the target in the
-    world, minus the effect of roll and pitch errors on the gear."""
+    """Return the change (3, 4) of the vector from the gear to the target, in level axes, for one
+    standard deviation of each bias. It is `target_shift_per_bias_sigma_m` (3, 4), the change of the
+    target's position in the world, minus the effect of the roll and pitch biases on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_shift_per_bias_sigma_m)
     moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.roll_pitch_bias_sigma_rad

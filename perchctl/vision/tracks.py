@@ -40,9 +40,9 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """Constants of the filters in the level and the world frame and of the pose estimation; whether
-    poses that do not fit the tracked target are rejected (`is_gate_enabled`); and the position of
-    the vehicle's own target."""
+    """Parameters for updating tracks: the filters in the level and in the world frame, the pose
+    estimation, and the position of the vehicle's own target. `is_gate_enabled`: reject poses that
+    do not fit the tracked target."""
 
     level_filter: FilterSetup
     world_filter: FilterSetup
@@ -51,15 +51,15 @@ class TrackSetup:
     own_target: OwnTargetPosition
 
     def select_filter(self, is_in_world_frame: bool) -> FilterSetup:
-        """Return the filters' constants in the world or the level frame."""
+        """Return the filter parameters for the world frame or the level frame."""
         return self.world_filter if is_in_world_frame else self.level_filter
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """Tracks after a frame; the target that is followed (`lock`) and a competing target-like
-    pattern (`rival`), None if there is none; and whether the pose was accepted as the target's
-    (`verdict`, the decision of the gate).
+    """Result of updating the tracks with one frame: the tracks, the tracked target (`lock`), a
+    competing target-like pattern (`rival`), and the gate's decision on the frame's pose
+    (`verdict`). Lock and rival are None if there is none.
 
     `marker_poses.poses_by_track` is empty if the gate rejects the frame's pose.
     """
@@ -79,7 +79,7 @@ def update_tracks(
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Return the tracks after a frame, updated with the poses that the gate accepts."""
+    """Update the tracks with the poses of one frame that the gate accepts."""
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
         name: make_track_measurement(
@@ -192,10 +192,9 @@ _MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose and its measurement for the filter, with whether both markers contributed and
-    whether the position of the target that is followed is in the image
-    (`is_locked_target_in_view`). `is_attitude_unknown` is True if the camera is used alone, without
-    a vehicle."""
+    """A frame's pose with its filter measurement. `has_both_markers` is True if both markers
+    contributed, `is_locked_target_in_view` if the expected position of the tracked target is in the
+    image, and `is_attitude_unknown` if the camera is used without a vehicle."""
 
     t_s: float
     pose: MarkerPose
@@ -208,9 +207,9 @@ class FramePose:
 
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
-    """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
-    restart at the pose, and whether they restart for the target followed so far
-    (`restarts_at_locked_target`) instead of for the rival.
+    """The gate's decision on a pose: whether it is accepted as a pose of the target, whether the
+    tracks restart at this pose, and whether they restart for the same target
+    (`restarts_at_locked_target`) or for the rival.
 
     `rival` is the rival track after this frame; `reason` explains a rejection or a restart.
     """
@@ -220,7 +219,7 @@ class GateVerdict:
     restarts_at_locked_target: bool = False
     rival: RivalTrack | None = None
     reason: str = ""
-    is_foreign_target: bool = False  # another vehicle's target, by its position
+    is_foreign_target: bool = False  # its position is that of another vehicle's target
 
 
 def judge_pose(
@@ -229,9 +228,9 @@ def judge_pose(
     frame_pose: FramePose,
     filter_setup: FilterSetup,
 ) -> GateVerdict:
-    """Decide whether a frame's pose belongs to the target that is followed (`lock`), to a competing
-    target-like pattern (`rival`), or to neither, which begins a new rival; lock and rival are None
-    if there is none. A pose without a lock is accepted."""
+    """Decide whether a frame's pose belongs to the tracked target (`lock`), to a competing
+    target-like pattern (`rival`), or to neither, in which case it starts a new rival. Lock and
+    rival are None if there is none. Without a lock, every pose is accepted."""
     lock, rival = drop_expired_lock_and_rival(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
@@ -280,9 +279,9 @@ def judge_pose(
 def drop_expired_lock_and_rival(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
-    """Return lock and rival, each replaced by None if it has not been seen for too long at `t_s`: a
-    rival, or a lock in the level frame without a rival, for `MAX_TRACK_GAP_S`, any other lock for
-    `LOCK_TIMEOUT_S`."""
+    """Return lock and rival, each replaced by None if it has expired at `t_s`. A rival, or a lock
+    in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S`; any other
+    lock after `LOCK_TIMEOUT_S`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
@@ -290,7 +289,7 @@ def drop_expired_lock_and_rival(
     age_s = t_s - lock.track.t_s
     # A position in the level frame expires soon, but a rival stays a rival.
     lasting = lock.is_in_world_frame or rival is not None
-    # After the clock was set back, no older track can be confirmed.
+    # If the clock was set back, older tracks cannot be confirmed any more.
     if age_s < -MAX_TRACK_GAP_S or age_s > (LOCK_TIMEOUT_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, rival
@@ -306,7 +305,8 @@ def predict_rival_state(
     """Return the rival's state (8,) at `t_s` if the rival was seen more recently than the locked
     target; otherwise None.
 
-    Until one of the two is confirmed, the target may be at either position.
+    Until one of the two is confirmed, the target may be at either position, so the estimate must
+    cover both.
     """
     if (
         lock is None
@@ -322,8 +322,8 @@ def predict_rival_state(
 def update_lock(
     lock: TargetLock | None, track: MarkerTrack, frame_pose: FramePose, verdict: GateVerdict
 ) -> TargetLock:
-    """Return the lock after the gate accepted `frame_pose`. `track` is the track that this pose
-    updated."""
+    """Return the updated lock after the gate has accepted `frame_pose`. `track` is the track that
+    this pose has updated."""
     anew = verdict.restarts_track and not verdict.restarts_at_locked_target
     before = (
         None
@@ -346,8 +346,8 @@ def update_lock(
 
 @dataclass(frozen=True, eq=False)
 class _Innovation:
-    """A pose as measured minus its prediction in the track's frame, (yaw, x, y, z), rad and m,
-    (4,), and the covariance `S` (4, 4) of that difference."""
+    """Innovation of a pose: measurement minus prediction of (yaw, x, y, z) in the track's frame,
+    rad and m, (4,), and its covariance `S` (4, 4)."""
 
     yaw_xyz: Array
     S: Array
@@ -371,13 +371,13 @@ def _compute_innovation(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> _Innovation:
     wanted, measurement = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measurement
-    # The largest drift counts as three standard deviations.
+    # The largest drift is taken as three standard deviations.
     drift_m = (
         min(filter_setup.max_target_speed_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
     )
     residual = measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
-    # A constant error shifts both.
+    # A bias shifts measurement and prediction alike.
     error_shifts = (
         wanted.shift_per_bias_sigma[MEASURED]
         if measurement.shift_per_bias_sigma is None
@@ -396,8 +396,8 @@ def _compute_innovation(
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
-    """True if errors that no covariance models, of lens, print and latency, already explain the
-    innovation, as in most frames: a fast check that saves the full one."""
+    """True if the innovation is smaller than the unmodelled errors of lens, print and latency
+    alone, as in most frames. This fast check saves the full one."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
@@ -410,8 +410,8 @@ def _range_m(frame_pose: FramePose) -> float:
 
 
 def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
-    """Return the standard deviations of (yaw, x, y, z), rad and m, at a range due to errors that no
-    covariance models."""
+    """Return the standard deviations of (yaw, x, y, z), rad and m, of unmodelled errors
+    (calibration, print, latency) at the range `range_m`."""
     sideways_m, along_m = (
         _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
         _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
@@ -420,9 +420,10 @@ def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
 
 
 def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: Array) -> bool:
-    """True if the target is where the vehicle saw it last, but not where the world frame predicts
-    it: the pose relative to the gear has changed much less than `world_residual` (4,), measured
-    minus predicted (yaw, x, y, z) in the world, rad and m. Then the state estimate has jumped."""
+    """True if the state estimate has jumped: the target is where the vehicle last saw it, but not
+    where the world frame predicts it. The pose relative to the gear has then changed much less than
+    `world_residual` (4,), which is measured minus predicted (yaw, x, y, z) in the world, rad and
+    m."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
@@ -440,10 +441,11 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
 def _matches_previous_track(
     lock: TargetLock, frame_pose: FramePose, residual: Array, filter_setup: FilterSetup
 ) -> bool:
-    """True if the pose fits the track as it was before the last accepted pose much better than the
-    present track. The last accepted pose was then most likely wrong: at a low frame rate, a single
-    wrong pose may pass the gate and give the track of a camera alone a wrong velocity. `residual`
-    (4,) is the pose's distance from the present track."""
+    """True if the pose fits the track before the last accepted pose much better than it fits the
+    current track. The last accepted pose was then most likely wrong: at a low frame rate, a single
+    wrong pose can pass the gate and corrupt the velocity of a track from a camera without a
+    vehicle. `residual` (4,) is measured minus predicted (yaw, x, y, z) for the current track, rad
+    and m."""
     if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
     innovation, unclaimed = (
@@ -516,7 +518,7 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
     if not lock.has_both_markers:
         return True
     unseen_s = frame_pose.t_s - max(rival.first_seen_s, lock.track.t_s)
-    # A position outside the image is not known to be empty.
+    # A target outside the image may still be at its position.
     return (
         (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.has_different_range
@@ -526,9 +528,9 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 
 
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
-    """True if the rival is most likely the target itself, and its distance from the track is due to
-    the camera's motion during lost frames: only the rival was seen for `MIN_RIVAL_ONLY_S`, since
-    after the last sight of the target, in enough frames and with as many markers as the target."""
+    """True if the rival is most likely the target itself, displaced from the track because the
+    camera moved during lost frames. Since the target was last seen, only the rival has been seen
+    for `MIN_RIVAL_ONLY_S`, in enough frames and with as many markers as the target."""
     if (
         rival.first_seen_s < lock.track.t_s
         or frame_pose.t_s - rival.first_seen_s < MIN_RIVAL_ONLY_S
@@ -547,16 +549,17 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
 # and as velocity times time. Each is weighted by its recent errors in the target's own images.
 
 
-_MOTION_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each image replaces
+_MOTION_ERROR_UPDATE_FRACTION = 0.1  # weight of a new frame in the running mean of squared errors
 
 
 def expected_corners(
     last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Return the expected corners of both markers, (4, 2) px, and the expected pose of the target:
-    the last pose, moved by the vehicle's motion.
+    """Predict the corners of both markers, (4, 2) px, and the pose of the target at `t_s` from the
+    last pose and the vehicle's motion since then.
 
-    Without both attitudes: None and the unmoved pose. Without a recent pose: None and None.
+    Returns (None, last pose) if one of the two attitudes is unknown, and (None, None) if there is
+    no recent pose.
     """
     if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -583,7 +586,8 @@ def expected_corners(
 def update_last_pose(
     previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
-    """Return the record of a new pose, with the errors of the estimated motion since `previous`."""
+    """Return a new pose as the last pose, with updated errors of the vehicle's estimated motion
+    since `previous`."""
     if previous is None:
         return LastPose(pose, attitude)
     then, passed_s = previous.attitude, pose.t_s - previous.pose.t_s
@@ -604,7 +608,8 @@ def update_last_pose(
 
 
 def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup) -> bool:
-    """True if a position (3,) in the world is in the image at the vehicle's attitude."""
+    """True if a position (3,) in the world frame is in the camera's field of view at the vehicle's
+    attitude."""
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (
         position_world_m - attitude.position_m - _vehicle_to_camera_world_m(attitude, setup)
@@ -621,8 +626,8 @@ def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup
 
 
 class _CameraDisplacements(NamedTuple):
-    """The camera's displacement (3,) in the world between two attitudes: from the difference of the
-    two estimated positions, and from velocity times time."""
+    """The camera's displacement (3,) in the world between two times: from the difference of the
+    estimated positions, and from velocity times time."""
 
     from_positions_m: Array
     from_velocity_m: Array
@@ -631,7 +636,8 @@ class _CameraDisplacements(NamedTuple):
 def _camera_displacements_m(
     previous: VehicleState, current: VehicleState, setup: PoseSetup
 ) -> _CameraDisplacements:
-    """Return the camera's displacement between two attitudes, computed in both ways."""
+    """Return the camera's displacement from the `previous` to the `current` vehicle state, computed
+    in both ways."""
     turned_m = _vehicle_to_camera_world_m(current, setup) - _vehicle_to_camera_world_m(
         previous, setup
     )

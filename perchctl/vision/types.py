@@ -24,7 +24,7 @@ GearToTargetInLevel = Array
 
 
 class VisibleMarkers(Enum):
-    """The stage of the paper (section II-A.2): which of the target's markers are in view."""
+    """The target's markers that are in view: the stages of the paper (section II-A.2)."""
 
     NONE = "none"
     LARGE = "large"  # stage 1, equation 5
@@ -42,8 +42,8 @@ class CameraModel:
         dist: distortion coefficients in OpenCV's order, shape (n,).
         model: ``plumb_bob`` (5), ``rational_polynomial`` (8) or ``fisheye`` (4).
 
-    Raises InvalidValue for any other form of `K`: OpenCV's functions use only fx, fy, cx and cy,
-    and silently ignore the other entries.
+    Raises InvalidValue for any other form of `K`, because OpenCV only uses fx, fy, cx and cy and
+    silently ignores the other entries.
     """
 
     size_px: tuple[int, int]
@@ -68,7 +68,8 @@ accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
-    """Raise InvalidValue if the camera matrix (3, 3) has entries that no computation uses."""
+    """Raise InvalidValue if the camera matrix (3, 3) has nonzero entries that perchctl does not
+    support."""
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
@@ -89,19 +90,18 @@ def check_camera_matrix(K: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image. `t_s` is its time of exposure on the loop's clock. A source computes it as the
-    time of arrival, `t_arrival_s`, minus the profile's `camera.latency_s`. Only
-    `perchctl.perception` subtracts the additional latency measured in flight and half the time of a
-    field.
+    """One camera image. `t_s` is its exposure time on the loop's clock: the arrival time,
+    `t_arrival_s`, minus `camera.latency_s` of the profile. The additional latency measured in
+    flight and half the duration of a field are subtracted only in `perchctl.perception`.
 
     `image` is grey, uint8, shape (height, width); `step` also accepts BGR, (height, width, 3).
 
-    `picture_kind` is the kind of the image: ``whole`` for one exposure, ``woven`` for two fields,
-    ``top`` or ``bottom`` for one field of a woven image at full height, None if not classified
-    yet (`perchctl.vision.fields`). `repeated`: the source returned the previous image again,
-    which is not a measurement. `encoded` is the source's JPEG, from which `cv2.imdecode` with
-    IMREAD_GRAYSCALE and IMREAD_IGNORE_ORIENTATION yields exactly `image`; None if there is none, or
-    if the image was changed.
+    `picture_kind` describes interlacing: ``whole`` for an image from one exposure, ``woven`` for
+    two interlaced fields, ``top`` or ``bottom`` for one field interpolated to full height, None if
+    not classified yet (`perchctl.vision.fields`). `repeated` is True if the source returned the
+    previous image again; such an image is not a new measurement. `encoded` is the JPEG from the
+    source, which `cv2.imdecode` decodes exactly to `image` with IMREAD_GRAYSCALE and
+    IMREAD_IGNORE_ORIENTATION; None if the source sends no JPEG or if the image was modified.
     """
 
     index: int
@@ -114,8 +114,8 @@ class Frame:
 
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
-    """Return a contiguous 8-bit grey image, (height, width), from an array in grey, BGR or BGRA
-    with 8 or 16 bits. Raises InvalidValue for anything else."""
+    """Convert a grey, BGR or BGRA array with 8 or 16 bits to a contiguous 8-bit grey image,
+    (height, width). Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue(
             "the picture is None: cv2.imread returns None if it cannot read a file as a picture"
@@ -145,19 +145,19 @@ class Detection:
 
     Attributes:
         sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
-            default if no line could be fitted.
-        are_corners_fitted: True if the corners follow from a fit of lines or of the drawing, False
-            if each was located by itself.
-        remaining_edge_shift_sigma_px: standard deviation of the common outward shift of all edges
-            that remains after its correction.
-        rolling_shutter_error_shift_px: change (4, 2) of the corners by one standard deviation of
-            the error of the readout time, which is common to both markers; None: no such error.
-        cov_px2: covariance (8, 8) of corners inferred from a part of the drawing, which may lie
-            outside the image: in pixels of a pinhole camera, with x and y of each corner
-            alternating.
-        row_jitter_sigma_px: standard deviation due to the jitter of rows in analogue video.
-        horizontal_side_extra_sigma_px: additional standard deviation of sides along the rows, if
-            every second row is interpolated.
+            default value if no lines were fitted.
+        are_corners_fitted: True if the corners come from a line fit or a photometric fit, False if
+            they come from OpenCV or from the other marker.
+        remaining_edge_shift_sigma_px: standard deviation of the remaining common outward shift of
+            all edges after its correction.
+        rolling_shutter_error_shift_px: change (4, 2) of the corners for one standard deviation of
+            the readout-time error, which is common to both markers; None if there is no such error.
+        cov_px2: covariance (8, 8) of corners that were inferred from a visible part of the marker
+            and may lie outside the image, in pixels of a pinhole camera, ordered x0, y0, x1, y1,
+            ...
+        row_jitter_sigma_px: standard deviation due to row jitter in analogue video.
+        horizontal_side_extra_sigma_px: additional standard deviation of sides along the image rows
+            if every second row is interpolated.
     """
 
     marker: MarkerName
@@ -167,7 +167,7 @@ class Detection:
     remaining_edge_shift_sigma_px: float = (
         0.0  # standard deviation of the common outward shift of all edges
     )
-    # (4, 2): change of the corners by one standard deviation of an error common to all of them
+    # (4, 2): change of the corners for one standard deviation of an error common to all of them
     rolling_shutter_error_shift_px: Array | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = (
@@ -179,9 +179,9 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """How far white has grown over black at all edges of an image, `white_growth_px` (positive: a
-    marker's black square looks smaller), its standard deviation, px, and the number of images
-    since it was measured."""
+    """Common shift of all black-white edges of an image (blooming, gamma). `white_growth_px` is how
+    far white has grown over black; if positive, a marker's black square looks smaller. `sigma_px`
+    is its standard deviation, and `age_frames` the number of frames since it was measured."""
 
     white_growth_px: float
     sigma_px: float
@@ -196,7 +196,7 @@ class Detections:
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    is_mirrored_marker_seen: bool = False  # a marker decoded as its mirror image
+    is_mirrored_marker_seen: bool = False  # whether a marker was decoded as its mirror image
     target_count: int = 0  # complete targets, with both markers, found by a search
     flow_pxps: dict[MarkerName, Array] = field(
         default_factory=dict
@@ -246,7 +246,8 @@ class VehicleState:
 
 @dataclass(frozen=True, eq=False)
 class MarkerPose:
-    """A pose from one frame. `source` is ``large``, ``small`` or ``joint``.
+    """The target's pose from one frame: from the ``large`` marker, the ``small`` marker or both
+    (``joint``), as named by `source`.
 
     Attributes:
         rvec_rad, tvec_m: pose in the OpenCV camera frame, with cv2.aruco's marker axes, (3,).
@@ -256,10 +257,10 @@ class MarkerPose:
         rms_reprojection_px: RMS distance of the projected from the measured corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        shift_per_print_error_sigma_m: shift of `e_m` by one standard deviation of the print's size
-            and of the sheet's curl, (3, 2). Included in `sigma_m` and `xyz_yaw_cov`, but identical
-            in every frame.
-        rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
+        shift_per_print_error_sigma_m: shift of `e_m` for one standard deviation of the print's size
+            error and of the sheet's curl, (3, 2). These errors are included in `sigma_m` and
+            `xyz_yaw_cov`, but are the same in every frame.
+        rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without print errors.
     """
 
     source: Literal["large", "small", "joint"]
@@ -279,13 +280,13 @@ class MarkerPose:
 
 @dataclass(frozen=True, eq=False)
 class MarkerTrack:
-    """A marker's Kalman filter between two frames (paper, section II-A.1).
+    """State of a marker's Kalman filter (paper, section II-A.1).
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. Column k of `shift_per_bias_sigma` (8, 4) is the change of the state by one standard
-    deviation of constant error k: the vehicle's roll and pitch, the print's size and curl.
-    `unseen_frames` counts the frames since the last measurement.
+    motion. Column k of `shift_per_bias_sigma` (8, 4) is the change of the state for one standard
+    deviation of bias k: the vehicle's roll and pitch, the print's size and curl. `unseen_frames`
+    counts the frames since the last measurement.
     """
 
     t_s: float
@@ -296,7 +297,7 @@ class MarkerTrack:
 
     @property
     def state_cov_with_biases(self) -> Array:
-        """Covariance (8, 8) of the state, including the constant errors."""
+        """Covariance (8, 8) of the state, including the biases."""
         return self.P + self.shift_per_bias_sigma @ self.shift_per_bias_sigma.T
 
 
@@ -350,9 +351,9 @@ class TargetEstimate:
 
 
 class MotionErrors(NamedTuple):
-    """Recent mean square errors of the vehicle's estimated motion since the last pose, as angles
-    seen from the camera, rad^2: of the motion computed from the difference of two estimated
-    positions, and of that computed from velocity times time."""
+    """Running mean squared errors of the vehicle's estimated motion between poses, as angles seen
+    from the camera, rad^2: for the motion from the difference of two estimated positions, and for
+    the motion from velocity times time."""
 
     from_positions_rad2: float = 0.0
     from_velocity_rad2: float = 0.0
@@ -360,9 +361,9 @@ class MotionErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LastPose:
-    """A pose of the target, the vehicle's attitude at that time, if known, and the errors of the
-    vehicle's estimated motion between poses. The motion with the smaller error has more weight in
-    the prediction of the next pose."""
+    """The last pose of the target, the vehicle's attitude at that time (None if unknown), and the
+    errors of the vehicle's estimated motion between poses. The prediction of the next pose weights
+    the two motion estimates by these errors."""
 
     pose: MarkerPose
     attitude: VehicleState | None
@@ -371,10 +372,9 @@ class LastPose:
 
 @dataclass(frozen=True, eq=False)
 class TargetLock:
-    """The target that the pipeline is locked on: its last track and pose in the world or the level
-    frame, the number of `accepted_frames` with a pose of it, and whether any pose used both
-    markers. `track_before_last_pose` is the track without its last pose; None after the first
-    one."""
+    """The target that the pipeline is locked on: its last track and pose, the number of frames with
+    an accepted pose (`accepted_frames`), and whether any of these poses used both markers.
+    `track_before_last_pose` is the track without its last pose; None after the first one."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -386,16 +386,17 @@ class TargetLock:
 
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
-    """A track of something that looks like the target, at a position that the target's own track
-    does not explain. It may be another target, or the target itself after an error of its track.
+    """A track of a target-like pattern at a position that contradicts the track of the locked
+    target. It may be another target, or the target itself if its track is wrong.
 
     Attributes:
-        track: its filter.
+        track: state of the rival's filter.
         is_in_world_frame: True if the track is in the world frame, False if in the level frame.
-        first_seen_s: time of its first frame.
-        seen_frames, frames_with_both_markers: number of its frames, and of those with both markers.
-        has_different_range: True if its range differs from the target's.
-        relative_position_text: where it is relative to the target, in words.
+        first_seen_s: time of the rival's first frame.
+        seen_frames, frames_with_both_markers: number of frames that showed the rival, and of those
+            that showed both of its markers.
+        has_different_range: True if the rival's range differs significantly from the target's.
+        relative_position_text: the rival's position relative to the target, in words.
     """
 
     track: MarkerTrack
@@ -409,7 +410,7 @@ class RivalTrack:
 
 @dataclass(frozen=True, eq=False)
 class MarkerPoses:
-    """The poses of one frame.
+    """The poses estimated from one frame.
 
     Attributes:
         poses: all poses, by ``joint``, ``large``, ``small``, in this order.
@@ -423,25 +424,25 @@ class MarkerPoses:
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
-        """The pose with the smallest standard deviation in `poses_by_track`, otherwise in `poses`;
-        None without poses."""
+        """The pose with the smallest standard deviation, from `poses_by_track` if it is not empty,
+        otherwise from `poses`; None if there are no poses."""
         poses = self.poses_by_track or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """State of the detection of interlacing in a stream.
+    """What is known about the interlacing of an image stream.
 
     Attributes:
-        picture_kind: kind of the last frame that was examined for interlacing.
-        frames_since_combing_check: number of frames since then.
+        picture_kind: kind of the last frame that was checked for combing.
+        frames_since_combing_check: number of frames since that check.
         top_field_first_votes: sum of the votes on the order of the fields: positive if the top
             field seems to be first, negative if the bottom field does.
         is_top_field_first: order of the fields; None until the votes decide.
         frame_periods_s: the last periods between frames.
         last_frame_t_s: time of the last frame.
-        previous_image: image of the previous frame, unless that frame was whole.
+        previous_image: previous image, unless it was a whole one.
     """
 
     picture_kind: PictureKind | None = None
@@ -455,7 +456,7 @@ class FieldState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """The pipeline's whole memory; `PipelineState()` is a fresh start."""
+    """The complete state of the pipeline between frames; `PipelineState()` is the initial state."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     are_tracks_in_world_frame: bool = (
@@ -474,7 +475,7 @@ class PipelineState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineOutput:
-    """Result of one frame, for the planner and the log."""
+    """Result of processing one frame, for the planner and the log."""
 
     detections: Detections
     poses: dict[str, MarkerPose]
@@ -485,18 +486,20 @@ class PipelineOutput:
     )
     picture_kind: PictureKind = "whole"  # kind of the image
     lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
-    is_foreign_target: bool = False  # this frame showed another vehicle's target, by its position
+    is_foreign_target: bool = (
+        False  # whether this frame showed another vehicle's target, judged by its position
+    )
 
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the profile's camera latency and mounting estimated in flight, each with one
+    """Errors of the camera latency and mounting in the profile, estimated in flight, each with its
     standard deviation.
 
-    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` are the small
-    rotations of the mounting about body x, y and z relative to the profile's.
-    `mount_rotation_sigma_xyz_rad` includes the constant error of the attitude, which moves the
-    target just as an error in roll and pitch of the mounting does.
+    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` are the small rotations
+    of the mounting about body x, y and z relative to the profile's. `mount_rotation_sigma_xyz_rad`
+    includes the bias of the attitude estimate, which shifts the target in the same way as a roll or
+    pitch error of the mounting.
     """
 
     delay_s: float

@@ -63,11 +63,12 @@ def find_expected_blurred(
     expected_corners_px: Mapping[MarkerName, Array],
     initial_blur_frame_counter: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first marker found near its expected corners (4, 2) px; empty if none is found.
+    """Find blurred markers near their expected corners (4, 2) px. Return the first one that is
+    found; empty if there is none.
 
-    `initial_blur_frame_counter` is a counter that the caller increases with each frame, so that the
-    fits start with little blur (even) and much blur (odd) in turn, which saves time; None tries
-    both in this frame."""
+    The caller increments `initial_blur_frame_counter` with each frame. To save time, the fits start
+    with a small blur if it is even and with a large blur if it is odd; None tries both in this
+    frame."""
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _START_BLURS_PX
@@ -91,9 +92,9 @@ def find_expected_blurred(
 
 
 def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker in the first of the image's quadrilaterals that the photometric fit
-    confirms, tried in the order of the correlation of their cells with a marker's; empty if none is
-    confirmed."""
+    """Find a blurred marker anywhere in the image. The photometric fit is tried on the
+    quadrilaterals whose cells correlate best with a marker's; the first one that it confirms is
+    returned. Empty if there is none."""
     image, setup = detector_input.image, detector_input.setup
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -107,8 +108,8 @@ def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorne
 def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, MarkerPattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return the quadrilaterals (m, 4, 2) whose cells resemble a marker's, best first, without
-    duplicates. Their corners are rolled to the marker's orientation."""
+    """Return the quadrilaterals among `quads` (m, 4, 2) whose cells resemble a marker's, best first
+    and without duplicates. The order of their corners is that of the marker."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -135,7 +136,7 @@ def _rank_quads(
 def _align_by_correlation(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array:
-    """Return the corners (4, 2) px shifted, all by the same vector, to where the marker's ideal
+    """Return the corners (4, 2) px, translated to the position at which the marker's ideal
     black-and-white pattern (its drawing) correlates best with the image."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
@@ -214,11 +215,11 @@ def align_marker(
     """Fit a marker's drawing to the image and return its corners; None unless the image matches
     the drawing.
 
-    The fit starts at `start_corners_px` (4, 2) with a first guess of the blur, `blur_px`.
-    `max_motion_from_start_sides` is the largest distance of the fitted corners from those, and
-    `max_corner_sigma_sides` their largest standard deviation, both in side lengths. If
-    `must_exclude_other_codewords`, the image must also exclude every other codeword
-    (`excludes_other_codewords`); this is not necessary if the other marker identifies this one.
+    The fit starts at `start_corners_px` (4, 2) with the initial blur `blur_px` (standard
+    deviation). Both limits are in side lengths: `max_motion_from_start_sides` for the distance of
+    the fitted corners from the start, and `max_corner_sigma_sides` for their standard deviation.
+    `must_exclude_other_codewords` requires that the image excludes every other codeword
+    (`excludes_other_codewords`); set it to False if the other marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
@@ -262,10 +263,10 @@ def align_marker(
 def is_alignment_confirmed(
     alignment: DrawingAlignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
 ) -> bool:
-    """True if the image matches the fitted drawing and determines its corners well enough.
+    """True if the image matches the fitted drawing and determines the corners accurately enough.
 
-    Where there is no marker, the correlation of the inner pattern stays below 0.72 if its contrast
-    is plausible; on a marker, it is above 0.95.
+    Without a marker, the correlation of the inner pattern stays below 0.72 at a plausible contrast;
+    with a marker, it is above 0.95.
     """
     return (
         alignment.pattern_correlation > _MIN_INNER_CORRELATION
@@ -277,9 +278,9 @@ def is_alignment_confirmed(
 
 
 def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
-    """True if flipping any single bit of the codeword would fit the image clearly worse. In tests
-    with markers of other codewords, `is_alignment_confirmed` accepted 36 by mistake; each of them
-    had a `bit_flip_fraction` above 0.5."""
+    """True if flipping any single bit of the codeword would fit the image clearly worse. In tests,
+    `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; each of these had a
+    `bit_flip_fraction` above 0.5."""
     return (
         alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
         and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA

@@ -144,17 +144,17 @@ CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6  # derived from the other marker, not me
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """Refined corners of a marker, with their uncertainty as in `Detection`.
+    """A marker's refined corners and their uncertainty (see `Detection`).
 
     Attributes:
         corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
-        are_corners_fitted: True if the corners follow from a fit of lines or of the drawing; False
-            if each was located by itself (by OpenCV, or from the other marker), which is less
-            accurate.
+        are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
+            they come from OpenCV or from the other marker, which is less accurate.
         corrected_edge_shift: how far white has grown over black at all edges of the image
-            (blooming, gamma), measured on this frame's markers or known before; the corners are
-            corrected for it. None: unknown, and not corrected.
-        remaining_edge_shift_sigma_px: standard deviation of that growth after the correction.
+            (blooming, gamma), measured on this frame's markers or in an earlier frame. The corners
+            are corrected for it. None: unknown, not corrected.
+        remaining_edge_shift_sigma_px: standard deviation of the remaining growth after the
+            correction.
         blur_px, sharpest_side_blur_px: largest and smallest blur of a side.
     """
 
@@ -172,8 +172,8 @@ class RefinedCorners:
 def refine_subpix(
     image: NDArray[np.uint8], raw_corners_px: Array, cells_per_side: int
 ) -> RefinedCorners:
-    """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep the raw corners if one leaves its
-    window.
+    """Refine corners (4, 2) px with `cv2.cornerSubPix`. If any corner leaves its window, return the
+    raw corners.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
     extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,

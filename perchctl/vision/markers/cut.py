@@ -93,8 +93,8 @@ def is_target_truncated(
     shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if each expected marker (4, 2) px may be cut by the image's edge or hidden by the
-    vehicle's gear."""
+    """True if every expected marker, with corners (4, 2) px, may be truncated by the image border
+    or hidden by the vehicle's gear."""
     whole = [
         corners
         for corners in expected_corners_px.values()
@@ -106,7 +106,8 @@ def is_target_truncated(
 def can_complete_marker_be_in_view(
     expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
 ) -> bool:
-    """True if at least one expected marker (4, 2) px may be completely in the image."""
+    """True if at least one expected marker, with corners (4, 2) px, may be completely in the
+    image."""
     return any(
         is_inside_image(corners, shape, -_MAX_CORNER_TO_IMAGE_EDGE_PX)
         for corners in expected_corners_px.values()
@@ -116,8 +117,9 @@ def can_complete_marker_be_in_view(
 def fit_truncated_markers(
     detector_input: DetectorInput, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the target's visible part and return one marker's corners from the fit; empty if it
-    fails. `expected_corners_px` are the predicted corners (4, 2) px."""
+    """Fit the pose of the target to its visible part and return one marker's corners, projected
+    from that pose; empty if the fit fails. `expected_corners_px` are the predicted corners (4, 2)
+    px."""
     image, camera, patterns = (
         detector_input.image,
         detector_input.camera,
@@ -163,9 +165,8 @@ def fit_truncated_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """True if the visible part of the target suffices for a measurement, when the large marker has
-    the rotation `R_cam_marker` (3, 3) and its centre is at `t_cam_marker_m` (3,) in the camera
-    frame."""
+    """True if the visible part of the target is large enough for a measurement. The pose of the
+    large marker in the camera frame is given by `R_cam_marker` (3, 3) and `t_cam_marker_m` (3,)."""
     patterns = _make_patterns(target)
     pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
@@ -194,7 +195,8 @@ def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> Target
 
 
 def _select_measured_marker(pose_fit: PoseFit) -> MarkerName:
-    """Return the marker that was measured: the small one if enough of it was visible."""
+    """Return the marker to report: the small one if enough of its edge points were found, otherwise
+    the large one."""
     return "small" if pose_fit.small_marker_point_count >= _MIN_SMALL_MARKER_POINTS else "large"
 
 
@@ -223,9 +225,9 @@ def _initial_pose(
 def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
-    """Return the pose near `start`, shifted across the image and along the line of sight, at
-    which the rendered drawing correlates best with the coarse image; None if it correlates well
-    nowhere."""
+    """Search poses that are shifted from `start` across the image and along the line of sight.
+    Return the one at which the rendered drawing correlates best with the coarse image; None if the
+    correlation is low everywhere."""
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
     for growth in _RANGE_SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
@@ -251,7 +253,7 @@ def _search_near_pose(
 
 
 def _is_reliable(pose_fit: PoseFit) -> bool:
-    """True if nearly all edges were found and determine the position."""
+    """True if most of the visible edge points were found and if they determine the position."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
@@ -266,8 +268,7 @@ def _project_marker_corners(
     pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
     """Return the corners (4, 2) px of the marker whose side is `side_to_large_side_ratio` times the
-    large marker's; None if a corner is so far from the optical axis that the lens model is not
-    valid there."""
+    large marker's; None if a corner is too far from the optical axis for the lens model."""
     r = (
         np.column_stack([side_to_large_side_ratio * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
@@ -333,8 +334,8 @@ class CoarseLattice:
 
 @dataclass(frozen=True, eq=False)
 class CoarseUndistortedImage:
-    """A reduced image without lens distortion: grey values (rows, columns) at the nodes of a
-    lattice. `is_visible` is True for nodes in the image that the vehicle does not cover."""
+    """A downsampled, undistorted image: grey values (rows, columns) at the nodes of a lattice.
+    `is_visible` is True for nodes inside the image that the vehicle does not cover."""
 
     lattice: CoarseLattice
     grey: FloatImage
@@ -343,7 +344,7 @@ class CoarseUndistortedImage:
 
 @lru_cache(maxsize=8)
 def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
-    """Return the lattice over a camera's image."""
+    """Return the lattice that covers the camera's field of view."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _POINTS_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -384,8 +385,8 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
 def make_coarse_image(
     image: NDArray[np.uint8], camera: CameraModel, hidden_mask_u8: NDArray[np.uint8] | None = None
 ) -> CoarseUndistortedImage:
-    """Return the image without lens distortion, reduced to the nodes of the camera's lattice.
-    Nodes where `hidden_mask_u8` (h, w) is not zero are marked as not visible."""
+    """Return the image undistorted and downsampled to the nodes of the camera's lattice. Nodes at
+    which `hidden_mask_u8` (h, w) is not zero are marked as not visible."""
     lattice = make_coarse_lattice(camera)
     seen = lattice.is_in_image
     if hidden_mask_u8 is not None:
@@ -452,8 +453,8 @@ class DrawingMatch(NamedTuple):
 def correlate_drawing(
     H: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
-    """Compare the coarse image with the drawing projected by H (3, 3), under the light that fits
-    best."""
+    """Compare the coarse image with the drawing projected by H (3, 3). Contrast and offset are
+    those that fit best."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -506,8 +507,8 @@ class TargetOutline:
 
 
 class DrawingTexture(NamedTuple):
-    """An image of the target and its white paper: `whiteness` (m, m), 0 to 1, and the homography
-    (3, 3) from the drawing's coordinates to its pixels."""
+    """The target and its white paper as a texture: `whiteness` (m, m), 0 to 1, and the homography
+    (3, 3) from the drawing's coordinates to the texture's pixels."""
 
     whiteness: FloatImage
     H_pixels_drawing: Array
@@ -609,12 +610,12 @@ def _iterate_cell_edges(
 # pixels.
 _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
-# below the first, no further round; above the second, the fit has failed
+# a step below the first limit ends the fit; a last step above the second one is a failure
 _CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
 _MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35  # grey levels; share of the median
 _MIN_EDGE_POINTS = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
-_ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
+_ROBUST_VARIANCE_FACTOR = 1.3  # compensates for the smaller squared residuals under robust weights
 _LINE_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
 _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
@@ -712,7 +713,8 @@ def fit_pose(
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
-    """Fit the pose in which the drawing's edges match the image's; None if the fit fails."""
+    """Fit the pose at which the projected edges of the drawing match the edges in the image; None
+    if the fit fails."""
     pose, pose_and_shift_change_from_start, fit_step, moved_px = start, np.zeros(7), None, math.inf
     for profile_reach_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
         edge_points = _edge_points_in_view(
@@ -753,8 +755,8 @@ def fit_pose(
 def predict_fit_accuracy(
     pose: RigidPose, outline: TargetOutline, camera: CameraModel
 ) -> PoseFit | None:
-    """Return the result that `fit_pose` would have for a perfect image taken at that pose; None
-    if too little of the target is visible."""
+    """Return the covariance and point counts that `fit_pose` would report for an ideal image taken
+    from `pose`; None if too little of the target is visible."""
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )
@@ -854,9 +856,9 @@ def _solve_gauss_newton_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one robust Gauss-Newton step of the seven unknowns of `_GaussNewtonStep`; None if too
-    few edges count. `edge_offset_px` (n,) is the result of `_measure_offsets`. The prior pulls
-    `pose_and_shift_change_from_start` (7,), the sum of the previous steps, back to zero."""
+    """Return one robust Gauss-Newton step; None if too few edges were found. `edge_offset_px` (n,)
+    is the result of `_measure_offsets`. A prior pulls `pose_and_shift_change_from_start` (7,), the
+    sum of the previous steps, towards zero."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

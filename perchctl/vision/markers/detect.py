@@ -3,7 +3,7 @@
 `CORNER_METHODS` lists the methods that find corners in the order in which they are tried, with the
 requirements, cost and use of each; ``docs/corners.md`` shows examples of all.
 
-    frame -> Prior -> CORNER_METHODS, one by one -> CornerFindings -> Detections
+    frame -> DetectionPrior -> CORNER_METHODS, one by one -> CornerResults -> Detections
              (expected corners, kinds of search)
 
 Corners are (4, 2) px, top left, top right, bottom right, bottom left as printed; (0, 0) is the
@@ -74,7 +74,7 @@ from perchctl.vision.types import (
 )
 
 _MIN_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
-# images for which a measured shift of all edges is valid, since light changes slowly
+# number of frames for which a measured edge shift stays valid, since the light changes slowly
 _MAX_EDGE_SHIFT_AGE_FRAMES = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
 
@@ -84,7 +84,7 @@ _FoundCorners = dict[MarkerName, RefinedCorners]
 
 @dataclass(frozen=True, eq=False)
 class DetectionPrior:
-    """Knowledge about the target before a frame is examined.
+    """What is known about the target before a frame is searched.
 
     Attributes:
         expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
@@ -92,17 +92,17 @@ class DetectionPrior:
         expected_corners_both_markers_px: the same, with a missing marker derived from the other
             one.
         search_mode: the kinds of search for this frame.
-        initial_blur_frame_counter: counter that alternates the blur with which blurred fits start
-            (see `find_expected_blurred`).
+        initial_blur_frame_counter: frame counter; its parity selects a small or a large initial
+            blur for the fits to blurred markers (see `find_expected_blurred`).
         was_target_seen_recently: a marker was found at most `MAX_TRUNCATED_FIT_AGE_S` before this
             frame; always False if edge fits are disabled.
-        was_target_truncated: `was_target_seen_recently` is True, and no marker can have been
-            completely in that image.
-        previous_edge_shift: how far white has grown over black, measured in one of the last frames;
-            None: measure it in this one.
-        measure_own_target_distance_m: function that returns a marker's distance, m, from where this
-            vehicle's own target is believed to be; it chooses one of several targets if none is
-            expected. None: choose by the image alone.
+        was_target_truncated: `was_target_seen_recently` is True, and every marker was truncated or
+            hidden in the last image with a detection.
+        previous_edge_shift: how far white has grown over black (blooming), measured in a recent
+            frame; None: measure it in this frame.
+        measure_own_target_distance_m: function that returns a marker's horizontal distance, m, from
+            the expected position of this vehicle's own target. It selects one of several targets if
+            no position is expected. None: select by the image alone.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
@@ -117,8 +117,8 @@ class DetectionPrior:
 
 @dataclass(frozen=True, eq=False)
 class CornerResults:
-    """Results of the methods tried so far: the markers' `corners`, and the raw markers that the
-    last search found, `search_result`."""
+    """Results of the corner methods tried so far: the markers' refined `corners`, and the raw
+    corners from the last search, `search_result`."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
     search_result: FoundMarkers = field(default_factory=FoundMarkers)
@@ -129,10 +129,10 @@ class CornerMethod:
     """One method to find corners: a row of `CORNER_METHODS`.
 
     Attributes:
-        name: its heading in ``docs/corners.md``.
-        requirements: its requirements.
+        name: heading in ``docs/corners.md``.
+        requirements: what the method needs, in words.
         cost_text: typical time for an image of 640x480 on one core.
-        condition: `should_run` in words.
+        condition: when the method runs, in words (`should_run`).
         should_run: function that returns True if the method should be tried on the image, given
             the prior and the findings so far.
         find: function that returns the findings that replace the previous ones.
@@ -178,8 +178,7 @@ def _has_edge_fit_found_nothing(
 def _search_half_size(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    # If no side was earlier_results, a close target has usually moved further than a profile
-    # reaches.
+    # If no side was found, a close target has usually moved further than a profile reaches.
     searched = search_half_size(detector_input, prior.expected_corners_both_markers_px)
     if searched is None:
         return earlier_results
@@ -413,7 +412,7 @@ def make_detection_prior(
     frames_without_markers: int | None = None,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> DetectionPrior:
-    """Return the knowledge before the frame; arguments as in `detect_markers`."""
+    """Return what is known before the frame; arguments as in `detect_markers`."""
     expected_corners_px = (
         dict(expected_corners_px)
         if expected_corners_px
@@ -509,9 +508,10 @@ def _is_marker_missing(
 
 
 def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
-    """Measure the raw corners of a search: by the edge fit, otherwise by subpixel refinement.
-    Markers that are not completely in view are measured by the partial-view fit because a search
-    takes the image's edge for a side. The photometric fit follows where edges do not suffice."""
+    """Refine the raw corners from a search by the edge fit, or else by subpixel refinement. The
+    partial-view fit measures markers that are truncated or hidden, because a search mistakes the
+    image border for a side of the marker. The photometric fit follows if the edges are not accurate
+    enough."""
     image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
@@ -578,12 +578,12 @@ def _make_detection(
 
 
 _WEIGHTS_OF_MEAN_OF_FOUR: Array = np.full(4, 0.25)
-_MAX_FLOW_AGE_S = 0.25  # older motion does not predict positions
+_MAX_FLOW_AGE_S = 0.25  # older image motion does not predict positions
 
 
 def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return the corners (4, 2) px in `previous`, extrapolated to `t_s` by their flow; may be
-    empty."""
+    """Return each marker's corners (4, 2) px, extrapolated from `previous` to `t_s` by their image
+    velocity; empty if no velocity is known."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -614,7 +614,7 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
 
 
 _MIN_ACCURATE_LINE_FIT_CELL_PX = (
-    6.0  # from this size on, lines are as accurate as the drawing, and faster
+    6.0  # with larger cells, a line fit is as accurate as a photometric fit, and faster
 )
 # the same limit as a ratio of a cell's width to the blur's standard deviation
 _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
@@ -687,8 +687,9 @@ def refine_photometrically(
 
 
 def _blur_px(corners: RefinedCorners | None) -> float:
-    """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
-    fitted to them, otherwise `_DEFAULT_BLUR_PX`, which is also the largest guess."""
+    """Return the initial blur, px (standard deviation), for a photometric fit: the blur of the
+    sides if lines were fitted to them, otherwise `_DEFAULT_BLUR_PX`, which is also the upper
+    limit."""
     if corners is None or not corners.are_corners_fitted or corners.blur_px <= 0.0:
         return _DEFAULT_BLUR_PX
     return min(
@@ -702,7 +703,7 @@ def _initial_corners_px(
     this, other = found_corners.get(name), found_corners.get(_OTHER_MARKER[name])
     if this is not None:
         if this.cov_px2 is not None:
-            return None  # an obstacle in front of the marker would spoil the drawing, too
+            return None  # an obstacle in front of the marker would also disturb the photometric fit
         # Small cells matter only if no larger ones were measured.
         enough = is_line_fit_sufficient(this, detector_input.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
@@ -725,7 +726,7 @@ def fit_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Fit the four sides of each marker, starting at `start_corners_px` (4, 2), and return the
-    markers with four straight sides. The cells are not examined.
+    markers with four straight sides. This function does not check the cells.
 
     All markers are fitted together, because blooming and gamma move all edges of an image by the
     same number of pixels. `known_edge_shift` is how far white has grown over black, if measured
@@ -750,12 +751,12 @@ def refine_expected_markers(
     expected_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the expected markers, corners (4, 2) px, whose sides and cells the image confirms,
-    measured by edge fits.
+    """Measure the expected markers, with corners (4, 2) px, by edge fits. Return those whose sides
+    and cells the image confirms.
 
-    Omitted are markers displaced by more than the window around a side reaches on the profiles, the
-    scan lines across it (0.85 cells, at most 7 px), cut or hidden markers, and markers with cells
-    below 2.5 px. `known_edge_shift` is how far white has grown over black; None measures it.
+    A marker is omitted if it is more than 0.85 cells (at most 7 px) from its expected position, if
+    it is truncated or hidden, or if its cells are smaller than 2.5 px. `known_edge_shift` is how
+    far white has grown over black; None measures it.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     start_corners_px = {
@@ -780,8 +781,8 @@ def add_partly_visible_markers(
     found_corners: _FoundCorners,
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the markers in `found_corners`, plus the expected markers of which a visible part
-    could be fitted.
+    """Return the markers in `found_corners`, plus each expected marker that could be fitted to its
+    visible part.
 
     If the small marker was found, the large one is expected around it. `known_edge_shift` is how
     far white has grown over black at all edges; None measures it.
@@ -799,8 +800,8 @@ def add_partly_visible_markers(
             if partly is not None:
                 found_corners[name] = partly
     if "large" in found_corners and "small" not in found_corners:
-        # Too small for lines, but its position follows from the large marker: a similar pattern is
-        # enough.
+        # The small marker is too small for a line fit, but its position follows from the large
+        # marker, so an approximate match is enough.
         small_px = detector_input.derive_corners_from_other_marker_px(
             found_corners["large"].corners_px, "small"
         )
@@ -829,7 +830,8 @@ def find_large_marker_around_small(
         return off_px <= max(_MAX_CENTRE_OFFSET_SIDES * mean_side_px(small.corners_px), 1.0)
 
     if is_inside_image(start, image.shape, IMAGE_MARGIN_PX):
-        # A small marker yields a rough position only, so the fit is repeated from the first result.
+        # The small marker only gives an approximate position, so the fit is repeated from its first
+        # result.
         found = fit_lines(detector_input, {"large": start}).get("large")
         if found is not None:
             found = fit_lines(detector_input, {"large": found.corners_px}).get("large")
@@ -849,8 +851,8 @@ _MAX_FIELD_MOTION_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def average_fields(first: Detections, second: Detections) -> Detections:
-    """Return the mean of both fields' corners, valid for either order of the fields. If one marker
-    is in both fields, a marker in only one field is omitted."""
+    """Return the mean corners of the two fields, which do not depend on the field order. If any
+    marker was detected in both fields, markers detected in only one field are omitted."""
     averaged: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)

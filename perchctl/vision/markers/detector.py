@@ -46,7 +46,7 @@ _LOOSE_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """Constants of `detect_markers`, made by `make_detector_setup`.
+    """Parameters of `detect_markers`, created by `make_detector_setup`.
 
     Attributes:
         large_and_small_aruco_dictionaries: OpenCV's dictionaries, with one marker each.
@@ -143,8 +143,8 @@ def _make_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:
 
 
 # --- The vehicle's own gear in the image ---
-# The gear hides the target. Its pixels are filled from their surroundings, so that no threshold
-# connects the gear to a marker's border; no side or cell is measured there.
+# The gear hides parts of the target. Its pixels are filled from their surroundings so that
+# thresholding does not connect the gear to a marker's border. No side or cell is measured there.
 
 
 HiddenMask = NDArray[np.bool_]
@@ -158,8 +158,8 @@ _MEAN_GREY_FILL_WEIGHT = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
-    """Return the mask of the vehicle in a frame, True where it covers the view, (h, w):
-    `static_hidden_mask`, widened for a single field because the missing rows are interpolated."""
+    """Return the mask (h, w) of the pixels that the vehicle hides in this frame. For a single
+    field, `static_hidden_mask` is widened by the rows that are interpolated from hidden ones."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
@@ -169,7 +169,8 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
 
 
 def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDArray[np.uint8]:
-    """Return the image with its hidden pixels filled smoothly from their surroundings."""
+    """Return the image with its hidden pixels filled by a smooth interpolation of their
+    surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
     size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
@@ -191,8 +192,8 @@ def is_any_part_hidden(
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if the vehicle hides any pixel of the square that extends `reach_half_sides` (in half
-    sides of the marker) from the marker's centre. `hidden_mask` is True where it does."""
+    """True if the vehicle hides any pixel near the marker: within the square that extends
+    `reach_half_sides` half sides from its centre. `hidden_mask` is True for hidden pixels."""
     if hidden_mask is None:
         return False
     h, w = hidden_mask.shape
@@ -212,8 +213,8 @@ def is_any_part_hidden(
 
 @dataclass(frozen=True, eq=False)
 class DetectorInput:
-    """An image with the setup and camera for measuring markers in it. `hidden_mask` (h, w) is True
-    where the vehicle covers the view."""
+    """An image in which markers are to be measured, with the detector setup and the camera.
+    `hidden_mask` (h, w) is True for pixels that the vehicle hides."""
 
     image: NDArray[np.uint8]
     hidden_mask: HiddenMask | None

@@ -81,9 +81,9 @@ _ROTATE_90_LEFT = np.array(-1j)
 
 
 def profile_positions(lengths_px: Array) -> Array:
-    """Return where the profiles, short scan lines across the edge, cross each side: shares (rows,
-    n) of the side, for sides of `lengths_px` (rows,). They keep away from the corners, where the
-    next side blurs the edge."""
+    """Return the positions (rows, n), as fractions of each side, at which profiles (short scan
+    lines across the edge) cross the sides with lengths `lengths_px` (rows,). The profiles keep a
+    margin from the corners, where the next side blurs the edge."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + SIDE_POSITIONS))
 
@@ -94,9 +94,9 @@ def make_side_profiles(
     positions_along_side: Array,
     camera: CameraModel,
 ) -> tuple[Array, Array]:
-    """Return the points where profiles cross the sides, px, and the unit normals there, to the left
-    of the direction from start to end in the image (outwards for a marker with clockwise
-    corners): each (rows, n, 2).
+    """Return the points, px, at which the profiles cross the sides, and the unit normals at these
+    points; both (rows, n, 2). The normals point to the left when going from start to end in the
+    image, which is outwards for a marker with clockwise corners.
 
     `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the normalised ends of the sides;
     `positions_along_side` (rows, n) come from `profile_positions`. The image of a side through the
@@ -119,12 +119,12 @@ def sample_profiles(
     image: NDArray[np.uint8], origin: Array, normal: Array, profile_half_length_px: Array
 ) -> Floats:
     """Return the grey values along the profiles, (rows, n, steps + 1), from -profile_half_length_px
-    to +profile_half_length_px (rows,) about `origin` along `normal`: bilinear, with the image's
-    border pixels repeated outside.
+    to +profile_half_length_px (rows,) about `origin` along `normal`: interpolated bilinearly.
+    Outside the image, the border pixels are repeated.
 
-    The image is converted to float, on which OpenCV 5 interpolates at the exact position. Other
-    releases, on 8-bit images, round it to 1/32 px, which is as large as the standard deviation
-    that the edge positions should have.
+    The image is converted to float because OpenCV 5 interpolates float images at the exact
+    position. For 8-bit images, OpenCV rounds positions to 1/32 px, which would be as large as the
+    intended standard deviation of the edges.
     """
     h, w = image.shape
     reach = float(profile_half_length_px.max()) + 2.0
@@ -158,25 +158,23 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
-# compensates the reduction of squared residuals and samples by the weights
+# compensates for the smaller squared residuals and number of samples under robust weights
 _ROBUST_LINE_VARIANCE_FACTOR = 1.7
-# bend of an edge by the next one, a cell away, in units of blur
+# error of an edge due to a neighbouring edge one cell away, in units of blur
 _NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
 _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = (
     0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
 )
 CLIPPED_CORNER_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
 MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
-# profiles cut off a wide edge that is not central
+# a wide edge that is off centre extends beyond its profile
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
-# of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
+# of 7 px: an edge 6 px off the centre extended beyond the profile and moved by up to 0.3 px
 _MAX_EDGE_OFFSET_PX = 4.0
 _MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = (
     2.0  # ratio of variances of the sides that shows jittering rows
 )
-_MIN_SIDE_SLANT_VARIANCE = (
-    0.05  # variance of the sides' slants (0 to 1) required to distinguish them
-)
+_MIN_SIDE_SLANT_VARIANCE = 0.05  # of the sides' orientations (0 to 1), to separate them
 _MIN_FLANK_CONTRAST_GREY = 6.0  # grey levels between the flanks
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
@@ -200,12 +198,12 @@ def refine_corners_by_lines(
     camera: CameraModel,
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers with corners (m, 4, 2) px, and intersect them; None for
-    each marker whose four sides were not found.
+    """Fit lines to the sides of m markers with corners (m, 4, 2) px and intersect them to get
+    refined corners. The entry of a marker is None if not all four sides were found.
 
-    `border_cells` are the cells inside each marker's border. The shift of all edges is measured
-    unless `known_edge_shift` is given. A marker with wide edges, or with edges near the ends of the
-    profiles, is fitted again with the profiles centred on its edges.
+    `border_cells` are the cells inside each marker's border. The common shift of all edges is
+    measured unless the caller passes `known_edge_shift`. If a marker's edges are wide or near the
+    ends of the profiles, the fit is repeated with the profiles centred on the edges.
     """
     found = _refine_lines_once(image, raw_corners_px, border_cells, camera, known_edge_shift)
     centred = raw_corners_px.copy()
@@ -341,8 +339,8 @@ def _intersect_adjacent_sides(line_coefficients: Array) -> Array:
 
 
 def edge_shift_prior_sigma_px(white_grey: float) -> float:
-    """Return the standard deviation, px, to assume for how far white has grown over black while it
-    is not measured: larger if the white paper's grey level is so high that white is clipped."""
+    """Return the prior standard deviation, px, of the growth of white over black before it is
+    measured. It is larger if the grey level of the white paper, `white_grey`, is clipped."""
     return (
         _CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX
         if white_grey > CLIPPED_GREY
@@ -358,8 +356,9 @@ def _measure_edge_shift(
     rms_residual_px: Array,
     corners_normalised: Array,
 ) -> EdgeShift | None:
-    """Measure how far white has grown over black, px, from the width of a border whose outer edge
-    has the `corners_normalised` (m, 4, 2); None if no inner edge was sampled.
+    """Measure how far white has grown over black, px, from the width of a marker's black border.
+    `corners_normalised` (m, 4, 2) are the measured corners of the outer edges. None if no inner
+    edge was sampled.
 
     A growth by d moves the border's outer edge in, and its inner edge out, by d. In the marker's
     own scale, whose unit is the outer edge as measured, an inner edge at r then appears at r + d (1
@@ -420,8 +419,8 @@ def _measure_edge_shift(
 def _side_bow_px(
     markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, rms_residual_px: Array
 ) -> float:
-    """Return the bow of the widest marker's sides, px: how far their ends are further out than
-    their middles. 0 if noise may explain it."""
+    """Return the bow of the widest marker's sides, px: by how much their ends are further out than
+    their middles. 0 if it is not significant."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_coefficients[four, :2, None])[..., 0]
@@ -489,8 +488,9 @@ def _corner_sigma_px(
 def _row_jitter_sigma_px(
     side_normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
 ) -> float:
-    """Return the standard deviation, px, of corners due to the jitter of rows in analogue video; 0
-    if it is not significant. Jitter moves upright sides only.
+    """Return the standard deviation of the corners, px, due to row jitter in analogue video; 0 if
+    it is not significant. Jitter only moves vertical sides, so they scatter more than horizontal
+    ones.
 
     `side_normals_x` are the x components of the four sides' unit normals, and
     `line_end_variances_px2` the variances of the ends of the lines fitted to them."""
@@ -668,8 +668,8 @@ def find_neighbour_edges(
     inner_border_cells: BorderCells,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Return which parallel edges, one cell further in or out, blur into the edges measured at
-    `positions_along_side` (rows, n), in shares of a side.
+    """Return which parallel edges, one cell further in or out, blur into the measured edges.
+    `positions_along_side` (rows, n) are fractions of a side.
 
     The rows are the four outer edges of each marker in `border_cells`, then, if there are four
     more, the inner edges of the border of the marker with `inner_border_cells`.
@@ -722,10 +722,12 @@ _TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
 _SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
 _MIN_FRACTION_OF_MEAN_GRADIENT = (
-    0.3  # share of the row's mean gradient that a profile requires to count
+    0.3  # a profile is usable if its gradient is at least this share of the row's mean
 )
-_MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # for a scatter that counts as noise
-_MAX_WIDE_WINDOW_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
+_MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # minimum cutoff, so that ordinary noise is not rejected
+_MAX_WIDE_WINDOW_ERROR_PX = (
+    0.2  # if the wide window is off by less than this, one narrow iteration is enough
+)
 _MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
 _OUT_OF_RANGE = 1e6
@@ -745,7 +747,7 @@ _MEDIAN_NEUTRAL_FILL: Floats = np.where(
 
 @dataclass(frozen=True, eq=False)
 class NeighbourEdges:
-    """The neighbouring edges that blur into a measured edge.
+    """Neighbouring edges that blur into a measured edge.
 
     Attributes:
         neighbour_distance_px: distance to a neighbouring edge, the size of a cell across the edge,
@@ -767,9 +769,9 @@ def locate_edges(
     window_half_length_px: Array,
     neighbours: NeighbourEdges,
 ) -> tuple[Array, Array, Array]:
-    """Locate the dark-to-bright edge on each profile. Return its offset from the middle of the
-    profile, px (rows, n), its weight, 0 for outliers (rows, n), and the blur of each row, standard
-    deviation in px (rows,).
+    """Locate the dark-to-bright edge on each profile. Return each edge's offset from the middle of
+    the profile, px (rows, n); its weight, 0 for outliers (rows, n); and the blur of each row, px
+    (standard deviation, (rows,)).
 
     Args:
         profile_greys: (rows, n, steps + 1), the profile from -half_px to +half_px.
@@ -801,7 +803,7 @@ def locate_edges(
 
 
 class _EdgeProfiles:
-    """The gradients along all profiles, and the values that every window over them needs."""
+    """The grey gradients along all profiles, and precomputed values for locating edges in them."""
 
     def __init__(
         self,
@@ -831,8 +833,8 @@ class _EdgeProfiles:
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Locate the edge on each profile with a wide window around the profile's middle. Return
-        its offsets, px (rows, n), and which profiles are usable."""
+        """Locate the edge on each profile with a wide window around the middle of the profile.
+        Return the edge offsets, px (rows, n), and whether each profile is usable (rows, n)."""
         spread = self.u * (_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -847,8 +849,8 @@ class _EdgeProfiles:
         self, line_offsets_px: Floats, blur_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Locate the edge on each profile again, with a narrow window around the side's line at
-        `line_offsets_px` (rows, n). Return the edge's offsets, px (rows, n), which profiles are
-        usable, and the variance of the blur, px^2 (rows,)."""
+        `line_offsets_px` (rows, n). Return the edge offsets, px (rows, n), whether each profile is
+        usable (rows, n), and the variance of the blur, px^2 (rows,)."""
         relative = self.u[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
@@ -885,8 +887,9 @@ class _EdgeProfiles:
 
 
 def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bool_]) -> Floats:
-    """Fit a line (rows, n) to each side through the mean of the middle 50 % of the offsets in each
-    half of its profiles, so that up to a quarter of a half may be outliers."""
+    """Fit a line to each side through the midmeans (the means of the middle 50 %) of the offsets in
+    both halves of its profiles. Up to a quarter of the profiles in each half may be outliers.
+    Returns the line's offsets (rows, n)."""
     halves = np.where(is_usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
         -1, 2, 2 * _QUARTER_PROFILES
     )
@@ -903,7 +906,8 @@ def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bo
 def _fit_robust_line(
     edge_offsets_px: Floats, is_usable: NDArray[np.bool_], iterations: int
 ) -> tuple[Floats, Floats]:
-    """Return straight lines (rows, n) fitted with Tukey's weights, and the weights."""
+    """Fit a straight line to each side with Tukey's biweight. Return the line's offsets and the
+    weights, both (rows, n)."""
     line = median_per_row(edge_offsets_px, is_usable)[:, None]
     for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)

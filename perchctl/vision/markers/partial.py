@@ -66,16 +66,18 @@ from perchctl.vision.markers.pattern import (
 )
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side contains no information
+MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side carries no information
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9  # share of the window
-_MAX_CORNER_SIGMA_SIDES = 0.02  # share of the side: less certain corners are no measurement
+_MAX_CORNER_SIGMA_SIDES = (
+    0.02  # share of the side; corners with a larger standard deviation are rejected
+)
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
-_ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
+_ROBUST_VARIANCE_FACTOR = 1.3  # compensates for the smaller squared residuals under robust weights
 _MAX_HOMOGRAPHY_INCREMENT = 0.5
 _MAX_MOTION_FROM_START_PX = (
-    20.0  # from the start, three windows away: edges cannot move a fit further
+    20.0  # three search windows; edges cannot move a fit further from its start
 )
 
 
@@ -86,13 +88,14 @@ def fit_partly_visible_marker(
     identified_by: IdentificationEvidence,
     known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """Fit the whole marker, starting at `start_corners_px` (4, 2), which may be outside the
-    image.
+    """Fit a marker to its visible part, starting at `start_corners_px` (4, 2). Corners may be
+    outside the image.
 
-    `identified_by` tells how the marker is known to be this one: by its own cells alone ("bits"),
-    by the prediction ("track") or by the other marker ("other_marker"); it sets how many visible
-    cells must match. `known_edge_shift` is how far white has grown over black, if measured before.
-    None if the visible part does not determine the corners, or if its cells are not the marker's.
+    `identified_by` is the evidence for the marker's identity: its own cells alone ("bits"), the
+    predicted position ("track") or the other marker ("other_marker"). It determines how many
+    visible cells must match. `known_edge_shift` is how far white has grown over black, if measured
+    before. None if the visible part does not determine the corners, or if its cells are not the
+    marker's.
     """
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
@@ -100,7 +103,7 @@ def fit_partly_visible_marker(
         >= MIN_PARTIAL_CELL_PX
     ):
         return None
-    # Enough cells must be in the image, wherever the fit may end.
+    # Wherever the fit converges, enough cells must be in the image.
     in_picture = _is_point_in_image(
         _project_sample_points_px(start_corners_px, pattern, camera),
         detector_input.image.shape,
@@ -199,8 +202,8 @@ def _make_refined_corners(
     pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the corners of the marker projected by H (3, 3), with their covariance; None if they
-    are too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit, and
+    """Return the marker's corners, projected by H (3, 3), with their covariance; None if they are
+    too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit, and
     `normal_matrix` (9, 9) is that of the last step."""
     w = visible_edges.weight
     mass = w.sum(axis=1)
@@ -266,9 +269,10 @@ def _has_matching_visible_cells(
     pattern: MarkerPattern,
     identified_by: IdentificationEvidence,
 ) -> bool:
-    """True if the visible cells without glare have their colours. With `identified_by` "bits", at
-    most one inner cell may be invisible, with "track" four; with "other_marker", any number, and a
-    fifth of the visible inner cells may have the wrong colour."""
+    """True if the visible cells without glare have the right colours. The number of inner cells
+    that may be invisible depends on `identified_by`: one for "bits", four for "track", any number
+    for "other_marker". For "other_marker", a fifth of the visible inner cells may also have the
+    wrong colour."""
     image, hidden_mask = detector_input.image, detector_input.hidden_mask
     h, w = image.shape
     at = _project_sample_points_px(corners_px, pattern, detector_input.camera)
@@ -310,7 +314,8 @@ def _project_sample_points_px(
     corners_px: Array, pattern: MarkerPattern, camera: CameraModel
 ) -> Array:
     """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted image; NaN
-    outside the lens model. A marker that fills the image is not a quadrilateral in it."""
+    outside the valid range of the lens model. The distortion matters here: a marker that fills the
+    image does not appear as a quadrilateral."""
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points_half_sides), 2), np.nan)
@@ -328,7 +333,7 @@ def _project_sample_points_px(
 def _is_point_in_image(
     points_px: Array, shape: tuple[int, ...], margin_px: float
 ) -> NDArray[np.bool_]:
-    """Return which points (n, 2) are in the image, or at most `margin_px` outside."""
+    """Return for each point (n, 2) whether it is in the image, or at most `margin_px` outside."""
     h, w = shape[:2]
     inside = (points_px >= -margin_px) & (points_px <= (w - 1 + margin_px, h - 1 + margin_px))
     return np.asarray(inside.all(axis=1))
@@ -337,8 +342,8 @@ def _is_point_in_image(
 def _is_cell_known(
     is_sample_visible: NDArray[np.bool_], pattern: MarkerPattern
 ) -> NDArray[np.bool_]:
-    """Return which cells (cells,) show at least half of their sample points; `is_sample_visible`
-    (n,)."""
+    """Return for each cell (cells,) whether at least half of its sample points are visible, given
+    `is_sample_visible` (n,)."""
     is_known: NDArray[np.bool_] = (
         np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
         >= 0.5 * pattern.samples_per_cell
@@ -404,7 +409,7 @@ class VisibleEdges:
 def find_visible_edges(
     detector_input: DetectorInput, H: Array, pattern: MarkerPattern
 ) -> VisibleEdges | None:
-    """Return the edges near the square projected by H (3, 3) to pixels; None if too few are
+    """Measure the edges of the marker that H (3, 3) projects to pixels; None if too few are
     visible."""
     camera, cells, corners = (
         detector_input.camera,
@@ -425,7 +430,7 @@ def find_visible_edges(
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _OUT_OF_RANGE_PX).all():
-        return None  # far outside, a lens model may yield any position, even NaN
+        return None  # far outside the image, a lens model may return any position, even NaN
     # White is outside the marker, and inside its border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
@@ -509,9 +514,9 @@ def _find_clean_profiles(
     window_half_length_px: Array,
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which profiles (rows, n) change from black to white, and the grey level of white
-    paper."""
-    # At half the window from the edge, blur has ended and no neighbour begins.
+    """Return for each profile (rows, n) whether it shows a clean step from black to white, and the
+    grey level of white paper. None if there is no such profile."""
+    # At half a window from the edge, its blur has faded and no neighbouring edge has begun.
     off = max(
         1,
         round(

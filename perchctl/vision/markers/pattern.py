@@ -1,5 +1,5 @@
-"""Appearance of a marker (rim of its border, cells, drawing), and checks of an image for these
-cells at given corners."""
+"""A marker's appearance (border, cells, drawing), and checks whether an image shows these cells at
+given corners."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from perchctl.vision.markers.corners import (
     is_inside_image,
 )
 
-MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a blob
+MIN_MARKER_SIDE_PX = 7.0  # a smaller marker looks like a blob
 MIN_CONTRAST_GREY = 10.0  # grey levels
 MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = (
-    0.1  # margin of a cell to the threshold, as a share of the contrast
+    0.1  # difference between a cell and the threshold, as a share of the contrast
 )
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
@@ -32,14 +32,15 @@ _SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], 
 
 @dataclass(frozen=True, eq=False)
 class BorderCells:
-    """The cells just inside a marker's border, along its four sides in the order of the corners.
+    """The row of cells just inside a marker's black border, along each of its four sides. Side k
+    runs from corner k to corner k + 1.
 
     Attributes:
-        is_cell_inside_border_white: 1 for a white cell, 0 for a black one, a factor in sums, (4,
-            n); the first and last ones belong to the border.
+        is_cell_inside_border_white: 1 for a white cell, 0 for a black one, as factors in sums, (4,
+            n). The first and last cells of a side belong to the border.
         are_two_cells_inside_border_white: 1 if this cell and the next one further in are white, (4,
             n).
-        print_tolerance_cells: standard deviation of the position of a printed edge.
+        print_tolerance_cells: standard deviation of a printed edge's position, in cells.
     """
 
     is_cell_inside_border_white: Array
@@ -80,8 +81,8 @@ class MarkerPattern:
 
 
 def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0) -> BorderCells:
-    """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
-    the border's edges."""
+    """Return the cells inside the border of a marker with inner bits (n, n), 1 = white: the cells
+    whose blur may reach the edges of the border."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -98,8 +99,8 @@ def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.
 
 
 def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> MarkerPattern:
-    """Return the pattern of a marker. It has sample points in all cells that no central marker
-    hides."""
+    """Return a marker's pattern, with sample points in all cells that are not covered by a small
+    marker in the centre."""
     n = len(drawing.cell_whiteness)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -131,7 +132,7 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
 
 
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
-    """True if the image clearly has the pattern's colour in every cell."""
+    """True if every cell in the image clearly has the colour of the pattern."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -151,8 +152,8 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Mar
 def has_mostly_matching_cells(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if the image has the pattern's colour in more than `MIN_MATCHING_CELL_FRACTION` of the
-    cells."""
+    """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells in the image have the colour of
+    the pattern."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -169,8 +170,8 @@ def is_correlated_with_pattern(
 
 
 def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> Array:
-    """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
-    rolled by 0 to 3; 0 without contrast."""
+    """Return the correlation (4,) of the grey values in the cells with the pattern, for the four
+    rotations of the marker (corners (4, 2) rolled by 0 to 3); 0 if there is no contrast."""
     grey = _read_sample_greys(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
@@ -196,7 +197,8 @@ def _cell_means(
 def _read_sample_greys(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array | None:
-    """Return the grey values (k,) at the sample points; None outside the image."""
+    """Return the grey values (k,) at the sample points; None if any of them is outside the
+    image."""
     at = apply_homography(
         homography_from_centred_square(corners_px), pattern.sample_points_half_sides
     )
@@ -208,7 +210,7 @@ def _read_sample_greys(
 
 
 def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Array) -> Array:
-    """Return the whiteness of the drawing at the sample points, with a blur of half a cell."""
+    """Return the whiteness of the drawing at the sample points after a blur of half a cell."""
     n, fine = len(drawing.cell_whiteness), 8
     sharp_nodes = np.kron(
         np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
@@ -230,9 +232,10 @@ BLUR_MARGIN_NODES = 12
 class MarkerDrawing:
     """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
 
-    The target's large marker also has the small marker's cells, `small_cell_whiteness`; the side of
-    the small marker over its own, `small_to_large_side_ratio`; and half the side of the paper in
-    the marker's coordinates, `paper_reach_half_sides` (None: infinite)."""
+    The drawing of the large marker also contains the small marker: its cells,
+    `small_cell_whiteness`; its side over that of the large marker, `small_to_large_side_ratio`; and
+    half the side of the paper in the marker's coordinates, `paper_reach_half_sides` (None:
+    infinite)."""
 
     cell_whiteness: Array
     small_cell_whiteness: Array | None = None
@@ -241,8 +244,8 @@ class MarkerDrawing:
 
     @property
     def photometric_fit_reach_half_sides(self) -> float:
-        """How far the square that the photometric fit compares with the image extends from the
-        marker's centre, in half sides of the marker."""
+        """Half the side of the square that the photometric fit compares with the image, in half
+        sides of the marker."""
         return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
@@ -251,8 +254,8 @@ def make_marker_drawing(
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side_ratio: float = 0.0,
 ) -> MarkerDrawing:
-    """Return a marker's drawing from its inner bits, 1 = white. If a small marker is printed in its
-    centre, `small_marker_bits` and `small_to_large_side_ratio` describe it."""
+    """Return the drawing of a marker with inner bits `bits`, 1 = white. `small_marker_bits` and
+    `small_to_large_side_ratio` describe the small marker in its centre, if any."""
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
         return MarkerDrawing(cells)
@@ -283,7 +286,8 @@ def _cell_coverage(
 
 
 def _add_margin_nodes(node_positions_half_sides: Array, half_node_spacing: float) -> Array:
-    """Return the axis with `BLUR_MARGIN_NODES` additional nodes at both ends."""
+    """Return the node positions along one axis with `BLUR_MARGIN_NODES` additional nodes at both
+    ends."""
     more = 2.0 * half_node_spacing * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
         [
@@ -298,7 +302,7 @@ def _add_margin_nodes(node_positions_half_sides: Array, half_node_spacing: float
 def render_whiteness_and_off_paper_fraction(
     drawing: MarkerDrawing, nodes_per_side: int
 ) -> tuple[NDArray[np.float32], ...]:
-    """Render the drawing at n by n nodes and the margin around them.
+    """Render the drawing at n by n nodes and at a margin of nodes around them.
 
     Returns the whiteness of each node, 0 to 1, as the first array. If the paper ends inside the
     compared square, a second array contains the fraction of each node beyond the paper.
@@ -331,9 +335,9 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 def render_cells(
     drawing: MarkerDrawing, node_positions_half_sides: Array, half_node_spacing: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness of the square grid of nodes with the coordinates
-    `node_positions_half_sides` in both directions, and of `BLUR_MARGIN_NODES` additional nodes on
-    all sides."""
+    """Return the whiteness at the nodes of a square grid with the coordinates
+    `node_positions_half_sides` along both axes, extended by `BLUR_MARGIN_NODES` nodes on all
+    sides."""
     wide = _add_margin_nodes(node_positions_half_sides, half_node_spacing)
     C = _cell_coverage(wide, half_node_spacing, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T

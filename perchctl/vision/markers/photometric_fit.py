@@ -55,7 +55,7 @@ _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 """Number of rounds after which the fit fails unless its correlation reaches
 `_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two rounds."""
-_CONVERGED_STEP_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
+_CONVERGED_STEP_PX = 0.05  # after a step this small, the next one is usually a tenth of it
 _MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
 _MAX_HOMOGRAPHY_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
 # Standard deviations of the shape from its start, in half sides: rotations and scales; the
@@ -97,14 +97,15 @@ class DrawingAlignment:
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
         fit_correlation: correlation of the image with the fitted drawing.
-        pattern_correlation: correlation of the inner bits with what a plain black square of the
-            same size leaves unexplained in the image.
+        pattern_correlation: correlation of the inner bits with the residual that a plain black
+            square of the same size leaves in the image.
         pattern_to_border_contrast: contrast of the inner bits relative to the border's.
         max_cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of the
             fitted drawing, relative to the contrast of black and white.
-        bit_flip_fraction: how far the worst cell has the opposite colour, from 0 (as drawn) to 1
-            (wrong bit).
-        bit_flip_fraction_sigma: standard deviation of that fraction for the least certain cell.
+        bit_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as drawn)
+            to 1 (flipped bit).
+        bit_flip_fraction_sigma: standard deviation of `bit_flip_fraction` for the least certain
+            cell.
         blur_px: standard deviation of the blur.
         motion_from_start_px: largest distance of a corner from its start.
     """
@@ -123,12 +124,12 @@ class DrawingAlignment:
 
 @dataclass(frozen=True, eq=False)
 class _NormalEquations:
-    """One linearised round of the fit.
+    """The normal equations of one Gauss-Newton iteration.
 
     Attributes:
         contrast_grey: grey levels from black to white.
-        grey_residual: the image's grey values minus the drawing's under the light that fits best,
-            (n * n,).
+        grey_residual: grey values of the image minus those of the drawing under the best-fitting
+            illumination, (n * n,).
         J: derivatives of the drawing's grey values with respect to the unknowns (k, n * n).
         noise_variance_grey2: variance of a residual.
         N, g: normal equations N x = g of the next increment, divided by that variance.
@@ -258,8 +259,8 @@ def align_drawing(
 def _linearize_greys(
     grey: Array, rendered_drawing: RenderedDrawing, increment_from_start: Array
 ) -> _NormalEquations | None:
-    """Return the equations of the next increment; None without contrast. `increment_from_start`
-    (8,) is the sum of the increments so far."""
+    """Linearise the fit and return its normal equations; None if there is no contrast.
+    `increment_from_start` (8,) is the sum of the increments so far."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
@@ -288,7 +289,8 @@ def _linearize_greys(
 
 
 def fit_correlation(grey: Array, grey_residual: Array) -> float:
-    """Return the correlation of grey values (k,) with their fit, given the residuals (k,)."""
+    """Return the correlation of grey values (k,) with their fitted values, given the residuals
+    (k,)."""
     spread = grey - grey.mean()
     explained = 1.0 - float((grey_residual**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -304,7 +306,7 @@ def _measure_bit_flip_fraction(
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped one. `nodes_per_independent_sample` is the result of
+    1 for a flipped cell. `nodes_per_independent_sample` is the result of
     `_estimate_nodes_per_independent_sample`."""
     soft, noise, contrast_grey = (
         rendered_drawing.blurred_cell_coverage,
@@ -325,8 +327,8 @@ def _measure_bit_flip_fraction(
 def _measure_inner_pattern_match(
     drawing: RenderedDrawing, grey: Array, contrast_grey: float
 ) -> tuple[float, float]:
-    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,), the contrast
-    relative to `contrast_grey`, that of black and white."""
+    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,). The contrast
+    is relative to `contrast_grey`, the contrast between black and white."""
     rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.illumination_basis[0][GAIN], grey
@@ -341,8 +343,9 @@ def _measure_inner_pattern_match(
 
 
 def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
-    """Return how many neighbouring nodes share one independent residual, from the correlation of
-    `grey_residual` (n, n) between neighbours. The variance of a fit is larger by this factor."""
+    """Return the number of neighbouring nodes per independent residual, estimated from the
+    correlation between neighbours in `grey_residual` (n, n). The variance of a fit is larger by
+    this factor."""
     energy = max(float((grey_residual * grey_residual).mean()), 1e-9)
     factor = 1.0
     for a, b in (
@@ -362,7 +365,8 @@ def _cell_deviation(relative_residual: Array, grid: SamplingGrid, n_cells: int) 
 
 @lru_cache(maxsize=32)
 def _assign_nodes_to_cells(grid: SamplingGrid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Return the cell number of each node, and the number of nodes in each cell."""
+    """Return the index of the cell that contains each node, and the number of nodes in each
+    cell."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
@@ -378,8 +382,8 @@ def _assign_nodes_to_cells(grid: SamplingGrid, n_cells: int) -> tuple[NDArray[np
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
     """Return the derivatives (9, n * n) of the drawing's grey values with respect to the
-    homography's increment (8) and the variance of the blur, under the light whose coefficients
-    `illumination` (7 or 8,) belong to the rows of `illumination_basis`."""
+    homography's increment (8) and the variance of the blur, under the illumination with the
+    coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
@@ -410,8 +414,8 @@ class SamplingGrid:
 
 @lru_cache(maxsize=64)
 def make_sampling_grid(nodes_per_side: int, half_side: float) -> SamplingGrid:
-    """Return the nodes in the middle of n by n equal parts of a square from -half_side to
-    half_side."""
+    """Return a grid over the square from -half_side to half_side, with one node in the middle of
+    each of its n by n equal parts."""
     node_positions_half_sides = half_side * (
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
     )
@@ -421,7 +425,7 @@ def make_sampling_grid(nodes_per_side: int, half_side: float) -> SamplingGrid:
 
 
 def _grid_coordinates(node_positions_half_sides: Array) -> Array:
-    """Return u, v and 1 at the crossings of the grid's lines, (3, n * n)."""
+    """Return the homogeneous coordinates (u, v, 1) of all nodes, (3, n * n)."""
     u, v = np.meshgrid(node_positions_half_sides, node_positions_half_sides)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
@@ -433,7 +437,7 @@ def project_nodes(H: Array, uv1: Array) -> Array:
 
 
 def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
-    """Convert pinhole pixels (2, n) to pixels of the lens."""
+    """Convert pinhole pixels (2, n) to pixels (2, n) of the distorted image."""
     K = camera.K
     rays = np.empty((pinhole_px.shape[1], 2))
     rays[:, 1] = (pinhole_px[1] - K[1, 2]) / K[1, 1]
@@ -442,7 +446,8 @@ def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: SamplingGrid, H: Array, camera: CameraModel) -> Array:
-    """Return the shift of each node by the lens, px (2, n * n), interpolated from a few nodes."""
+    """Return the shift of each node due to lens distortion, px (2, n * n), interpolated from a few
+    nodes."""
     uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H, uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _CHEBYSHEV_NODES, _CHEBYSHEV_NODES)
@@ -465,8 +470,8 @@ def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
 def _extract_patch(
     image: NDArray[np.uint8], grid: SamplingGrid, H: Array, node_lens_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the image that contains all nodes, and its top left pixel (2, 1); None
-    if a node is outside the image."""
+    """Return the part of the image that contains all nodes, and the position (2, 1) of its top-left
+    pixel; None if a node is outside the image."""
     h, w = image.shape
     x, y = project_nodes(H, grid.uv1) + node_lens_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -482,9 +487,9 @@ def _extract_patch(
 def _sample_patch(
     patch: NDArray[np.float32], grid: SamplingGrid, H: Array, lens_shift_from_patch_corner_px: Array
 ) -> Array:
-    """Return the grey values (n * n,) of the patch at the nodes projected by H and moved by
-    `lens_shift_from_patch_corner_px` (2, n * n): the lens's shift of each node minus the patch's
-    top left pixel."""
+    """Return the grey values (n * n,) of the patch at the nodes projected by H and shifted by
+    `lens_shift_from_patch_corner_px` (2, n * n): the lens distortion at each node minus the
+    position of the patch's top-left pixel."""
     at = (project_nodes(H, grid.uv1) + lens_shift_from_patch_corner_px).astype(np.float32)
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -540,10 +545,10 @@ class RenderedDrawing:
 
     @cached_property
     def illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of the drawing's grey values under any light, and the Gram matrix of its rows. The
-        rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast (gain) and
-        its slopes, and the bend of the tone curve; the eighth, the grey beyond the paper, exists
-        only if the paper ends inside the compared square."""
+        """Basis of the drawing's grey values under any illumination, and the Gram matrix of its
+        rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
+        (gain) and its slopes, and the bend of the tone curve; the eighth, the grey beyond the
+        paper, exists only if the paper ends inside the compared square."""
         u, v, one = self.grid.uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -579,8 +584,8 @@ def render_blurred(
     drawing: MarkerDrawing, nodes_per_side: int, blur_table_index: int
 ) -> RenderedDrawing:
     """Return the drawing at n by n nodes over the compared square, blurred by
-    ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes: the blurs form a table, so that results
-    can be cached."""
+    ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes. Only blurs from this table are rendered,
+    so that results can be cached."""
     return RenderedDrawing(
         drawing,
         make_sampling_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),

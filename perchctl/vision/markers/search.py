@@ -55,9 +55,9 @@ ImageWindow = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Raw corners (4, 2) px of at most one large and one small marker; whether a marker was decoded
-    as its mirror image, as by a mirrored camera; and the number of complete targets to choose
-    from."""
+    """Result of a search: the raw corners (4, 2) px of at most one large and one small marker,
+    whether a marker was decoded as its mirror image (the camera image is mirrored), and the number
+    of complete targets in view."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     is_mirrored_marker_seen: bool = False
@@ -70,13 +70,13 @@ def search(
     search_mode: SearchMode = "all",
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers with OpenCV's detector, then the whole image
-    if the window shows too little.
+    """Search the window around the expected markers with OpenCV's detector, then the whole image if
+    markers are missing in the window.
 
     With `search_mode` "near_expected" or "expected_window", only the window is searched (they
     differ in the fits to blurred markers that follow); with "whole_sharp", only the whole image;
-    otherwise both. If several targets are found and none is expected, the one with the smallest
-    `measure_own_target_distance_m`, its distance from this vehicle's own target, is chosen.
+    otherwise both. If several targets are found and none is expected, the search returns the one
+    closest to this vehicle's own target (`measure_own_target_distance_m`).
     """
     setup, shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
@@ -116,7 +116,8 @@ def search_half_size(
     expected_corners_px: Mapping[MarkerName, Array],
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
-    """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
+    """Search the window in an image of half the size, which takes 1 ms; None if this misses a
+    marker that is expected to be completely in view."""
     shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
     if (
@@ -145,9 +146,10 @@ def make_search_window(
     small_to_large_side_ratio: float,
     shape: tuple[int, ...],
 ) -> ImageWindow | None:
-    """Return the part of the image around the expected markers; None if it is nearly the whole
-    image, which is then searched instead. `small_to_large_side_ratio` is the small marker's side
-    over the large one's. The window contains the whole large marker if that may be in the image."""
+    """Return the part of the image to search for the expected markers; None if it is nearly the
+    whole image, which the caller then searches instead. `small_to_large_side_ratio` is the small
+    marker's side over the large one's. The window contains the complete large marker if that may be
+    in the image."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
@@ -212,7 +214,7 @@ def choose_markers(
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
-    A small marker in the centre of a large one, with the right size and rotation, verifies both.
+    A small marker in the centre of a large one with the right size and rotation confirms both.
     Markers at expected positions take precedence over a pair elsewhere; among single markers, the
     closest by `measure_own_target_distance_m` is chosen.
     """
@@ -259,7 +261,8 @@ def _sort_by_own_target_distance(
     """Return the candidates sorted by their distance from this vehicle's own target, without those
     that are too far away to be it.
 
-    A single candidate stays, however far: the pipeline refuses it and says why.
+    A single candidate is kept at any distance: the pipeline rejects it later and reports the
+    reason.
     """
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -274,7 +277,8 @@ def _sort_by_own_target_distance(
 def _pair_markers(
     candidates: Mapping[MarkerName, list[Array]], small_to_large_side_ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of markers that form a target: error and indices, best first."""
+    """Return the pairs of a large and a small marker that form a target, best first: nesting error,
+    index of the large marker, index of the small marker."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
         (relative_nesting_error(a, b, small_to_large_side_ratio), i, j)
@@ -291,9 +295,9 @@ def _pair_markers(
 def relative_nesting_error(
     large_corners_px: Array, small_corners_px: Array, small_to_large_side_ratio: float
 ) -> float:
-    """Return how far the small marker's corners are from where `small_to_large_side_ratio` (side of
-    the small marker over that of the large one) places them inside the large one, divided by the
-    allowed distance: up to 1, the two form a target."""
+    """Return the largest distance of the small marker's corners from their expected positions
+    inside the large one, divided by the allowed distance. The two form a target if the result is at
+    most 1. `small_to_large_side_ratio` is the small marker's side over the large one's."""
     mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
