@@ -19,7 +19,7 @@ def one_thread() -> Iterator[None]:
     process, because OpenCV's setting is global.
 
     Use it for small patches, where waking threads costs more than it saves, and where sums need a
-    fixed order. Searching a whole picture is faster with all threads.
+    fixed order. Searching a whole image is faster with all threads.
     """
     global _users, _threads
     with _LOCK:

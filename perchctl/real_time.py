@@ -66,7 +66,7 @@ def fly(
         rows: your own transitions, besides those of the profile; a replay does not know them.
         seed: of the simulated scenario.
         log_dir: folder of the log, instead of the profile's.
-        record: keep the pictures beside the log; by default only of real vehicles.
+        record: keep the images beside the log; by default only of real vehicles.
 
     Raises:
         InvalidValue, NotFound, UsageError, ConnectionFailed, TimedOut, SafetyAbort, Interrupted:

@@ -38,5 +38,5 @@ def _environment(package: str) -> jinja2.Environment:
 
 
 def data_url(kind: str, content: bytes) -> str:
-    """Return content of a MIME type as a ``data:`` URL, for a page that holds its own pictures."""
+    """Return content of a MIME type as a ``data:`` URL, for a page that holds its own images."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""The target's pose in each picture of any source, without a vehicle."""
+"""The target's pose in each image of any source, without a vehicle."""
 
 from __future__ import annotations
 
@@ -60,21 +60,21 @@ Named = tuple[Frame, str | None]
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """The target in one picture; frames and signs are those of docs/conventions.md.
+    """The target in one image; frames and signs are those of docs/conventions.md.
 
     Attributes:
-        index: number of the picture in its source, from 0.
+        index: number of the image in its source, from 0.
         t_s: time of exposure, s; of a live source by `time.monotonic`.
-        name: the picture's file name, or None.
+        name: the image's file name, or None.
         markers: the detected ones of ``large`` and ``small``: `corners_px` (4, 2), top left, top
             right, bottom right, bottom left on the paper; `sigma_px`, their standard deviation.
-        T_cam_target: pose of the target in the camera frame, (4, 4), m, by this picture alone; None
+        T_cam_target: pose of the target in the camera frame, (4, 4), m, by this image alone; None
             without an accepted pose.
         covariance: of that pose, (6, 6), in ROS's order: shifts along the camera's x, y, z (m),
             then small rotations about the camera's x, y, z (rad); None without a pose.
         T_level_target: pose in the level frame, from the vehicle's centre, (4, 4), m, by
             `camera.mount`; None without a pose or an attitude.
-        note: what is wrong with the picture or the target; else empty.
+        note: what is wrong with the image or the target; else empty.
     """
 
     index: int
@@ -95,7 +95,7 @@ def track(
     attitude: VehicleState | AttitudeAt | None = None,
     rate_hz: float | None = None,
 ) -> Iterator[Sighting]:
-    """Yield a `Sighting` for each picture of a source, or for each field of an interlaced one.
+    """Yield a `Sighting` for each image of a source, or for each field of an interlaced one.
 
     Args:
         source: a text that `perchctl track` takes, such as ``camera:0``, ``video:flight.mp4`` or
@@ -105,11 +105,11 @@ def track(
         calibration: the camera's, or its file; that of the profile by default.
         attitude: the vehicle's attitude, or a function that returns it for a frame's `t_s`; for
             `T_level_target`.
-        rate_hz: of arrays that are a stream. Without it, and from ``images:``, each picture is
+        rate_hz: of arrays that are a stream. Without it, and from ``images:``, each image is
             searched by itself, thoroughly.
 
     Raises:
-        NotFound: no such source, profile or calibration. InvalidValue: None instead of a picture, a
+        NotFound: no such source, profile or calibration. InvalidValue: None instead of an image, a
         wrong type, shape, size or number. ConnectionFailed: a live source fell silent.
     """
     profile = load_profile(profile)
@@ -163,7 +163,7 @@ def _sightings(
             live, frames = source.live, _polled(source, camera)
         else:
             live, frames = False, _numbered(source, rate_hz)
-        # `open_camera` has turned the pictures already, if it has the profile's section.
+        # `open_camera` has turned the images already, if it has the profile's section.
         turns = profile.camera.mirrored and not isinstance(source, WrappedSource)
         tracker = Tracker(profile, camera, live=live, stills=stills, attitude=attitude)
         for frame, name in frames:
@@ -204,7 +204,7 @@ def _numbered(images: Iterable[Any], rate_hz: float) -> Iterator[Named]:
 class Tracker:
     """Runs the profile's pipeline on one source's frames, without a vehicle.
 
-    `live`: the source is a camera. `stills`: each picture is searched thoroughly, and by itself.
+    `live`: the source is a camera. `stills`: each image is searched thoroughly, and by itself.
     Without `attitude` poses are relative to the camera instead of the gear.
     """
 
@@ -226,7 +226,7 @@ class Tracker:
 
     def process(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput | None, list[str]]]:
         """Yield the frame, or both fields of an interlaced one, with the pipeline's output and
-        notes. A live picture that stands still or is noise has no output, a repeated one is left
+        notes. A live image that stands still or is noise has no output, a repeated one is left
         out."""
         kind = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and kind == "repeated":
@@ -270,7 +270,7 @@ class Tracker:
 def _add_pose(
     seen: Sighting, state: PipelineState, attitude: VehicleState | None, pipeline: Pipeline
 ) -> Sighting:
-    """The sighting with its pose, if the pipeline accepted one of this picture."""
+    """The sighting with its pose, if the pipeline accepted one of this image."""
     if state.last_pose is None or state.last_pose.pose.t_s != seen.t_s:
         return seen
     pose, T_body_cam = state.last_pose.pose, pipeline.pose_setup.T_body_cam

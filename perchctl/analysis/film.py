@@ -1,4 +1,4 @@
-"""A film of a flight: camera picture, side view, error and thrust."""
+"""A film of a flight: camera image, side view, error and thrust."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BESIDE_M, ABOVE_M = 0.25, 0.12
 LEAST_ASIDE_M = 0.05
 """Horizontal distance from the target below which the start gives the view no direction, m."""
 LAST_PICTURE_S = 2.0
-"""Time for which the last picture stays, s."""
+"""Time for which the last image stays, s."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
 SIZE_STEP_PX = 32
 """Multiple to which the width is rounded, so that width and height are even, as H.264 requires."""
@@ -37,7 +37,7 @@ Rgb = NDArray[np.uint8]
 Progress = Callable[[int, int | None], object]
 """Called with the number done, and the total."""
 Recorded = Iterator[tuple[int, float, NDArray[np.uint8]]]
-"""Recorded pictures: number, time of exposure, grey (height, width)."""
+"""Recorded images: number, time of exposure, grey (height, width)."""
 
 
 def write_film(
@@ -48,13 +48,13 @@ def write_film(
     width_px: int = 960,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write the flight as a film (.mp4 or .gif) at its own pace, and return its number of pictures.
+    """Write the flight as a film (.mp4 or .gif) at its own pace, and return its number of images.
 
     Args:
-        pictures: the recorded pictures, oldest first; None without a recording.
-        rate_hz: pictures per second of flight; the period is rounded to 0.01 s.
+        images: the recorded images, oldest first; None without a recording.
+        rate_hz: images per second of flight; the period is rounded to 0.01 s.
         width_px: width of the film; its height is 9/16 of it.
-        progress: called after each picture of the film with the number done and of all.
+        progress: called after each image of the film with the number done and of all.
 
     Errors: InvalidValue for a log without ticks, a recording that cannot be read, or a file that
     cannot be written.
@@ -85,11 +85,11 @@ def _film_pictures(
 
 
 class ShownPicture:
-    """The recorded picture that the flight had last processed, and its record in the log.
+    """The recorded image that the flight had last processed, and its record in the log.
 
     Attributes:
         image: grey (height, width); None before the first.
-        record: the log's record of the newest picture.
+        record: the log's record of the newest image.
     """
 
     def __init__(self, flight: FlightAnalysis, recorded: Recorded) -> None:
@@ -100,7 +100,7 @@ class ShownPicture:
 
     @property
     def has_more(self) -> bool:
-        """True if a picture is still to come."""
+        """True if an image is still to come."""
         return self._coming is not None
 
     def advance(self, index: int) -> None:
@@ -113,7 +113,7 @@ class ShownPicture:
 
 
 class CameraView:
-    """A picture with the markers' outlines, in axes of its own; `add` takes each moving artist."""
+    """An image with the markers' outlines, in axes of its own; `add` takes each moving artist."""
 
     def __init__(self, ax: Axes, flight: FlightAnalysis, add: Callable[[Any], Any]) -> None:
         ax.set_axis_off()
@@ -128,7 +128,7 @@ class CameraView:
         }
 
     def show(self, shown: ShownPicture) -> None:
-        """Show this picture from now on."""
+        """Show this image from now on."""
         if shown.image is None:
             return
         self._image.set_data(shown.image)
@@ -138,8 +138,8 @@ class CameraView:
 
 
 class _Stage:
-    """The figure: what stays is drawn once, what moves is drawn for each picture. Without recorded
-    pictures, the side view takes their place."""
+    """The figure: what stays is drawn once, what moves is drawn for each image. Without recorded
+    images, the side view takes their place."""
 
     def __init__(self, flight: FlightAnalysis, width_px: int, *, has_pictures: bool) -> None:
         self._flight = flight
@@ -158,7 +158,7 @@ class _Stage:
         self._still = draw_still(self._figure)
 
     def drawn(self, index: int, shown: ShownPicture) -> Rgb:
-        """A tick's picture, (height, width, 3)."""
+        """A tick's image, (height, width, 3)."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
         if self._camera is not None:
             self._camera.show(shown)
@@ -246,7 +246,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
 
 
 def film_period(rate_hz: float) -> Fraction:
-    """Time between two pictures, s, rounded to 0.01 s, in which a GIF counts."""
+    """Time between two images, s, rounded to 0.01 s, in which a GIF counts."""
     return Fraction(max(2, round(100 / rate_hz)), 100)
 
 
@@ -263,7 +263,7 @@ def draw_still(figure: Figure) -> Any:
 
 
 def draw_moving(figure: Figure, still: Any, moving: Sequence[Any]) -> Rgb:
-    """Draw these artists over what does not move; return the picture, (height, width, 3)."""
+    """Draw these artists over what does not move; return the image, (height, width, 3)."""
     canvas = cast(Any, figure.canvas)
     canvas.restore_region(still)
     for artist in moving:

@@ -1,4 +1,4 @@
-"""A film of a fleet: the room from above, all heights, and each vehicle's camera picture.
+"""A film of a fleet: the room from above, all heights, and each vehicle's camera image.
 
 Each vehicle's log has a clock of its own. What puts them together is the fleet's clock, on which
 each flight has its begin and its pace: simulated time may run slower than the clock on the wall.
@@ -45,7 +45,7 @@ class FilmedVehicle:
     """One vehicle of a fleet's flight.
 
     Attributes:
-        pictures: the recorded ones, oldest first; None without a recording.
+        images: the recorded ones, oldest first; None without a recording.
         begin_s: its first tick, on the fleet's clock.
         pace: time of its flight per time of the fleet's clock.
         home_m, target_m, radius_m: of its corridor, in the room's axes.
@@ -97,7 +97,7 @@ def write_fleet_film(
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write the flight of a fleet as a film (.mp4 or .gif) at its own pace, and return its number
-    of pictures. `rate_hz`, `width_px`, `progress` and errors are those of
+    of images. `rate_hz`, `width_px`, `progress` and errors are those of
     `perchctl.analysis.write_film`.
     """
     for vehicle in vehicles:
@@ -122,7 +122,7 @@ def _fleet_pictures(
 
 
 class _FleetStage:
-    """The figure: what stays is drawn once, what moves is drawn for each picture."""
+    """The figure: what stays is drawn once, what moves is drawn for each image."""
 
     def __init__(self, vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int) -> None:
         self._begin_s = float(times_s[0])
@@ -151,7 +151,7 @@ class _FleetStage:
         self._still = draw_still(self._figure)
 
     def drawn(self, t_s: float) -> Rgb:
-        """The picture of this time of the fleet's clock, (height, width, 3)."""
+        """The image of this time of the fleet's clock, (height, width, 3)."""
         for each in self._shown:
             each.show(t_s)
         hanging = sum(each.hangs for each in self._shown)
@@ -202,7 +202,7 @@ class _FleetStage:
 
 
 class _ShownVehicle:
-    """What moves of one vehicle: its camera's picture, its words, and its place in the room."""
+    """What moves of one vehicle: its camera's image, its words, and its place in the room."""
 
     def __init__(
         self, vehicle: FilmedVehicle, colour: str, camera: Axes, room: Axes, add: Any

@@ -1,4 +1,4 @@
-"""The picture of a flight, beside its log and on its report's page."""
+"""The image of a flight, beside its log and on its report's page."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def plot_flight(log: FlightLog | FlightAnalysis, path: Path | str) -> None:
 
 
 def flight_png(flight: FlightAnalysis) -> bytes:
-    """The picture of a flight as a PNG; the log has at least one tick."""
+    """The image of a flight as a PNG; the log has at least one tick."""
     return figure_bytes(flight_figure(flight))
 
 

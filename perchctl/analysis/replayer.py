@@ -54,13 +54,13 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class PerceptionReplay:
-    """Result of replaying perception on the recorded pictures, telemetry and times.
+    """Result of replaying perception on the recorded images, telemetry and times.
 
     Attributes:
-        turns: the replayed turns, up to the first missing picture.
+        turns: the replayed turns, up to the first missing image.
         differences: the first difference of each turn whose poses or observation differ.
         frames_flown: number of frames that the flight processed.
-        missing: why the pictures ended the replay early, or None.
+        missing: why the images ended the replay early, or None.
     """
 
     turns: Sequence[ReplayedInputs]
@@ -82,19 +82,19 @@ class PerceptionReplay:
     def is_identical(self) -> bool:
         """True if no replayed value differs.
 
-        A picture that is missing or unreadable does not count as a difference.
+        An image that is missing or unreadable does not count as a difference.
         """
         return not (self.differences or (self.missing is not None and self.missing.is_different))
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Replay of a log through the planner, and through perception if pictures were recorded.
+    """Replay of a log through the planner, and through perception if images were recorded.
 
     Attributes:
         decisions: the planner's replayed decisions, one for each turn.
         differences: the first difference of each decision that differs from the log.
-        seen: replay of perception; None without pictures.
+        seen: replay of perception; None without images.
         changed_keys: profile keys that differ from the flown profile.
         gap_text: sentence on turns missing from the log, or empty (`turns_and_gap_text`).
     """
@@ -158,7 +158,7 @@ class Replay:
         """The replay in JSON types.
 
         `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
-        None without pictures; `changed` is empty for the flown profile; `not_compared` names the
+        None without images; `changed` is empty for the flown profile; `not_compared` names the
         fields that the log does not hold.
         """
         seen = self.seen
@@ -231,7 +231,7 @@ def replay(
     seen = None
     if pictures is not None:
         pipeline = pipeline or replay_pipeline(log, used, changed)
-        # A source takes the latency off the time at which a picture came.
+        # A source takes the latency off the time at which an image came.
         delay_s = flown.camera.start_latency_s - used.camera.start_latency_s
         replayed, missing = _replayed(turns, used, pipeline, pictures, delay_s)
         differing = list(_differing(log, turns, replayed, comparison))
@@ -273,7 +273,7 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
 
-# --- What the pictures show ---
+# --- What the images show ---
 
 
 def _replayed(
@@ -283,7 +283,7 @@ def _replayed(
     pictures: Iterable[Picture],
     delay_s: float,
 ) -> tuple[list[ReplayedInputs], PictureMissing | None]:
-    """Replay perception up to the first missing picture."""
+    """Replay perception up to the first missing image."""
     found: list[ReplayedInputs] = []
     missing: PictureMissing | None = None
     try:

@@ -46,7 +46,7 @@ def write_report(
 ) -> Report:
     """Write the HTML report of the logs atomically, and return its content. `with_film` embeds a
     film of each flight. `names`: the vehicles of a fleet, by their logs. `progress` is called with
-    the number done and of all: after each flight, or with films after each picture of a film.
+    the number done and of all: after each flight, or with films after each image of a film.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
@@ -89,7 +89,7 @@ class Report:
 @dataclass(frozen=True, eq=False)
 class ReportedFlight:
     """One flight of a report. `pictures` is None without a recording; `picture_problem` says why
-    pictures could not be read. `name`: the vehicle's, in a fleet."""
+    images could not be read. `name`: the vehicle's, in a fleet."""
 
     flight: FlightAnalysis
     pictures: tuple[DecisionPicture, ...] | None = None
@@ -213,7 +213,7 @@ def mission_phases(log: FlightLog) -> list[str]:
 def film_url_and_problem(
     flight: FlightAnalysis, progress: Progress = lambda done, total: None
 ) -> tuple[str, str]:
-    """The flight's film as a `data:` URL, and why the film or its camera pictures are
+    """The flight's film as a `data:` URL, and why the film or its camera images are
     missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
@@ -246,17 +246,17 @@ DECIDED = {
     "HOVER": "at its place",
 }
 WIDEST_PX = 480
-"""Width to which a wider picture is reduced. Larger: a larger file."""
+"""Width to which a wider image is reduced. Larger: a larger file."""
 REPORT_JPEG_QUALITY = 80
-"""Of 100. Larger: a larger file. Smaller: coarser pictures."""
+"""Of 100. Larger: a larger file. Smaller: coarser images."""
 LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 
 @dataclass(frozen=True)
 class DecisionPicture:
-    """Last camera picture before a phase change, as a JPEG with the detected markers drawn.
+    """Last camera image before a phase change, as a JPEG with the detected markers drawn.
 
-    The caption has the picture's time, as the last centimetres are flown without pictures.
+    The caption has the image's time, as the last centimetres are flown without images.
     """
 
     caption: str
@@ -269,7 +269,7 @@ class DecisionPicture:
 
 def read_reported_flight(log_path: Path) -> ReportedFlight:
     """Read one flight from its log and from the recording beside it. If the recording cannot be
-    read, only the pictures are missing.
+    read, only the images are missing.
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """

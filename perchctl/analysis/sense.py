@@ -1,7 +1,7 @@
-"""Replay the perception of a flight: pass the recorded telemetry and pictures to the loop's own
+"""Replay the perception of a flight: pass the recorded telemetry and images to the loop's own
 inputs again.
 
-On one thread, the same pictures, samples and times must give bit-identical poses.
+On one thread, the same images, samples and times must give bit-identical poses.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
-"""Of a frame: its number, the source's time, and the searched picture."""
+"""Of a frame: its number, the source's time, and the searched image."""
 
 
 class PictureMissing(Exception):
-    """A picture that the replay needs is missing (the message says why) or, with `is_different`, is
+    """An image that the replay needs is missing (the message says why) or, with `is_different`, is
     not the one that the flight processed."""
 
     is_different = False
@@ -99,7 +99,7 @@ class _Given:
         return None
 
     def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        if self._taken.camera_problem is not None:  # no picture was searched in this turn
+        if self._taken.camera_problem is not None:  # no image was searched in this turn
             return np.zeros((1, 1), np.uint8)
         image = self._repeated_picture(seen) if seen.is_repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
@@ -138,7 +138,7 @@ def replay_inputs(
     """Replay perception turn by turn, from the first turn before take-off. `delay_s` is added to
     the exposure times of a live source.
 
-    Raises PictureMissing at the first picture that is missing, differs or cannot be read: from
+    Raises PictureMissing at the first image that is missing, differs or cannot be read: from
     there the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
@@ -169,7 +169,7 @@ def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
-    """Yield the pictures; an unreadable one ends them, not the planner's replay."""
+    """Yield the images; an unreadable one ends them, not the planner's replay."""
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:

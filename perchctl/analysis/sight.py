@@ -39,7 +39,7 @@ class Frames:
         has_target: (n,) bool, True for the frames that showed the target.
         gaps_s: (k, 2) start and end of each gap without a usable frame.
         rate_hz: 1 over the median time between two frames; NaN where it is unknown.
-        median_age_s: median age of a picture when it was used; NaN where it is unknown.
+        median_age_s: median age of an image when it was used; NaN where it is unknown.
     """
 
     t_s: Array
@@ -108,7 +108,7 @@ class TargetLoss:
     target to the next such frame (`is_regained`), or to the flight's end.
 
     Attributes:
-        frames_without_target: 0 if no picture came at all.
+        frames_without_target: 0 if no image came at all.
     """
 
     start_s: float
@@ -122,7 +122,7 @@ class TargetLoss:
 
 
 def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
-    """All target losses, oldest first; none at the ceiling, where no pictures are evaluated."""
+    """All target losses, oldest first; none at the ceiling, where no images are evaluated."""
     stays = log.phases
     starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]
@@ -149,7 +149,7 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":
-            return None  # so near that no marker fits into the picture, as it should be
+            return None  # so near that no marker fits into the image, as it should be
         end_s = left.start_s
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None

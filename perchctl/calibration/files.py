@@ -30,7 +30,7 @@ class CalibrationNotes:
 
     Attributes:
         board: the board's notation.
-        picture_hashes: `perchctl.calibration.board.detect.BoardView.picture_hash` of the pictures.
+        picture_hashes: `perchctl.calibration.board.detect.BoardView.picture_hash` of the images.
     """
 
     board: str

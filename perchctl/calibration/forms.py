@@ -5,13 +5,13 @@ and nothing notices it later. Therefore the keys decide, according to one table 
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must be neutral, as another value would change the projection (binning, xi, ...);
-- notes, which do not concern the projection of the camera's own pictures: those in the table, and
-  keys that consist of words about boards, pictures, errors and dates.
+- notes, which do not concern the projection of the camera's own images: those in the table, and
+  keys that consist of words about boards, images, errors and dates.
 
 A key that is in no table might change the projection, so its file is refused, unless the value is 0
 or empty, with which no term of a lens model has any effect. Among the notes are
 `rectification_matrix` and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified
-pictures, while K and D belong to the camera's own.
+images, while K and D belong to the camera's own.
 
 Forms of programs that are known, but not read, are refused by their name.
 """
@@ -133,7 +133,7 @@ _NOTE_WORDS = frozenset(
         *("file", "path", "comment", "comments", "note", "notes", "description"),
     )
 )
-"""Words about boards, pictures, errors and dates: a key that consists only of these is a note,
+"""Words about boards, images, errors and dates: a key that consists only of these is a note,
 too."""
 _UNITS = frozenset(("px", "mm", "cm", "m", "deg"))
 
@@ -150,7 +150,7 @@ _OPENCV_LONG = (12, 14)
 """Coefficients of OpenCV's thin prism and tilted sensor models."""
 
 _MAX_RMS_SHARE = 0.01
-"""Largest reprojection error relative to the picture's width: a calibration that reports a larger
+"""Largest reprojection error relative to the image's width: a calibration that reports a larger
 one on its own board is unusable."""
 
 _AS_CAMERA_INFO = (
@@ -188,7 +188,7 @@ _OTHER_FORMS = (
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Content of a calibration file: picture size, camera matrix (3, 3), and distortion of the
+    """Content of a calibration file: image size, camera matrix (3, 3), and distortion of the
     `model` of `perchctl.vision.CameraModel`."""
 
     size_px: tuple[int, int]
@@ -400,7 +400,7 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
 
 
 def _check_region(found: _Found) -> None:
-    """Raise InvalidValue if the pictures are a section of those that were calibrated."""
+    """Raise InvalidValue if the images are a section of those that were calibrated."""
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
             raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")

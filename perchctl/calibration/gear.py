@@ -1,7 +1,7 @@
-"""Learn which part of the picture the vehicle itself covers, from pictures taken while it moves.
+"""Learn which part of the image the vehicle itself covers, from images taken while it moves.
 
-While you turn the vehicle in your hand, only its own parts stay the same in the picture. They are
-connected with the picture's edge.
+While you turn the vehicle in your hand, only its own parts stay the same in the image. They are
+connected with the image's edge.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LEAST_PICTURES = 20
 MOST_GEAR_SHARE = 0.6
 _LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room pass by
 _STILL_RATIO = 0.3  # share of that spread below which a pixel belongs to the gear
-_LEAST_BLOB_SHARE = 5e-4  # least share of the picture for a part of the gear
+_LEAST_BLOB_SHARE = 5e-4  # least share of the image for a part of the gear
 _CLOSED_PX = 7  # width of gaps that are filled; larger: pixels between two parts are covered, too
 _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered than the gear hides
 
@@ -31,11 +31,11 @@ _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered tha
 def learn_gear_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of the pixels that the vehicle covers, from the pictures of a
+    """Return the mask (h, w) of the pixels that the vehicle covers, from the images of a
     recording, or of a live camera for `LIVE_S` or until `stopped`.
 
     Raises:
-        InvalidValue: too few pictures, unequal sizes, too little motion, or nothing found.
+        InvalidValue: too few images, unequal sizes, too little motion, or nothing found.
     """
     count, start_s = 0, time.monotonic()
     total = squares = np.zeros((0, 0))
@@ -75,7 +75,7 @@ def learn_gear_mask(
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts that touch the picture's edge, without specks and gaps."""
+    """Return the parts that touch the image's edge, without specks and gaps."""
     clean = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     gap = np.ones((_CLOSED_PX, _CLOSED_PX), np.uint8)
     clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, gap)

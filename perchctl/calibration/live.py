@@ -28,7 +28,7 @@ class GuidedFrame:
     """A frame of a guided recording, with the guidance shown beside it.
 
     Attributes:
-        index, image: the frame's number and picture (h, w).
+        index, image: the frame's number and image (h, w).
         outlines: kind and corners (n, 2) px of each detection.
         rows: name, text and bar (None: no bar) of each value to show.
         advice: what to do now.

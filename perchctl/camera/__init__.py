@@ -1,4 +1,4 @@
-"""Cameras, streams, videos and pictures as sources of frames, and their health."""
+"""Cameras, streams, videos and images as sources of frames, and their health."""
 
 import lazy_loader
 

@@ -2,10 +2,10 @@
 frame.
 
 HOST is 192.168.4.1 if the deck is its own access point. The deck's GAP8 must run Bitcraze's example
-`wifi-img-streamer`, which sends raw or JPEG pictures of 324x244.
+`wifi-img-streamer`, which sends raw or JPEG images of 324x244.
 
 The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
-one byte of routing, one of function, and the data. A picture is a packet with its header,
+one byte of routing, one of function, and the data. An image is a packet with its header,
 ``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
 bytes have come. (cflib's own reader blocks for ever when the deck goes away.)
 """
@@ -27,7 +27,7 @@ from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
 STALLED_S = 2.0
-"""Time from a picture's first to its last byte after which the picture is dropped, s."""
+"""Time from an image's first to its last byte after which the image is dropped, s."""
 MAX_PACKET_BYTES = 1022
 """Largest length of a packet: the deck's buffers hold no more (its MTU)."""
 MOST_SIDE_PX = 1024
@@ -44,7 +44,7 @@ _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 
 @dataclass
 class _Picture:
-    """A picture that is arriving: the content of its header, and the `data` so far.
+    """An image that is arriving: the content of its header, and the `data` so far.
 
     `began_s` is the time at which its first byte arrived.
     """
@@ -57,7 +57,7 @@ class _Picture:
     data: bytearray
 
     def decode(self) -> tuple[NDArray[np.uint8], bytes | None] | str:
-        """Return the grey picture (h, w), and its JPEG if it came as one; or why it cannot be used.
+        """Return the grey image (h, w), and its JPEG if it came as one; or why it cannot be used.
         Bytes after the end of a JPEG are padding."""
         shape, data = (self.height, self.width), bytes(self.data)
         if not self.is_jpeg:
@@ -80,11 +80,11 @@ class _Picture:
 
 
 class AiDeckSource(LiveSource):
-    """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
+    """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG images.
 
-    A picture's time is its first byte's arrival minus `latency_s`, as the deck sends the header on
-    exposure; the transfer takes 60 ms and more for a raw picture. Its arrival time is that of
-    the last byte. Incomplete pictures are dropped; an invalid packet ends the connection, and the
+    An image's time is its first byte's arrival minus `latency_s`, as the deck sends the header on
+    exposure; the transfer takes 60 ms and more for a raw image. Its arrival time is that of
+    the last byte. Incomplete images are dropped; an invalid packet ends the connection, and the
     source reconnects.
     """
 
@@ -160,7 +160,7 @@ class AiDeckSource(LiveSource):
 
 
 def _header_of(data: bytes, came_s: float) -> _Picture | None:
-    """Return the picture whose header that packet is; None if it is no header."""
+    """Return the image whose header that packet is; None if it is no header."""
     if len(data) != _HEADER.size:
         return None
     magic, width, height, depth, kind, size = _HEADER.unpack(data)
@@ -174,9 +174,9 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
     return None
 
 
-# --- The colour mosaic of a camera whose pictures are delivered as grey ---
+# --- The colour mosaic of a camera whose images are delivered as grey ---
 # The pixels have colour filters in blocks of two by two. Their pattern shows in raw and grey JPEG
-# pictures.
+# images.
 
 
 LEAST_MOSAIC_SHARE = 0.04
@@ -194,7 +194,7 @@ def has_mosaic(image: NDArray[np.uint8]) -> bool:
 
 
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the picture smoothed to grey: a quarter red, half green, a quarter blue.
+    """Return the image smoothed to grey: a quarter red, half green, a quarter blue.
 
     The weights 1 2 1 along rows and columns cancel any pattern with a period of two pixels, so this
     works for each order of the colour filters, and for a JPEG.
@@ -203,7 +203,7 @@ def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class MosaicFilter:
-    """Removes the colour mosaic from a stream's pictures once a picture has shown one."""
+    """Removes the colour mosaic from a stream's images once an image has shown one."""
 
     def __init__(self) -> None:
         self._in_a_row = 0

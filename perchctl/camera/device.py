@@ -67,7 +67,7 @@ def configure_capture(
 class DeviceSource(LiveSource):
     """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
-    A bad picture is dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is
+    A bad image is dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is
     released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
     """
 
@@ -97,7 +97,7 @@ class DeviceSource(LiveSource):
                         self._put(image)
                         failures = 0
                         continue
-                except Exception as error:  # any error that a damaged picture causes in OpenCV
+                except Exception as error:  # any error that a damaged image causes in OpenCV
                     why = f"delivers pictures that cannot be decoded ({describe_error(error)})"
                     self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1
@@ -154,7 +154,7 @@ def _no_camera() -> NotFound:
 
 
 def _known_cameras(devices: Path, names: Path) -> list[ConnectedCamera]:
-    """List each camera once, with its first video node, since the others often give no pictures."""
+    """List each camera once, with its first video node, since the others often give no images."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):

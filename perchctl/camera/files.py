@@ -22,10 +22,10 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 
 
 class RecordedSource:
-    """Base of the recorded sources; `_read` returns the next picture and its time, or None.
+    """Base of the recorded sources; `_read` returns the next image and its time, or None.
 
     `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
-    the files of pictures, in the order of their frames' indices; empty for a video.
+    the files of images, in the order of their frames' indices; empty for a video.
     """
 
     live = False
@@ -36,7 +36,7 @@ class RecordedSource:
         self._name = name
         self._latency_s = latency_s
         self._index = 0
-        # reads one picture ahead, so that size and end are known in time
+        # reads one image ahead, so that size and end are known in time
         self._ahead = self._read()
         if self._ahead is None:
             raise InvalidValue(
@@ -81,7 +81,7 @@ class VideoSource(RecordedSource):
         # one sentence is enough, so OpenCV prints nothing
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        # keeps the sensor's grid, as with pictures
+        # keeps the sensor's grid, as with images
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0
@@ -111,7 +111,7 @@ class VideoSource(RecordedSource):
 
 
 class ImagesSource(RecordedSource):
-    """The pictures of a folder or a glob, or those named one by one, in natural order (2
+    """The images of a folder or a glob, or those named one by one, in natural order (2
     before 10), at `rate_hz`."""
 
     def __init__(
@@ -139,9 +139,9 @@ class ImagesSource(RecordedSource):
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """The grey picture of a file's bytes, on the sensor's grid whatever orientation they note.
+    """The grey image of a file's bytes, on the sensor's grid whatever orientation they note.
 
-    Raises ValueError for a picture that is cut off, or that OpenCV does not read.
+    Raises ValueError for an image that is cut off, or that OpenCV does not read.
     """
     # OpenCV's decoders would fill in the rest with grey, and print a warning without the file's
     # name.

@@ -25,11 +25,11 @@ VERDICT_TEXTS: dict[FrameKind, str] = {
 
 # Grey levels range from 0 to 255.
 FROZEN_AFTER_S = 0.4
-"""Time without a change after which a repeated picture counts as frozen, s."""
+"""Time without a change after which a repeated image counts as frozen, s."""
 UNIFORM_SIGMA = 1.5
-"""Standard deviation below which a picture shows nothing: a blank screen has less than 1."""
+"""Standard deviation below which an image shows nothing: a blank screen has less than 1."""
 DARK_LEVEL = 30.0
-"""Level below which a picture is dark: mean plus two standard deviations."""
+"""Level below which an image is dark: mean plus two standard deviations."""
 SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
 """Thresholds for snow: its standard deviation, the difference of lines two rows apart relative to
 unrelated lines (1), and that of columns, which is smaller because a receiver's bandwidth smooths
@@ -37,7 +37,7 @@ along lines."""
 
 
 class FrameHealth:
-    """Judges the frames of one source in order; it remembers the last picture."""
+    """Judges the frames of one source in order; it remembers the last image."""
 
     def __init__(self) -> None:
         self._picture: NDArray[np.uint8] | None = None
@@ -46,9 +46,9 @@ class FrameHealth:
     def assess(self, frame: Frame, live: bool = True) -> FrameKind:
         """Classify the next frame; only "ok" frames are measurements.
 
-        Noise makes each live picture differ from the last one, so identical bytes mean that the
-        receiver or the stream repeats a picture. `Frame.repeated` frames count as repeated, too,
-        but not as frozen. In recordings (`live` False) identical pictures are accepted.
+        Noise makes each live image differ from the last one, so identical bytes mean that the
+        receiver or the stream repeats an image. `Frame.repeated` frames count as repeated, too,
+        but not as frozen. In recordings (`live` False) identical images are accepted.
         """
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):
@@ -61,7 +61,7 @@ class FrameHealth:
 
 
 def picture_kind(image: NDArray[np.uint8]) -> FrameKind:
-    """Classify a picture by its content, from a sample of its lines."""
+    """Classify an image by its content, from a sample of its lines."""
     height = image.shape[0]
     first = image[: max(height - 2, 1) : 8]
     mean, sigma = (float(each[0, 0]) for each in cv2.meanStdDev(first))
@@ -83,8 +83,8 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
 
 
-# --- Pictures that a receiver repeats because no new one has arrived ---
-# In a stream of 60 pictures a second, a receiver of 25 pictures a second repeats each two or three
+# --- Images that a receiver repeats because no new one has arrived ---
+# In a stream of 60 images a second, a receiver of 25 images a second repeats each two or three
 # times. The repetition is not another measurement, and its time is that of the first copy.
 
 
@@ -92,7 +92,7 @@ Grey = NDArray[np.uint8]
 
 
 def same_bytes(one: Grey, other: Grey) -> bool:
-    """True if both pictures are identical; stops at the first row that differs."""
+    """True if both images are identical; stops at the first row that differs."""
     middle = len(one) // 2
     return (
         one.shape == other.shape

@@ -1,8 +1,8 @@
 """The structure of a JPEG: its end, its declared size and its pixels; and the pixels of any
-picture. Pure.
+image. Pure.
 
 Data from a radio may be damaged anywhere. Two wrong bytes that declare a size of 32000x32000 cost a
-decoder gigabytes and minutes, so the size is checked before a picture of a stream is decoded.
+decoder gigabytes and minutes, so the size is checked before an image of a stream is decoded.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PICTURE_BYTES = 8_000_000
-"""Size of a picture in a stream after which it is dropped if it has not ended, bytes."""
+"""Size of an image in a stream after which it is dropped if it has not ended, bytes."""
 MOST_STREAM_PX = 4096 * 4096
-"""Largest number of pixels of a picture in a stream: more than any flying camera has, and decoded
+"""Largest number of pixels of an image in a stream: more than any flying camera has, and decoded
 within 0.2 s."""
 
 _SCAN_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
@@ -32,7 +32,7 @@ def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | 
     """The length of the JPEG at the start of `data`, and its width and height; None if it is
     incomplete.
 
-    For a damaged JPEG (a marker is missing, or another picture begins) return the offset of the
+    For a damaged JPEG (a marker is missing, or another image begins) return the offset of the
     damage, and (0, 0) as size.
     """
     at, size_px, in_scan = 2, (0, 0), False
@@ -62,23 +62,23 @@ def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | 
 
 
 class JpegSplitter:
-    """Cuts a byte stream into whole JPEG pictures.
+    """Cuts a byte stream into whole JPEG images.
 
     It follows the structure of the JPEGs, not the multipart headers, so wrong lengths and bad or
-    missing headers do no harm, and a picture is complete with its last byte.
+    missing headers do no harm, and an image is complete with its last byte.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[bytes, tuple[int, int]]]:
-        """Append bytes; return the pictures completed by them, oldest first, each as JPEG bytes and
+        """Append bytes; return the images completed by them, oldest first, each as JPEG bytes and
         (width, height)."""
         self._buffer += data
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
             self._bound()
-            return pictures  # no picture ends in the new bytes
+            return pictures  # no image ends in the new bytes
         while (start := self._buffer.find(_START)) >= 0:
             del self._buffer[:start]
             extent = jpeg_end_and_size(self._buffer)
@@ -87,7 +87,7 @@ class JpegSplitter:
             end, size_px = extent
             if all(size_px):
                 pictures.append((bytes(self._buffer[:end]), size_px))
-            # The beginning of the next picture may be what interrupted the structure of this one.
+            # The beginning of the next image may be what interrupted the structure of this one.
             del self._buffer[:end]
         else:
             del self._buffer[:-2]  # the next start marker may be cut in half here
@@ -95,18 +95,18 @@ class JpegSplitter:
         return pictures
 
     def _bound(self) -> None:
-        """Drop a picture that never ends."""
+        """Drop an image that never ends."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
 
 
 SENSOR_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-"""OpenCV's flags for a grey picture on the sensor's grid. The orientation that a camera notes for
-viewers says how the camera was held; applying it would give each picture another lens."""
+"""OpenCV's flags for a grey image on the sensor's grid. The orientation that a camera notes for
+viewers says how the camera was held; applying it would give each image another lens."""
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
-    """The grey picture of any bytes, on the sensor's grid whatever orientation they note; None if
+    """The grey image of any bytes, on the sensor's grid whatever orientation they note; None if
     OpenCV cannot decode them; raises nothing."""
     if not data:
         return None  # OpenCV raises an error for an empty array
@@ -123,7 +123,7 @@ _TIFF_ORIENTATION = 274
 
 def _as_stored(data: bytes) -> bytes:
     """Return a TIFF with its orientation tag set to 1, since OpenCV's reader rotates it in spite of
-    the flag; return any other picture unchanged."""
+    the flag; return any other image unchanged."""
     order = _TIFF_BYTE_ORDER.get(bytes(data[:4]))
     if order is None:
         return data

@@ -1,6 +1,6 @@
 """Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
 
-PyAV's mpjpeg reader is not used for Motion-JPEG: if no length precedes a picture, the reader
+PyAV's mpjpeg reader is not used for Motion-JPEG: if no length precedes an image, the reader
 returns it only with the next one's first bytes, a whole period late.
 """
 
@@ -117,7 +117,7 @@ class MjpegSource(LiveSource):
                     f"it sends {kind}, but no complete JPEG",
                     "check that the address is that of the stream itself",
                 )
-            # If several pictures arrived at once, only the newest is worth decoding.
+            # If several images arrived at once, only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
                 if width * height > MOST_STREAM_PX:
                     self._drop(
@@ -139,10 +139,10 @@ MAX_DAMAGED = 100
 """Number of successive packets that cannot be decoded before the source reconnects."""
 DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""Rate by which a camera's clock may run slow before its pictures seem to become older."""
+"""Rate by which a camera's clock may run slow before its images seem to become older."""
 
 _OPTIONS = {
-    "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
+    "rtsp_flags": "prefer_tcp",  # a lost packet costs every image up to the next whole one
     "fflags": "nobuffer",
     "flags": "low_delay",
     "max_delay": "0",
@@ -155,9 +155,9 @@ _OPTIONS = {
 
 
 class TransferDelay:
-    """Estimates a picture's extra transfer time over the fastest picture of the last 10 s.
+    """Estimates an image's extra transfer time over the fastest image of the last 10 s.
 
-    The delay is found from the camera's timestamps. Without it, pictures that arrive in a burst
+    The delay is found from the camera's timestamps. Without it, images that arrive in a burst
     after a radio stall would seem to be new.
     """
 
@@ -166,7 +166,7 @@ class TransferDelay:
         self._ways: deque[tuple[float, float]] = deque()  # arrival times with their `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
-        """The transfer time beyond the fastest picture's, s; 0 without `camera_s`, the camera's
+        """The transfer time beyond the fastest image's, s; 0 without `camera_s`, the camera's
         timestamp."""
         if camera_s is None:
             return 0.0
@@ -226,7 +226,7 @@ class RtspSource(LiveSource):
             return "the stream carries no video"
         self._connected()
         video = stream.streams.video[0]
-        # One thread per frame would delay the pictures by as many frames as there are threads.
+        # One thread per frame would delay the images by as many frames as there are threads.
         video.thread_type = "NONE"
         video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
         delay, damaged = TransferDelay(), 0

@@ -80,7 +80,7 @@ class SourceName:
 
 
 def parse_source(text: str) -> SourceName:
-    """The source of a text: a scheme in either case and its place, a bare path of video, picture,
+    """The source of a text: a scheme in either case and its place, a bare path of video, image,
     pattern or folder, or a camera of your own, ``my_module:MyCamera``. Nothing is opened.
 
     Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
@@ -140,15 +140,15 @@ def open_camera(
     """Open any source and wait for its first frame.
 
     Args:
-        source: a text that `parse_source` takes, or picture files one by one. ``sim:`` belongs
+        source: a text that `parse_source` takes, or image files one by one. ``sim:`` belongs
             to the simulated vehicle, whose stream's address the caller gives instead. Of
             ``my_module:MyCamera`` the class is called with `clock` and `config`.
         clock: of the frames' times, s.
         config: the profile's camera. Its latency is taken off live frames' times, its format
-            and rate are asked of ``camera:``, and mirrored pictures are turned right.
+            and rate are asked of ``camera:``, and mirrored images are turned right.
         size_px: wanted width and height (requested of ``camera:`` only).
         latency_s: from exposure to arrival, instead of the profile's (0 without one).
-        pictures_hz: pictures count as taken at this rate (``images:`` only; 30 by default).
+        pictures_hz: images count as taken at this rate (``images:`` only; 30 by default).
         timeout_s: how long the first frame of a live source may take, instead of the profile's.
 
     Raises:

@@ -21,9 +21,9 @@ from perchctl.vision import CameraModel, Frame, to_grey
 
 
 class NewestSlot:
-    """Keeps the newest picture, with the time of its first arrival.
+    """Keeps the newest image, with the time of its first arrival.
 
-    A picture that the receiver repeats does not replace the original until the original is taken,
+    An image that the receiver repeats does not replace the original until the original is taken,
     so the arrival time stays. Afterwards the repeat is given with the same index and
     `Frame.repeated`: a sign of life, not a measurement.
     """
@@ -36,7 +36,7 @@ class NewestSlot:
     def put(
         self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
     ) -> None:
-        """Keep a picture with its times of exposure and arrival; `encoded`: its JPEG, if any."""
+        """Keep an image with its times of exposure and arrival; `encoded`: its JPEG, if any."""
         if self._last is None or not same_bytes(self._last, image):
             self._last = image
             self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
@@ -127,10 +127,10 @@ class LiveSource:
     """A live source: a thread reads the camera, and the loop polls the newest frame.
 
     A subclass defines `_connection`, which opens and reads the camera. A connection that ended is
-    made again after `reconnect_wait_s`, until `max_failures` in a row brought no picture.
+    made again after `reconnect_wait_s`, until `max_failures` in a row brought no image.
 
-    The message of a source that gives no picture names only causes that the source has observed:
-    whether it connected (`_connected`), whether anything came (`_note`), and whether pictures came
+    The message of a source that gives no image names only causes that the source has observed:
+    whether it connected (`_connected`), whether anything came (`_note`), and whether images came
     and were dropped (`_drop`).
     """
 
@@ -155,12 +155,12 @@ class LiveSource:
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
-        self._arrived = 0  # number of pictures, including a receiver's repetitions
+        self._arrived = 0  # number of images, including a receiver's repetitions
         self._why_silent = ""
-        # finding of the newest connection, and advice, until a picture arrives
+        # finding of the newest connection, and advice, until an image arrives
         self._found = ("", "")
         self._is_connected = False
-        self._dropped = 0  # number of pictures that arrived since the last good one
+        self._dropped = 0  # number of images that arrived since the last good one
         self._why_dropped = ""
         self.connections = 0
         self.failure: PerchError | None = None
@@ -189,7 +189,7 @@ class LiveSource:
         return TimedOut(found, advice, separator=": ")
 
     def _finding_and_advice(self) -> tuple[str, str]:
-        """Return what was observed since the last picture, and what to do about it."""
+        """Return what was observed since the last image, and what to do about it."""
         if self._dropped:
             count = f"{self._dropped} so far"
             return f"pictures arrive but are dropped ({count}): {self._why_dropped}", ""
@@ -214,7 +214,7 @@ class LiveSource:
 
     def _connection(self) -> str:
         """Open the camera, read it until it ends, and return why it ended. It calls `_put` for
-        each picture, looks at `_stop`, and may raise any Exception."""
+        each image, looks at `_stop`, and may raise any Exception."""
         raise NotImplementedError
 
     def _run(self) -> None:
@@ -257,11 +257,11 @@ class LiveSource:
         self._note(_SILENT, self.silent_advice)
 
     def _note(self, finding: str, advice: str = "") -> None:
-        """Note what this connection has delivered instead of a picture, and what to do about it."""
+        """Note what this connection has delivered instead of an image, and what to do about it."""
         self._found = (finding, advice)
 
     def _drop(self, why: str) -> None:
-        """Note that a picture arrived but cannot be used."""
+        """Note that an image arrived but cannot be used."""
         self._why_dropped, self._dropped = why, self._dropped + 1
 
     def _put(
@@ -272,7 +272,7 @@ class LiveSource:
         began_s: float | None = None,
         encoded: bytes | None = None,
     ) -> None:
-        """Keep a picture that has arrived now.
+        """Keep an image that has arrived now.
 
         `waited_s`: by how much its transfer took longer than usual. `began_s`: start of its
         arrival; the latency counts from there. `encoded`: as in `Frame`.
@@ -410,7 +410,7 @@ class GuardedSource:
 
 
 def mirrored_problem(config: CameraConfig) -> Problem:
-    """Return the problem that the picture is mirrored, with advice on the profile's `config`."""
+    """Return the problem that the image is mirrored, with advice on the profile's `config`."""
     advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror it, so remove camera.mirrored from the profile"

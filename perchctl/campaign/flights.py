@@ -74,7 +74,7 @@ def _give_back_memory() -> None:
     """Free a flight's memory, whose objects refer to each other, at once."""
     gc.collect()
     if not gc.get_freeze_count():
-        # What is left is kept for all flights; to look through it takes as long as 30 pictures.
+        # What is left is kept for all flights; to look through it takes as long as 30 images.
         gc.freeze()
 
 
@@ -83,7 +83,7 @@ def fly_seed(
 ) -> FlightResult:
     """Fly one seed of the profile's scenario; any executor can send this function to a worker.
 
-    `record` writes the pictures beside the log. A refused flight is a result, too, without a log.
+    `record` writes the images beside the log. A refused flight is a result, too, without a log.
     Errors: NotFound, InvalidValue (calibration, log).
     """
 

@@ -1,4 +1,4 @@
-"""Rows on the camera and the target in its pictures, from a rehearsal. Pure.
+"""Rows on the camera and the target in its images, from a rehearsal. Pure.
 
 If the target is the positioning system, one more row says whether it is in view.
 """
@@ -34,14 +34,14 @@ from perchctl.target import overhead_text
 from perchctl.vision import CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
-"""Picture rates below which the check warns and fails, Hz. An AI-deck's program gives 8 as it is
+"""Image rates below which the check warns and fails, Hz. An AI-deck's program gives 8 as it is
 delivered, and a simulated vehicle perches with 7."""
 GAP_WARN = 0.4
-"""Longest gap between pictures before the check warns, as a share of `safety.camera_hold_s`."""
+"""Longest gap between images before the check warns, as a share of `safety.camera_hold_s`."""
 SEEN_WARN = 0.5
-"""Share of the pictures that must show the target, below which the check warns."""
+"""Share of the images that must show the target, below which the check warns."""
 LEAST_RATED = 10
-"""Number of pictures below which no rate can be computed."""
+"""Number of images below which no rate can be computed."""
 _AGAIN = {
     "camera": "plug the receiver or camera in again",
     "aideck": "switch the Crazyflie off and on again",
@@ -77,7 +77,7 @@ def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
-    """Compare the size of the pictures (None: unknown) with the calibration's."""
+    """Compare the size of the images (None: unknown) with the calibration's."""
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
@@ -86,7 +86,7 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """The rows of `picture_row_names` for a rehearsal; the first failed if no picture came."""
+    """The rows of `picture_row_names` for a rehearsal; the first failed if no image came."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture arrived during the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -98,7 +98,7 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
     return rows
 
 
-# --- The pictures ---
+# --- The images ---
 
 
 def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -113,7 +113,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge the longest gap between successive pictures."""
+    """Judge the longest gap between successive images."""
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
@@ -235,15 +235,15 @@ IN_VIEW = "in view"
 
 
 def picture_row_names(profile: Profile) -> tuple[str, ...]:
-    """The names of the rows of checks on pictures, in order."""
+    """The names of the rows of checks on images, in order."""
     return (*PICTURES, *([IN_VIEW] if profile.positioning.source.is_target else ()))
 
 
-# --- The computer that processes the pictures ---
+# --- The computer that processes the images ---
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by its processing time per picture and by late ticks; None: skipped."""
+    """Judge the loop by its processing time per image and by late ticks; None: skipped."""
     if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

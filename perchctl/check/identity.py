@@ -9,7 +9,7 @@ target   its camera sees its target where it must be from this home
 
 Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
 camera would show the same, or if the target is not in view, perchctl asks somebody to cover the
-lens: a picture that goes blind identifies the camera. Nothing is armed, and no motor turns.
+lens: an image that goes blind identifies the camera. Nothing is armed, and no motor turns.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BODY_AT_HOME_M = 0.25
 and another vehicle's corridor. Larger: neighbours that have swapped places may pass. Smaller: homes
 measured by tape fail."""
 DARK_SHARE = 0.5
-"""Share of dark or blank pictures above which a camera counts as covered. Larger: a hand that does
+"""Share of dark or blank images above which a camera counts as covered. Larger: a hand that does
 not cover the whole lens is not recognised. Smaller: a camera with a bad signal counts as
 covered."""
 _DARK = ("dark", "uniform")
@@ -189,7 +189,7 @@ class View:
     scope: CheckScope
 
     def rehearse(self, profile: Profile | None = None) -> Rehearsal:
-        """Process a few seconds of pictures. With `profile`, look for another target."""
+        """Process a few seconds of images. With `profile`, look for another target."""
         flown = profile or self.profile
         pipeline = make_pipeline(flown, self.calibrated)
         seconds = self.scope.rehearse_s
@@ -219,7 +219,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     own = view.rehearse()
     place_m = _target_place(own)
     away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
-    # Single pictures may be within the limit although the target is not.
+    # Single images may be within the limit although the target is not.
     if away_m <= target.expected_within_m:
         found = f"its camera sees its target {away_m:.2f} m from its place"
         if ask is None or not stand.lookalikes:

@@ -1,4 +1,4 @@
-"""Run the flight loop's perception on live pictures for a few seconds, to find out what it sees and
+"""Run the flight loop's perception on live images for a few seconds, to find out what it sees and
 how long it takes.
 
 A rehearsal cannot send anything to the vehicle: it has only the telemetry of its link.
@@ -40,7 +40,7 @@ TakeTelemetry = Callable[[], list[Telemetry]]
 
 @dataclass(frozen=True)
 class PictureProblem:
-    """A problem of a picture. `kind` is its name in `FrameHealth`, or ``mirrored``; None for any
+    """A problem of an image. `kind` is its name in `FrameHealth`, or ``mirrored``; None for any
     other problem."""
 
     text: str
@@ -52,15 +52,15 @@ class Rehearsal:
     """Result of a rehearsal.
 
     Attributes:
-        arrivals: index and arrival time of each picture.
-        repeats: number of repeated pictures, which other counts leave out.
-        processing_s: time for each tick with a picture; tick_delays_s: lateness of each tick.
-        ages_s: time from each picture's exposure, by `camera.latency_s`, to its result.
-        problem: the camera's at the end, or empty; problems: number of pictures by problem.
-        newest_outputs: the last few; target_pictures: number of pictures with a target.
-        silent_s: time without a picture at the end.
+        arrivals: index and arrival time of each image.
+        repeats: number of repeated images, which other counts leave out.
+        processing_s: time for each tick with an image; tick_delays_s: lateness of each tick.
+        ages_s: time from each image's exposure, by `camera.latency_s`, to its result.
+        problem: the camera's at the end, or empty; problems: number of images by problem.
+        newest_outputs: the last few; target_pictures: number of images with a target.
+        silent_s: time without an image at the end.
         target: the final estimate; None if the target was not in view.
-        target_places: time and place of the target, m, in each picture that measured it since the
+        target_places: time and place of the target, m, in each image that measured it since the
             vehicle came to rest.
         prints: the comparison of both markers; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
@@ -95,7 +95,7 @@ class Rehearsal:
 
     @property
     def frame_period_s(self) -> float | None:
-        """Mean time between pictures; None for fewer than two pictures, or for a recording."""
+        """Mean time between images; None for fewer than two images, or for a recording."""
         if not self.live or len(self.arrivals) < 2:
             return None
         (first, begin_s), (last, end_s) = self.arrivals[0], self.arrivals[-1]

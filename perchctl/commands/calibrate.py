@@ -1,4 +1,4 @@
-"""`perchctl calibrate`: make a calibration file or a mask from pictures, or check or convert a
+"""`perchctl calibrate`: make a calibration file or a mask from images, or check or convert a
 calibration."""
 
 from __future__ import annotations
@@ -86,12 +86,12 @@ def camera(
 ) -> None:
     """Calibrate the camera, and report the resulting error at the target in mm.
 
-    A report next to the calibration file (same name, .html) shows the coverage of the picture, the
+    A report next to the calibration file (same name, .html) shows the coverage of the image, the
     residuals, the spread of the views, and what to do better.
 
     A view is rejected if its RMS error exceeds 2.5 times that of the median view. A corner is
     rejected if its error exceeds 5 times the spread of its view. The report lists rejected views
-    and corners, and pictures without a board.
+    and corners, and images without a board.
     """
     say_on_terminal("looking for the board")
     pictures = _source(source, view)
@@ -149,7 +149,7 @@ def mask(
     force: ForceOption = False,
     size: SizeOption = None,
 ) -> None:
-    """Find the parts of the picture that the vehicle covers while you turn it in your hand."""
+    """Find the parts of the image that the vehicle covers while you turn it in your hand."""
     say_on_terminal("looking for what the vehicle covers")
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask")
@@ -183,7 +183,7 @@ def check(
     board: CheckBoardOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Check a calibration against new pictures of a board (exit code 1 if it fails)."""
+    """Check a calibration against new images of a board (exit code 1 if it fails)."""
     say_on_terminal(f"reading {calibration}")
     if not calibration.is_file() and file_kind(Path(source)) == "a camera calibration":
         raise UsageError(
@@ -272,11 +272,11 @@ def _find_views(
     view: bool = False,
     check: Callable[[tuple[int, int]], object] = lambda size_px: None,
 ) -> calibrations.FoundViews:
-    """Return the views, at least one, and the pictures without a board.
+    """Return the views, at least one, and the images without a board.
 
     Args:
         view: with the live page of a live camera.
-        check: called with a live camera's picture size before the person begins.
+        check: called with a live camera's image size before the person begins.
     """
     source = cameras.parse_source(spec)
     if source.scheme != "images":
@@ -317,7 +317,7 @@ def capture_live_views(
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(Stopper().as_handler())
-        # The page draws the picture and its corners, but no axes: any camera serves.
+        # The page draws the image and its corners, but no axes: any camera serves.
         any_camera = visions.CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(displays.live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guidance_display(page))

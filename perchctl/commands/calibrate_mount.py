@@ -223,7 +223,7 @@ def _record_live(
 
     recordings: list[calibrations.MountingRecording] = []
     with contextlib.ExitStack() as stack:
-        # Its pictures keep the camera's own time: what is taken off it is what is measured.
+        # Its images keep the camera's own time: what is taken off it is what is measured.
         frames = cameras.open_camera(
             source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
         )

@@ -82,7 +82,7 @@ def check(
 
     Each check passes, warns, fails, or is skipped if perchctl cannot find out. Nothing is armed,
     and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not answer,
-    20 if the camera gives no picture, and 52 if any other check fails.
+    20 if the camera gives no image, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")
@@ -173,7 +173,7 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def camera_rows() -> Iterator[checks.Row]:
-    """Yield a row for each camera; nothing is set, no picture taken. Errors: NotFound if none."""
+    """Yield a row for each camera; nothing is set, no image taken. Errors: NotFound if none."""
     for camera in cameras.find_cameras():
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)

@@ -61,7 +61,7 @@ def fit(
 ) -> int:
     """Fit the merge weights to poses with known ground truth, and verify that they help.
 
-    Each CSV row is one picture. Its columns are position (a number for each place), t_s, and
+    Each CSV row is one image. Its columns are position (a number for each place), t_s, and
     x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and actual_. The cells of a
     marker that was not detected are empty. All three poses are in the same coordinate frame;
     collect writes the target relative to the gear, in the level frame.

@@ -207,7 +207,7 @@ def replay(
 ) -> int:
     """Replay a flight from its log, and verify that every command is bit-for-bit identical.
 
-    If there is a recording next to the log, perchctl also processes its pictures again and
+    If there is a recording next to the log, perchctl also processes its images again and
     verifies the poses. With --set or --profile, it reports which decisions would have been
     different.
 
@@ -309,11 +309,11 @@ def film(
     ] = 960,
     force: ForceOption = False,
 ) -> None:
-    """Make a film of a flight: camera picture, side view to scale, error and thrust.
+    """Make a film of a flight: camera image, side view to scale, error and thrust.
 
-    The camera picture needs a recording next to the log (fly --record). The folder of a fleet's
+    The camera image needs a recording next to the log (fly --record). The folder of a fleet's
     flight (with a fleet.json) gives one film of all its vehicles: room from above, heights and
-    camera pictures.
+    camera images.
     """
     fleet = fleets.read_fleet_folder(file) if file is not None and file.is_dir() else None
     if fleet is not None:

@@ -96,7 +96,7 @@ QUESTIONS: dict[str, str] = {
     "safety.fence_radius_m": "1.5",
 }
 """What is asked, in this order, with the default: keys of the profile, the two edges of the
-picture, and the ceiling. Some defaults depend on earlier answers (`default_answer`)."""
+image, and the ceiling. Some defaults depend on earlier answers (`default_answer`)."""
 WORDS: dict[str, str] = {
     "link.uri": "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://",
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
@@ -185,7 +185,7 @@ def new(
 
     With --defaults, or with --set for every question, perchctl asks nothing. You describe the
     camera's mounting in words: hold a hand over the vehicle's front, then over its left side, and
-    say at which edge of the picture it appears.
+    say at which edge of the image it appears.
     """
     check_output(output, (".yaml", ".yml"), force, "a profile")
     say_on_terminal("reading the shipped profiles")
@@ -370,7 +370,7 @@ def profile_and_keys(
         )
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    # An AI-deck's few and late pictures need more than their calibration.
+    # An AI-deck's few and late images need more than their calibration.
     base = profiles.load_profile("aideck") if _is_aideck(source) else profiles.Profile()
     shipped = analysis.profile_differences(
         *(p.model_dump(mode="json") for p in (profiles.Profile(), base))
@@ -442,10 +442,10 @@ def schema() -> None:
     print(json.dumps(profiles.json_schema(), indent=2))
 
 
-# --- How a camera is turned, in words: which edge of its picture is the vehicle's front ---
-# People see the picture and the vehicle, and no axes: a hand over the vehicle's front comes into
-# the picture at one edge, over its left side at another. The two tell the camera's turn about
-# its view, and whether the picture is mirrored (docs/conventions.md, "Camera mount").
+# --- How a camera is turned, in words: which edge of its image is the vehicle's front ---
+# People see the image and the vehicle, and no axes: a hand over the vehicle's front comes into
+# the image at one edge, over its left side at another. The two tell the camera's turn about
+# its view, and whether the image is mirrored (docs/conventions.md, "Camera mount").
 
 
 PICTURE_EDGES: dict[str, tuple[int, int]] = {
@@ -454,13 +454,13 @@ PICTURE_EDGES: dict[str, tuple[int, int]] = {
     "bottom": (0, 1),
     "left": (-1, 0),
 }
-"""Where each is in the picture, x right and y down."""
+"""Where each is in the image, x right and y down."""
 UPRIGHT = math.cos(math.radians(30.0))
 
 
 def left_edges(front: str) -> tuple[str, str]:
-    """Return the picture's edge at the vehicle's left side if edge `front` is at its front: in an
-    unmirrored picture, and in a mirrored one."""
+    """Return the image's edge at the vehicle's left side if edge `front` is at its front: in an
+    unmirrored image, and in a mirrored one."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
@@ -468,19 +468,19 @@ def left_edges(front: str) -> tuple[str, str]:
 
 
 def yaw_deg_and_mirrored(front: str, left: str) -> tuple[float, bool]:
-    """Return the yaw in `camera.mount.rpy_deg` of a camera that looks up, and whether its picture
+    """Return the yaw in `camera.mount.rpy_deg` of a camera that looks up, and whether its image
     is mirrored. `left` is one of `left_edges(front)`."""
     x, y = PICTURE_EDGES[front]
     mirrored = left == left_edges(front)[1]
     if mirrored:
-        x = -x  # of the picture as it is flipped before use
-    # The front is at the angle a in the picture; x right, y down, seen from below: the turn is -a.
+        x = -x  # of the image as it is flipped before use
+    # The front is at the angle a in the image; x right, y down, seen from below: the turn is -a.
     turn_deg = -math.degrees(math.atan2(y, x))
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored
 
 
 def front_left_edges(mount: profiles.Mounting, mirrored: bool) -> tuple[str, str] | None:
-    """Return the edges of the raw picture at the vehicle's front and left side; None for a camera
+    """Return the edges of the raw image at the vehicle's front and left side; None for a camera
     that does not look up, or whose yaw is near an odd multiple of 45 deg."""
     R_cam_body = mount.T_body_cam[:3, :3].T
     if R_cam_body[2, 2] < UPRIGHT:

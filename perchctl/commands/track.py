@@ -75,13 +75,13 @@ def track(
     ] = "camera_optical_frame",
     view: ViewOption = False,
 ) -> None:
-    """Find the target in a camera stream, a video or pictures, without a vehicle.
+    """Find the target in a camera stream, a video or images, without a vehicle.
 
     Poses are in the OpenCV camera frame, with the marker axes of cv2.aruco:
     X_cam = R(rvec) X_marker + tvec. With --json, each line is an object with these fields:
 
     \b
-    frame         file name of the picture, or index of the frame
+    frame         file name of the image, or index of the frame
     t_s           time of exposure; for a live source, on the monotonic clock
     unix_s        the same as Unix time, or null for a recording
     stage         detected markers: large, both, small or none
@@ -90,15 +90,15 @@ def track(
     target        null, or rvec_rad, tvec_m, yaw_rad, sigma_m and sigma_yaw_rad
     pose          null, or frame_id, child_frame_id, position_m, quaternion_xyzw
                   and covariance
-    note          what is wrong with the picture, or why a pose is not the
+    note          what is wrong with the image, or why a pose is not the
                   target's; otherwise empty
 
-    If both markers are in view, target is their joint pose. Except for still pictures, target is
+    If both markers are in view, target is their joint pose. Except for still images, target is
     filtered, and continues for a few frames after stage becomes none. yaw_rad is
-    atan2(R[1,0], R[0,0]), the marker's heading in the picture plane. sigma_m is along the camera's
+    atan2(R[1,0], R[0,0]), the marker's heading in the image plane. sigma_m is along the camera's
     x, y and z axes.
 
-    pose is the target's pose from this picture alone, for ROS 2 and filters of your own. Its axes
+    pose is the target's pose from this image alone, for ROS 2 and filters of your own. Its axes
     are the marker's, turned by 180 deg about x, so that z points away from the camera. covariance
     has 36 numbers, row by row: x, y, z (m), then small rotations about the camera's x, y, z (rad).
 
@@ -127,7 +127,7 @@ def track(
             paths, count = recording.paths, recording.count
         advice = ", the shipped example: name your camera's with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
-        # Files of pictures need not belong together.
+        # Files of images need not belong together.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
         target: TargetInCamera | None = None
         stack.enter_context(stop.as_handler())  # until here Ctrl-C ends at once
@@ -204,7 +204,7 @@ def poll_until_stopped(
 
 @dataclass(frozen=True, eq=False)
 class TargetInCamera:
-    """The target's pose in the camera frame; `yaw_rad` is the heading in the picture's plane,
+    """The target's pose in the camera frame; `yaw_rad` is the heading in the image's plane,
     `sigma_m` (3,) is along the camera's axes."""
 
     rvec_rad: Array
@@ -216,14 +216,14 @@ class TargetInCamera:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Tracking result of one picture.
+    """Tracking result of one image.
 
     Attributes:
-        name: the picture's file name, or else the frame's index.
-        output: the pipeline's output; None if the picture was not searched.
+        name: the image's file name, or else the frame's index.
+        output: the pipeline's output; None if the image was not searched.
         target: the target's pose; at stage ``none`` predicted by the filter.
-        notes: remarks on the picture, a sentence each.
-        sighting: the pose by this picture alone; None if the picture was not searched.
+        notes: remarks on the image, a sentence each.
+        sighting: the pose by this image alone; None if the image was not searched.
     """
 
     name: str | int
@@ -261,7 +261,7 @@ def target_in_camera(
         known = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
     if known is None:
         return None
-    # The filter holds position and yaw; the tilt is the picture's own.
+    # The filter holds position and yaw; the tilt is the image's own.
     R = np.asarray(cv2.Rodrigues(known.rvec_rad)[0], dtype=np.float64)
     R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
     rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
@@ -396,7 +396,7 @@ class DatagramSender:
             ) from None
         self._address = found[0][4]
         self._socket = socket.socket(found[0][0], socket.SOCK_DGRAM)
-        self._socket.setblocking(False)  # a full buffer must not delay the next picture
+        self._socket.setblocking(False)  # a full buffer must not delay the next image
         self._is_failing = False
 
     def __enter__(self) -> DatagramSender:

@@ -1,7 +1,7 @@
-"""The live page of a fleet: a tile for each vehicle with its picture, and buttons to stop.
+"""The live page of a fleet: a tile for each vehicle with its image, and buttons to stop.
 
-Each vehicle's own process serves its pictures (`FlightPage`). The page's threads fetch one when a
-browser asks for it, so that no picture ever goes through the line on which the orders go.
+Each vehicle's own process serves its images (`FlightPage`). The page's threads fetch one when a
+browser asks for it, so that no image ever goes through the line on which the orders go.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ EVENTS_SHOWN = 200
 """Number of lines of events. More: each answer to a browser is larger. Fewer: a page that is opened
 late does not show the beginning of a long flight."""
 PICTURE_TIMEOUT_S = 0.5
-"""Time for a vehicle's process to deliver a picture, s. Longer: a process that hangs delays the
-other tiles. Shorter: pictures from a busy computer are missing."""
+"""Time for a vehicle's process to deliver an image, s. Longer: a process that hangs delays the
+other tiles. Shorter: images from a busy computer are missing."""
 LARGEST_PICTURE_BYTES = 2_000_000
-"""Largest JPEG, bytes. Larger: data that is no picture fills the memory. Smaller: large cameras
-show no picture."""
+"""Largest JPEG, bytes. Larger: data that is no image fills the memory. Smaller: large cameras
+show no image."""
 
 
 class FleetPage(Page):
@@ -75,7 +75,7 @@ class FleetPage(Page):
         self._events.append(line)
 
     def picture(self, name: str) -> bytes | None:
-        """The newest picture of the vehicle with this number; None if there is none now."""
+        """The newest image of the vehicle with this number; None if there is none now."""
         port = next((r.picture_port for r in self._rows if str(r.number) == name), None)
         return None if port is None else _fetch_picture(port)
 
@@ -106,7 +106,7 @@ class FleetPage(Page):
 
 
 def _fetch_picture(port: int) -> bytes | None:
-    """Return the newest picture of the page on this port of this computer; None if it has none."""
+    """Return the newest image of the page on this port of this computer; None if it has none."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PICTURE_TIMEOUT_S)
     with contextlib.closing(connection):
         try:

@@ -31,7 +31,7 @@ class FleetRow:
         link_s: age of the newest telemetry.
         has_ended: its flight is over; `hangs`: and it hangs with its motors off.
         is_silent: its process has sent nothing for too long.
-        picture_port: of this computer, where its process serves its pictures.
+        picture_port: of this computer, where its process serves its images.
     """
 
     number: int

@@ -1,4 +1,4 @@
-"""The live page of one camera: newest picture and numbers.
+"""The live page of one camera: newest image and numbers.
 
 The loop only stores references to the newest values. Drawing, JPEG encoding and HTTP happen in the
 page's threads; an error there is stored in `problem` and never raised.
@@ -28,7 +28,7 @@ _PICTURE_STALE_S = 1.0
 
 
 class LivePage(Page):
-    """Serves one page with the newest picture on localhost until closed.
+    """Serves one page with the newest image on localhost until closed.
 
     Args:
         camera: projects the axes to draw.
@@ -69,20 +69,20 @@ class LivePage(Page):
 
     @property
     def _is_fresh(self) -> bool:
-        """True while pictures arrive."""
+        """True while images arrive."""
         return self._clock() - self._picture_s < _PICTURE_STALE_S
 
     def state(self) -> dict[str, Any]:
-        """The state of `Page.state`, with ``fresh``: whether pictures arrive."""
+        """The state of `Page.state`, with ``fresh``: whether images arrive."""
         return super().state() | {"fresh": self._is_fresh}
 
     def picture(self, name: str) -> bytes | None:
-        """The newest picture while pictures come; `name` is not used."""
+        """The newest image while images come; `name` is not used."""
         newest = self.jpeg_after(0) if self._is_fresh else None
         return None if newest is None else newest[1]
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
-        """Wait for a picture newer than `number`; return its number and JPEG, or None on a
+        """Wait for an image newer than `number`; return its number and JPEG, or None on a
         timeout."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._number > number, LIVE_WAIT_S)
@@ -126,7 +126,7 @@ def live_page(
             report(f"the live page failed: {page.problem}")
 
 
-# --- The picture with the detections drawn on it: outlines and the target's axes ---
+# --- The image with the detections drawn on it: outlines and the target's axes ---
 
 
 # Blue, green, red.
@@ -141,7 +141,7 @@ _DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """A picture with the overlay to draw on it, which is done outside the flight loop.
+    """An image with the overlay to draw on it, which is done outside the flight loop.
 
     Attributes:
         image: grey (h, w) uint8; not changed by drawing.
@@ -171,7 +171,7 @@ def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """The picture with its overlay, BGR (h, w, 3) uint8. Lines far outside the picture, and
+    """The image with its overlay, BGR (h, w, 3) uint8. Lines far outside the image, and
     axes with a tip behind the camera, are left out."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:

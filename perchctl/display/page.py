@@ -1,4 +1,4 @@
-"""The live page of a flight: pictures, numbers, and buttons to land and to cut the motors."""
+"""The live page of a flight: images, numbers, and buttons to land and to cut the motors."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Page:
     HTML: ClassVar[str]
     """The page's file, with placeholders for the style and script that all pages share."""
     HAS_STREAM: ClassVar[bool] = False
-    """True if `jpeg_after` gives pictures."""
+    """True if `jpeg_after` gives images."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Page:
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show a card (outcome, good, reason, rows) over the last picture and values. Waits up
+        """Show a card (outcome, good, reason, rows) over the last image and values. Waits up
         to a second for a polling browser to get the card."""
         with self._changed:
             self._card, self._state_s = card, None
@@ -120,11 +120,11 @@ class Page:
         }
 
     def picture(self, name: str) -> bytes | None:
-        """The newest picture of this name as JPEG; None if there is none now. May wait a second."""
+        """The newest image of this name as JPEG; None if there is none now. May wait a second."""
         return None
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
-        """Wait for a picture newer than `number`; return its number and JPEG, or None on a
+        """Wait for an image newer than `number`; return its number and JPEG, or None on a
         timeout."""
         return None
 
@@ -169,7 +169,7 @@ class Page:
 HOSTS = ("127.0.0.1", "localhost", "::1")
 TOKEN_HEADER = "X-Perchctl-Token"
 LEAST_PERIOD_S = 0.04
-"""Time between two pictures to one reader, s: the eye needs no more than 25 a second."""
+"""Time between two images to one reader, s: the eye needs no more than 25 a second."""
 _CLIENT_TIMEOUT_S = 5.0
 _BOUNDARY = "perchctlpicture"
 
@@ -281,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
                 continue
             number, jpeg = newest
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-            # The next boundary is sent with the picture; otherwise a browser shows it one picture
+            # The next boundary is sent with the image; otherwise a browser shows it one image
             # late.
             self.wfile.write(head.encode() + jpeg + f"\r\n--{_BOUNDARY}\r\n".encode())
             time.sleep(LEAST_PERIOD_S)

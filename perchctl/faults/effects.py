@@ -75,7 +75,7 @@ def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
 
 
 def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
-    """Begin the `CameraFault` with these values, which corrupts the pictures for `for_s`."""
+    """Begin the `CameraFault` with these values, which corrupts the images for `for_s`."""
     rig.camera.begin_fault(CameraFault(kind, for_s, late_s), t_s)
 
 

@@ -219,7 +219,7 @@ class FaultyFlight:
         self._facts.update(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.on_floor and not sample.motors_on:
-            # otherwise most of the time would be spent rendering pictures of the wait
+            # otherwise most of the time would be spent rendering images of the wait
             self._vehicle.camera = None
         self._on_sample(t_s)
 

@@ -232,7 +232,7 @@ TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED
 GUIDED_BY_CAMERA = frozenset(CAMERA_GUIDED) | {Phase.HOVER}
 FREE_AIR = GUIDED_BY_CAMERA | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
-"""The camera faults that leave no usable picture. During a fault in `NO_SIGHT`, no target can be
+"""The camera faults that leave no usable image. During a fault in `NO_SIGHT`, no target can be
 seen."""
 # "dark" is missing because a target close by is found in the dark
 NO_SIGHT = (*NO_PICTURE, "covered")

@@ -54,7 +54,7 @@ REST_S = 1.9
 older samples. A shorter time shows less of a slow drift."""
 DRIFT_M = 0.07
 """Largest distance by which the estimate may move in that time (0.037 m/s). A healthy estimate
-moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from pictures, and
+moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from images, and
 0.035 m with ranging anchors."""
 STANDING_MPS = 0.1
 """Largest mean velocity of the estimate in that time. With the target as the only source of

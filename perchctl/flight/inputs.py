@@ -39,7 +39,7 @@ from perchctl.vision import (
 )
 
 DOUBTFUL_KINDS = ("dark", "uniform")
-"""Kinds of doubtful pictures that are searched anyway. A target may still be visible in a dark one,
+"""Kinds of doubtful images that are searched anyway. A target may still be visible in a dark one,
 and a bare ceiling looks like an empty screen."""
 HEARD_S = 0.15  # extrapolating a detection with an older estimate would make the vehicle oscillate
 
@@ -78,7 +78,7 @@ class FlightInputs:
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    is_logged: bool = False  # then with the pictures' checksums
+    is_logged: bool = False  # then with the images' checksums
     # Called with each frame as the source delivered it.
     on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
@@ -91,7 +91,7 @@ class FlightInputs:
     repeated: bool = False  # this tick's frame is identical to the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
-    # The kind, by `FrameHealth`, of the picture that is the camera's problem; None for another kind
+    # The kind, by `FrameHealth`, of the image that is the camera's problem; None for another kind
     # of problem.
     problem_kind: str | None = None
     frames: int = 0
@@ -155,7 +155,7 @@ class FlightInputs:
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
-        # a source of another size; a single picture of another size is only torn
+        # a source of another size; a single image of another size is only torn
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         self._frame_kind = "ok"
@@ -196,9 +196,9 @@ class FlightInputs:
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def picture_problem(self, now_s: float) -> str | None:
-        """Return why there is no good picture now; None if there is one. Either none has arrived,
+        """Return why there is no good image now; None if there is one. Either none has arrived,
         the newest could not be used as a measurement, or the last good one is older than
-        `safety.camera_hold_s`. A picture that is only dark or empty counts as good."""
+        `safety.camera_hold_s`. An image that is only dark or empty counts as good."""
         age_s = now_s - self.last_good_frame_s
         if self.frames == 0:
             return self.camera_problem or "none has arrived"
@@ -225,7 +225,7 @@ class FlightInputs:
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late_samples=tuple(late))
         if self.last_good_frame_s == began_s:
-            # this tick did get a picture, so the camera has not failed
+            # this tick did get an image, so the camera has not failed
             self.last_good_frame_s = now_s
 
     def observation(self, now_s: float) -> Observation:
@@ -253,7 +253,7 @@ class FlightInputs:
 
     @property
     def poses(self) -> dict[str, UnfilteredPose]:
-        """The unfiltered poses from this tick's picture, of the `large`, `small` and `joint`
+        """The unfiltered poses from this tick's image, of the `large`, `small` and `joint`
         markers."""
         poses = {} if self.output is None else self.output.poses
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
@@ -272,7 +272,7 @@ class FlightInputs:
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
         """Return why this frame cannot be used as a measurement: it has another size, is frozen, is
-        not a picture at all, or is too old."""
+        not an image at all, or is too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
@@ -300,7 +300,7 @@ class FlightInputs:
 
 # --- The target as positioning system, tick by tick ---
 # While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
-# better than from any picture, so the known position is sent instead. This ends with the first
+# better than from any image, so the known position is sent instead. This ends with the first
 # sample in which the accelerometer no longer shows that something carries the vehicle. Otherwise a
 # vehicle that falls would be told that it still hangs, and would look as if it did.
 
@@ -319,7 +319,7 @@ FROZEN_ATTITUDE_S = 0.06
 """Age above which an unchanged attitude no longer counts as the attitude at the exposure, s. An
 error of 0.1 rad displaces a vehicle 1.2 m below the target by 12 cm."""
 PICTURE_AHEAD_S = 0.1
-"""Largest time by which a picture may be ahead of the loop's clock, s. Beyond it, its time stamp
+"""Largest time by which an image may be ahead of the loop's clock, s. Beyond it, its time stamp
 comes from another clock."""
 
 
@@ -332,7 +332,7 @@ class TargetPositioning:
         self._touches = False
 
     def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:
-        """Begin a tick: send a supported vehicle's position if it is known without a picture."""
+        """Begin a tick: send a supported vehicle's position if it is known without an image."""
         newest = history.newest
         self._touches = in_contact
         if newest is None or not is_supported(history, now_s):

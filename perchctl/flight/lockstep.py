@@ -39,7 +39,7 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import Frame, Step, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
-_QUEUED = 2  # number of pictures that may wait; a newer one replaces the oldest
+_QUEUED = 2  # number of images that may wait; a newer one replaces the oldest
 HARD_LANDING_MPS = 1.0  # hitting the floor faster than this is a fall, whatever the log says
 FIRST_FRAME_S = 1.0
 

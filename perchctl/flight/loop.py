@@ -263,7 +263,7 @@ def _mission(
         parts.begin_turn()
         inputs.poll_inputs(
             began_s,
-            # Close to the ceiling, the picture shows no target and cannot be used for steering.
+            # Close to the ceiling, the image shows no target and cannot be used for steering.
             search=state is None or state.phase is not Phase.COMPLETE,
             sends_sights=state is None or state.belief.dead_reckoning_since_s is None,
             drops_sightings=drops_sightings,

@@ -101,7 +101,7 @@ class GroundTurn:
 
     `waited_s`: how long it has waited in all; `took_s`: how long this turn took so far;
     `samples`: the telemetry of the last moments, oldest first, the newest `telemetry_age_s` old;
-    `picture_problem`: why there is no good and fresh picture, `unseen_s` after the last one;
+    `picture_problem`: why there is no good and fresh image, `unseen_s` after the last one;
     `link_problem`: what is wrong with the link.
     """
 
@@ -297,7 +297,7 @@ def view_problem(
 ) -> Problem | None:
     """Problem: the target would be lost on the way up. With the vehicle leaning a little at
     take-off height, over the start or over `planner.approach_xy_m`, no marker would be completely
-    in the picture. `yaw_rad` is the vehicle's heading."""
+    in the image. `yaw_rad` is the vehicle's heading."""
     planner, (x, y, z) = profile.planner, start_m
     advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
     for over in ((x, y), planner.approach_xy_m):
@@ -338,7 +338,7 @@ def target_view_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """The view of a vehicle that leans so that the target moves to the picture's edge."""
+    """The view of a vehicle that leans so that the target moves to the image's edge."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.has_marker and aside_m > 1e-9):

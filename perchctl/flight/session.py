@@ -59,7 +59,7 @@ class FlyOptions:
     link_uri: str | None = None
     """What the link opens instead of `uri`: the vehicle behind a radio hub."""
     serve_pictures: bool = False
-    """The process of a vehicle in a fleet provides its pictures for the fleet's page."""
+    """The process of a vehicle in a fleet provides its images for the fleet's page."""
 
     @property
     def simulated(self) -> bool:

@@ -268,7 +268,7 @@ def rescue(
         position_age_s: age of the newest external position at a time; positions are no longer
             sent if the target is the positioning system.
         on_sent: called with each command that was sent.
-        motion: the motion that pictures and accelerometer last agreed on.
+        motion: the motion that images and accelerometer last agreed on.
     """
 
     def send(command: Command) -> None:

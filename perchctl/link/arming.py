@@ -1,4 +1,4 @@
-"""Disarm the vehicle at the end of a session, for every kind of link.
+"""Disarm the vehicle at the end of a session. Every kind of link uses this module.
 
 A vehicle that does not arm itself spins its propellers while it is armed, even on the ground.
 `perchctl.flight` arms it once everything else is ready. Whatever ends the session on the ground,
@@ -21,13 +21,13 @@ from perchctl.vehicle import (
 )
 
 DISARM_S = 2.0
-"""Time for which the order is repeated, s. Larger: without a radio, the end of a session is
-delayed. Smaller: a radio that is silent for a moment is given up."""
+"""Time for which the disarm command is repeated, s. Larger: the session ends later if the radio is
+dead. Smaller: a short radio dropout may leave the vehicle armed."""
 DISARM_PERIOD_S = 0.1
-"""Time between two orders to disarm, s."""
+"""Time between two disarm commands, s."""
 ANSWERED_S = 0.1
-"""Time after the order from which a sample shows its effect, s: the supervisor reacts within 40
-ms."""
+"""Time after the disarm command from which telemetry shows its effect, s. The supervisor reacts
+within 40 ms."""
 
 
 def disarm(
@@ -38,19 +38,20 @@ def disarm(
     *,
     was_ordered: bool,
 ) -> bool:
-    """Disarm a vehicle on the ground until its telemetry confirms it; bounded by `DISARM_S`.
+    """Repeat the disarm command to a vehicle on the ground until its telemetry confirms it, for at
+    most `DISARM_S`.
 
-    Nothing is sent to a vehicle that arms itself, or that nobody has armed. The order is sent only
-    while fresh telemetry says that the vehicle does not fly: in the air, it would cut the motors.
-    The flying bit stays set for 2 s after they stop. Returns False if the vehicle may still be
-    armed.
+    Nothing is sent to a vehicle that arms itself or that is not armed. The command is sent only
+    while fresh telemetry says that the vehicle is not flying, because it would cut the motors in
+    the air. The flying bit stays set for 2 s after the motors stop. Returns False if the vehicle
+    may still be armed.
 
     Args:
         newest: function that returns the newest telemetry, None without any.
-        send: function that sends an order to the vehicle, after the orders before it.
+        send: function that queues a command for the vehicle.
         clock, wait: functions that return the present time, s, and wait for some seconds.
-        was_ordered: this session has sent `Arm(True)`, which may take effect at any time; then only
-            a sample from after the order to disarm counts.
+        was_ordered: True if this session has sent `Arm(True)`, which may take effect at any time.
+            Only a sample newer than the disarm command then confirms that the vehicle is disarmed.
     """
     end_s, ordered_s = clock() + DISARM_S, None
     while True:

@@ -1,7 +1,7 @@
 """Connect a simulated or real Crazyflie with cflib: the flight's only access to the radio.
 
-No call blocks without a bound, and cflib's callbacks make no blocking calls. The link is closed
-only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
+Every call that may block has a timeout, and cflib's callbacks make no blocking calls. The link is
+closed only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
 (docs/firmware.md, "When setpoints stop"). perchctl waits for a radio that falls silent, and reopens
 a driver that has ended.
 """
@@ -57,7 +57,7 @@ from perchctl.vehicle import (
 )
 
 SILENCE_S = 1.5
-"""Time without telemetry that is a problem of the link, s."""
+"""Time without telemetry after which the link counts as lost, s."""
 DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
@@ -98,7 +98,7 @@ class CflibLink:
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
         self._lost_since_s: float | None = None  # time of the last arrival, while the link is lost
-        self._was_armed = False  # armed by an order of this session
+        self._was_armed = False  # armed by a command of this session
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -127,7 +127,7 @@ class CflibLink:
     def send_external(self, place: ExternalPosition) -> bool:
         try:
             return self.connection is not None and self.connection.send(*encode(place))
-        except Exception:  # an error of the library; commands report their own
+        except Exception:  # any error from cflib; failures to send are reported separately
             return False
 
     def settle_estimator(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
@@ -157,15 +157,16 @@ class CflibLink:
         return None
 
     def new_notes(self) -> list[str]:
-        """Return sentences about harmless failures since the last call."""
+        """Return messages about harmless failures since the last call."""
         return [] if self._sender is None else self._sender.new_notes()
 
     def close(self) -> None:
-        """Close when nothing flies; otherwise leave the link without its farewell packet.
+        """Close the link. If the vehicle may still be flying, do so without cflib's farewell
+        packet.
 
-        On the ground, a vehicle that does not arm itself is disarmed. For a vehicle that still
-        reports flying after the wait, or whose state is unknown, its own landing or levelling is
-        safer than a zero setpoint.
+        On the ground, a vehicle that does not arm itself is disarmed. If the vehicle still reports
+        flying after the wait, or if its state is unknown, the firmware's own landing or levelling
+        is safer than a zero setpoint.
         """
         if self._sender is not None:
             self._sender.drain(DRAIN_S)
@@ -206,7 +207,8 @@ class CflibLink:
         )
 
     def _unlock_thrust(self, connection: Connection) -> None:
-        """Unlock the raw thrust; on the ground only, since its zero thrust cuts the motors."""
+        """Unlock raw thrust. Only called on the ground, because the zero-thrust packet cuts the
+        motors."""
         newest, now_s = self._blocks.newest, self._clock()
         if not is_fresh(newest, now_s):
             raise ConnectionFailed(
@@ -253,7 +255,8 @@ class CflibLink:
             connection.reopen(f"the radio has neither taken nor lost a packet for {stuck_s:.1f} s")
 
     def _may_hear_more(self) -> bool:
-        """True unless the link is lost permanently: with a sender, it is being reopened."""
+        """True unless the link is lost permanently. While a sender exists, a lost link is being
+        reopened."""
         connection = self.connection
         return connection is not None and (connection.lost is None or self._sender is not None)
 
@@ -264,18 +267,18 @@ class CflibLink:
         return newest is not None and is_armed_by_request(newest.supervisor)
 
     def _may_say_farewell(self) -> bool:
-        """True if a zero setpoint neither drops nor locks the vehicle, according to fresh
-        telemetry."""
+        """True if fresh telemetry shows that a zero setpoint would neither drop nor lock the
+        vehicle."""
         return not may_be_flying(self._blocks.newest, self._clock())
 
     def _leave(self, *, farewell: bool) -> None:
-        """Release the link. With `farewell`, cflib sends its zero setpoint, which drops a flying
-        vehicle."""
+        """Release the link. If `farewell` is True, cflib sends its zero setpoint, which drops a
+        flying vehicle."""
         connection, self.connection = self.connection, None
         if connection is None:
             return
         at_s, linked = self._clock(), connection.lost is None
         connection.close(farewell=farewell)
         if farewell and linked:
-            with contextlib.suppress(Exception):  # errors of any observer
+            with contextlib.suppress(Exception):  # an observer's error must not end the link
                 self._on_sent(SentCommand(at_s, "farewell", FAREWELL))

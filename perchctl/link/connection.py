@@ -1,4 +1,4 @@
-"""An open `cflib.crazyflie.Crazyflie`: opening and closing within bounds, sending, and a lock
+"""An open `cflib.crazyflie.Crazyflie`: opening and closing with timeouts, sending, and a lock
 against other programs."""
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ CONNECT_TRIES = 2
 LINK_CLOSE_TIMEOUT_S = 3.0
 """Longest wait for a driver to close, s."""
 RADIO_RETRIES = 100_000
-"""Number of successive lost packets after which cflib gives a radio up: about 200 s, instead of 0.2
-s for cflib's own 100. Waiting recovers better: a radio that was given up must negotiate safelink
-again."""
+"""Number of successive lost packets after which cflib gives up on a radio link: about 200 s,
+instead of 0.2 s with cflib's default of 100. Waiting is better, because a link that was given up
+must negotiate safelink again."""
 REOPEN_PAUSE_S = 0.05
 """Time between two attempts to reopen a driver, s."""
 SAFELINK_S = 0.15
-"""Time for a driver to negotiate safelink, s: its ten attempts take 20 to 50 ms."""
+"""Timeout for safelink negotiation, s. A driver's ten attempts take 20 to 50 ms."""
 DEAD_S = 0.5
-"""Time without any answer after which a dongle counts as dead, s: it reports even a lost packet
-within 2 ms."""
+"""Time without any answer after which a dongle counts as dead, s. A working dongle reports even a
+lost packet within 2 ms."""
 
 
 class Connection:
@@ -62,12 +62,12 @@ class Connection:
         # guards the fields below; cflib is never called with it held
         self._change = threading.Lock()
         self._left = False
-        self._number = 0  # number of the present driver; reports of earlier ones are ignored
+        self._number = 0  # number of the current driver; reports from earlier drivers are ignored
         self._closer: threading.Thread | None = None
         self._opener: threading.Thread | None = None
         self._has_safelink = False
         self._refused_since_s: float | None = None  # since when the lock was not available
-        # last call of `is_dead`, and start of the unchanged count
+        # time of the last call of `is_dead`, and time since which the count has not changed
         self._asked_s = self._counted_s = 0.0
         self._counted: object = None
         internals.replace_error_callback(self.cf, partial(self._on_error, self._number))
@@ -86,10 +86,11 @@ class Connection:
         return True
 
     def send(self, packet: Packet) -> bool:
-        """Send a packet now, or not at all; return True if the driver has accepted it.
+        """Send a packet now or not at all. Return True if the driver accepted it.
 
-        Unlike cflib's `send_packet`, it never waits for cflib's lock or for the single place in its
-        radio's queue. That wait takes 2 s, after which the driver reports its end inside the call.
+        Unlike cflib's `send_packet`, this method never waits for cflib's lock or for the single
+        slot in the radio driver's queue. That wait would take 2 s, after which the driver would
+        report its own failure from inside the call.
         """
         if self.lost is not None:
             return False
@@ -115,8 +116,8 @@ class Connection:
 
         Must be called repeatedly, and only while the driver accepts no packet.
 
-        A radio out of reach counts its lost packets and recovers by itself. A radio whose dongle
-        was unplugged counts nothing, and cflib retries forever in this case, too.
+        If the vehicle is out of range, the driver counts lost packets and recovers by itself. If
+        the dongle was unplugged, the driver counts nothing, but cflib still retries forever.
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -131,8 +132,8 @@ class Connection:
         return not thread.is_alive() or (left is not None and now_s - self._counted_s > DEAD_S)
 
     def reopen(self, cause: str | None = None) -> None:
-        """Open new drivers until one answers, to replace a driver that has ended or, with `cause`,
-        is given up. Returns at once; the link is `lost` until a driver answers."""
+        """Replace the driver: open new drivers until one answers. The old one has ended or, if
+        `cause` is given, is closed. Returns at once; the link is `lost` until a driver answers."""
         with self._change:
             if self._left or (self._opener is not None and self._opener.is_alive()):
                 return
@@ -143,8 +144,8 @@ class Connection:
             self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
-        """Release the driver. With `farewell`, cflib sends its zero setpoint, which drops a flying
-        vehicle; otherwise nothing more is sent."""
+        """Release the driver. If `farewell` is True, cflib sends its zero setpoint, which drops a
+        flying vehicle; otherwise nothing is sent."""
         calls = [self.cf.close_link]
         with self._change:
             self._left = True
@@ -156,7 +157,7 @@ class Connection:
         self.claim.close()
 
     def _on_error(self, number: int, message: str) -> None:
-        """Record a driver's end; called in any thread, at any time."""
+        """Record that a driver has ended. Called in any thread, at any time."""
         with self._change:
             if number == self._number and not self._left:
                 self._give_up(find_cause(message))
@@ -172,7 +173,7 @@ class Connection:
         self.cause, self.lost = cause, _cause_text(cause)
 
     def _give_up(self, cause: Problem) -> None:
-        """Close the present driver without a replacement; called with `_change` held."""
+        """Close the current driver without a replacement. Called with `_change` held."""
         self._number += 1
         self._lose(cause)
         driver, self.cf.link = self.cf.link, _Nowhere()
@@ -198,7 +199,7 @@ class Connection:
                 self.cf.link_statistics.radio_link_statistics_callback,
                 partial(self._on_error, number),
             )
-        except Exception:  # any error of the driver: the radio is not available yet
+        except Exception:  # any driver error: the radio is not available yet
             return False
         if driver is None:
             return False
@@ -213,11 +214,12 @@ class Connection:
         return False
 
     def _agrees_on_safelink(self, driver: Any) -> bool:
-        """Wait, bounded, for a new driver's safelink; return True if it has one, or needs none.
+        """Wait for a new driver to negotiate safelink, with a timeout. Return True if it has
+        safelink or does not need it.
 
-        A vehicle that has used safelink accepts one packet of a driver without it, then none
-        (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach remains such a
-        driver for its lifetime.
+        A vehicle that has used safelink accepts only one packet from a driver without safelink
+        (docs/firmware.md, "Safelink"). A driver that was opened while the vehicle was out of range
+        never gets safelink.
         """
         end_s = time.monotonic() + SAFELINK_S
         while self._has_safelink and not internals.has_safelink(driver):
@@ -276,9 +278,9 @@ def open_connection(uri: str, timeout_s: float, *, shown_uri: str | None = None)
 
 
 def init_cflib() -> None:
-    """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence cflib, which logs what it also reports by callback and prints on stdout. Raises
-    UsageError if this cflib lacks a part that perchctl needs."""
+    """Register cflib's drivers, keep the radio driver from giving up after the first lost packets,
+    and silence cflib, which prints to stdout and logs errors that it also reports by callback.
+    Raises UsageError if this cflib lacks a part that perchctl needs."""
     import cflib.crtp
 
     internals.check_internals()
@@ -325,7 +327,8 @@ _CAUSES = {
 
 
 def find_cause(message: str) -> Problem:
-    """Return cflib's message without its traceback or, if known, the cause and its remedy."""
+    """Return the cause of a cflib error and its remedy if they are known, otherwise cflib's message
+    without the traceback."""
     for words, cause in _CAUSES.items():
         if words in message:
             return cause
@@ -343,7 +346,7 @@ def _cause_text(cause: Problem) -> str:
 
 
 def _separator(cause: Problem) -> str:
-    """Return what precedes the remedy: a remedy of several lines begins with a line of its own."""
+    """Return the separator before the remedy: a line break if the remedy has several lines."""
     return ".\n" if "\n" in cause.advice else "; "
 
 
@@ -363,8 +366,8 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
 
 
 # --- One program per vehicle: a lock shared by this user's programs on this computer ---
-# cflib's connect would reset the log blocks of a vehicle that flies for another program, and two
-# streams of setpoints would conflict.
+# Connecting by cflib would reset the log blocks of a vehicle that flies for another program, and
+# two streams of setpoints would conflict.
 
 
 def lock_vehicle(uri: str, shown_uri: str | None = None) -> contextlib.ExitStack:

@@ -65,7 +65,7 @@ class Packet(NamedTuple):
 
 
 LAND_TIMES = 3
-"""Number of times that a landing order is sent."""
+"""Number of times that a landing command is sent."""
 # Port 7: channels, then types of setpoints.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
@@ -82,8 +82,8 @@ _ARM, _EMERGENCY_STOP = 1, 3
 
 
 def encode(message: Command | ExternalPosition) -> tuple[Packet, ...]:
-    """Return the packets of a command or an external position in the order of sending; none for
-    `Idle`.
+    """Return the packets for a command or an external position, in the order in which they are
+    sent; none for `Idle`.
 
     Raises InvalidValue for a number that does not fit into its field.
     """
@@ -105,9 +105,9 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
         case Land(height, duration):
             # Without a yaw, to which the vehicle would rotate on the way: cflib's `yaw=None`.
             data = struct.pack("<BBff?f", _LAND_2, _ALL_GROUPS, height, 0.0, True, duration)
-            # The order comes first, and three times: the notify message alone cuts the motors at
-            # once (docs/firmware.md, "Notify alone"), so the order must not get lost. If the notify
-            # message is lost, the setpoint watchdog leaves 2 s in which everything is repeated.
+            # The landing command is sent first, three times: it must not get lost, because the
+            # notify message alone cuts the motors at once (docs/firmware.md, "Notify alone"). If
+            # the notify message is lost, the setpoint watchdog leaves 2 s to repeat everything.
             return (Packet(Port.HIGH_LEVEL, 0, data),) * LAND_TIMES + (_NOTIFY,)
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
@@ -126,7 +126,8 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
 
 
 def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
-    """Return a raw setpoint without yaw rate; the pitch is negated."""
+    """Return a raw setpoint with zero yaw rate. The pitch is negated for the Crazyflie's
+    convention."""
     roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
     return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
 
@@ -136,7 +137,8 @@ _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPO
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet after boot, on the ground, then the message that returns the priority.
 Without the first, raw thrust stays 0; without the second, the firmware does not execute its own
-landing (docs/firmware.md, "Raw thrust"). Their arrival is not confirmed, and a first raw thrust in
-the air would cut the motors, so they are sent `UNLOCK_TIMES`."""
+landing (docs/firmware.md, "Raw thrust"). The vehicle does not confirm these packets, and if they
+were lost, the first raw thrust in the air would cut the motors. They are therefore sent
+`UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
 """Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

@@ -1,5 +1,5 @@
-"""Set up the estimator of a vehicle with an external position: parameters, start, and agreement of
-estimate and measurement.
+"""Set up the estimator of a vehicle that uses external positions: set its parameters, start it, and
+check that estimate and measurement agree.
 
 On the ground only. The filter is reset to the capture's pose while positions already arrive;
 otherwise it would drift. Positions do not determine the heading, and a wrong heading makes the
@@ -36,8 +36,8 @@ RESETS = 3
 RESET_PULSE_S = 0.1
 """Time for which the reset parameter is set, s."""
 AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
-"""Time for agreement after one reset, and the time that the agreement must last, s; the number of
-resets is bounded by `RESETS`."""
+"""Timeout for agreement after one reset, and how long the agreement must last, s. There are at most
+`RESETS` resets."""
 RESET_AGREE_M = 0.05
 """Largest distance between estimate and capture after a reset, m: ten times the capture's assumed
 error."""
@@ -51,8 +51,8 @@ ESTIMATE_POLL_S = 0.02
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return the firmware's parameters for external positions, to be set after the user's own; none
-    with decks."""
+    """Return the firmware parameters for external positions, which are set after the user's own
+    parameters; none if decks measure the position."""
     if config.source.is_deck:
         return {}
     return {
@@ -78,7 +78,7 @@ def settle_estimator(
     clock: Callable[[], float],
     wait: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Reset the estimator until it agrees with the feed, on the ground. Bounded.
+    """Reset the estimator of a vehicle on the ground until it agrees with the feed, with a timeout.
 
     `newest` returns the vehicle's newest telemetry, and `wait` waits for some seconds. Raises
     ConnectionFailed for a vehicle that may be flying, NotFound, InvalidValue and TimedOut.
@@ -100,8 +100,8 @@ def settle_estimator(
         assert start is not None  # the loop above has waited for one
         x, y, z = start.position_m
         set_parameters(cf, uri, estimator_start_parameters(start))
-        # The estimate shows whether the reset was received: the firmware may clear the parameter by
-        # itself.
+        # Only the estimate shows whether the reset was received, because the firmware may clear the
+        # parameter itself.
         for value in (1, 0):
             set_parameters(cf, uri, {RESET_PARAMETER: value}, read_back=False)
             wait(RESET_PULSE_S * value)

@@ -1,4 +1,4 @@
-"""Check, set and read a connected vehicle's log variables and parameters by name, within bounds."""
+"""Check, set and read a connected vehicle's log variables and parameters by name, with timeouts."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ NEEDED_PROTOCOL = 12
 """Protocol version from firmware 2026.08 on, with the supervisor's own port (docs/firmware.md,
 "Link")."""
 PARAMETER_TIMEOUT_S = 2.0
-"""Time for the answer to a parameter, s."""
+"""Timeout for the answer to a parameter request, s."""
 ASKED_TIMES = 10
-"""Number of requests for the kind of vehicle."""
+"""Number of requests for the vehicle type."""
 _VERSION_CHANNEL, _DEVICE_TYPE = 1, b"\x02"
 
 

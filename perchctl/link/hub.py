@@ -1,9 +1,9 @@
 """The radio hub: a process that owns a Crazyradio and shares it between several flight processes.
 
-cflib shares a dongle only within one process (docs/firmware.md, "Shared dongle"). A vehicle's
-flight is a process of its own, so that a hang or a crash in one never delays another; their packets
-meet here. `RadioHub` is the handle of the process that starts the flights; `perchctl.link.sharing`
-is what runs in the hub.
+cflib shares a dongle only within one process (docs/firmware.md, "Shared dongle"). Each vehicle's
+flight runs in its own process, so that a hang or a crash in one never delays another. The hub
+carries the packets of all of them. `RadioHub` is the handle used by the process that starts the
+flights; `perchctl.link.sharing` runs in the hub process.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from perchctl.link.hub_driver import HubReport
 from perchctl.link.protocol import check_uri, vehicle_uri
 
 HUB_START_TIMEOUT_S = 20.0
-"""Longest wait for a hub to start and open its dongle, s: loading takes 1 s on an idle computer,
-and each of a dongle's settings at most 1 s. Longer: a hub that hangs is noticed later. Shorter: a
-busy computer fails to start."""
+"""Timeout for a hub to start and open its dongle, s. Loading takes 1 s on an idle computer, and
+each setting of the dongle at most 1 s. Longer: a hanging hub is detected later. Shorter: the start
+fails on a busy computer."""
 HUB_END_TIMEOUT_S = 5.0
-"""Longest wait for a hub to end, s, after which it is killed. Longer: a hub that hangs delays the
-end. Shorter: its dongle may stay claimed until the system has cleaned up."""
+"""Time after which a hub that does not end is killed, s. Longer: a hanging hub delays the end.
+Shorter: its dongle may stay claimed until the system has cleaned up."""
 SILENT_S = 1.0
-"""Time without a report after which the hub counts as hanging, s; it reports five times a second.
-Longer: noticed later. Shorter: a busy computer is taken for a hang."""
+"""Time without a report after which the hub counts as hanging, s. It reports five times a second.
+Longer: a hang is detected later. Shorter: a busy computer looks like a hang."""
 PROGRAM = "from perchctl.link.sharing import serve_parent; serve_parent()"
 
 
@@ -35,14 +35,16 @@ class RadioHub:
     """Handle of a hub for the vehicles at `uris`, radio URIs of one dongle; a context manager.
 
     Raises InvalidValue for URIs that one dongle cannot serve, ConnectionFailed if the dongle cannot
-    be opened or a vehicle is in use by another program, and TimedOut. Then no packet was sent to
-    any vehicle. A vehicle that does not answer is no error here: its flight fails to connect.
+    be opened or a vehicle is in use by another program, and TimedOut. In these cases, no packet has
+    been sent to any vehicle. A vehicle that does not answer is not an error here: its flight fails
+    to connect.
 
-    The hub survives its parent until the flights have ended, because they land by its packets.
+    If its parent process ends, the hub keeps running until the flights have ended, because they
+    need it to land.
 
     Attributes:
-        uris: for each given URI, the `hub://` URI for the flight's `CflibLink`.
-        reports: for each given URI, the newest report that `update` has read.
+        uris: maps each given URI to the `hub://` URI for the flight's `CflibLink`.
+        reports: maps each given URI to the newest report that `update` has read.
     """
 
     def __init__(self, uris: Sequence[str]) -> None:
@@ -71,8 +73,8 @@ class RadioHub:
         self._heard_s = time.monotonic()
 
     def update(self) -> str | None:
-        """Read the hub's newest reports. Return None, or a sentence on why the hub itself is of no
-        use any more. Never blocks."""
+        """Read the hub's newest reports. Return None, or a message if the hub itself has failed.
+        Never blocks."""
         try:
             while self._channel.poll():
                 self.reports = self._channel.recv()
@@ -85,16 +87,16 @@ class RadioHub:
         )
 
     def limit(self, uri: str, packets_per_s: int | None) -> None:
-        """Limit the packets for an idle vehicle, so that the others get its share; None: no limit.
+        """Limit the packet rate of an idle vehicle to leave more for the others; None: no limit.
 
-        Takes effect after the vehicle's next packet. It limits telemetry too: a flight that asks
-        for more telemetry than fits gets it late.
+        Takes effect after the vehicle's next packet. The limit includes telemetry: if a flight
+        requests more than fits, its telemetry arrives late.
         """
         with contextlib.suppress(OSError):  # the hub has ended, as `update` says
             self._channel.send((uri, packets_per_s))
 
     def stop(self) -> None:
-        """End the hub, which sends no packet any more. May be called twice."""
+        """Stop the hub. It sends no more packets. May be called twice."""
         self._channel.close()
         if self._child.poll() is None:
             with contextlib.suppress(OSError):

@@ -1,5 +1,5 @@
-"""The flight's end of the radio hub: a driver for cflib's `hub://` URIs, and the messages between
-both ends.
+"""The flight's side of the radio hub: a cflib driver for `hub://` URIs, and the messages between
+the two sides.
 
 ```
 flight process                            hub process (perchctl/link/hub.py)
@@ -10,17 +10,17 @@ One datagram carries one CRTP packet, as with cflib's `udp://`. The two reserved
 header are always set (`perchctl.link.crtp.Packet`); a datagram without them is a message:
 
 - `HELLO`, the vehicle and a key: the flight asks for this vehicle's packets, first to connect and
-  then once a second. The answer is a `REPORT`. The key is a random part of the flight's URI, so
-  that no other program of the computer can take the vehicle over.
+then once a second. The answer is a `REPORT`. The key is a random part of the flight's URI, so that
+no other program on the computer can take over the vehicle.
 - `BYE`: the flight has closed its link.
-- `ROOM` and a byte: how many of the flight's packets wait in the hub for the radio.
+- `ROOM` and a byte: the number of the flight's packets that are waiting in the hub for the radio.
 - `REPORT` and a `HubReport` as JSON.
 
-cflib's own `udp://` driver would not do. It accepts any number of packets, and a stop would go out
-behind the setpoints that had piled up while the radio was silent. And it has no way to report that
-the dongle is dead.
+cflib's own `udp://` driver is not suitable. It accepts any number of packets, so a stop would be
+sent after all the setpoints that had piled up during a radio dropout. It also cannot report a dead
+dongle.
 
-Nothing here waits for the hub, except `connect`, which cflib calls in a thread of its own.
+Only `connect` waits for the hub; cflib calls it in a separate thread.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ SCHEME = "hub://"
 HELLO, BYE, ROOM, REPORT = (bytes((kind,)) for kind in (0x00, 0x10, 0x20, 0x30))
 _RESERVED_BITS = 0x0C
 MOST_BYTES = 2048
-"""Largest datagram, bytes: a report is shorter than 500. Larger: memory only. Smaller: a report
-would be cut off, and ignored."""
+"""Largest datagram, bytes; a report has fewer than 500. Larger: only costs memory. Smaller: a
+report would be truncated and ignored."""
 WINDOW = 1
-"""Packets that may wait in the hub before the flight's sender holds the next one back; cflib's
-radio driver has the same queue of one. Larger: a stop waits behind as many more packets. At 0,
+"""Number of packets that may wait in the hub before the flight's sender holds back the next one.
+cflib's radio driver also has a queue of one. Larger: a stop waits behind more packets. With 0,
 nothing could be sent."""
 HELLO_TIMEOUT_S = 1.0
-"""Longest wait for a hub's first answer, s; it takes 1 ms on an idle computer. Longer: a dead hub
-is reported later. Shorter: a busy computer fails to connect."""
+"""Timeout for the hub's first answer, s, which takes 1 ms on an idle computer. Longer: a dead hub
+is reported later. Shorter: connecting fails on a busy computer."""
 HELLO_PERIOD_S = 0.1
-"""Time between two requests for it, s, should one get lost. Longer: such a loss delays the
-connection. Shorter: no gain."""
+"""Time between two requests for that answer, s, in case one gets lost. Longer: a lost request
+delays the connection. Shorter: no benefit."""
 SIGN_OF_LIFE_S = 1.0
-"""Time between two requests of an open link, s, by which the hub knows that the flight is there. If
-the hub's process is gone, the system refuses them: that is noticed even if nothing is sent. Longer:
-noticed later. Shorter: more packets."""
+"""Time between two requests of an open link, s. They tell the hub that the flight is still running.
+If the hub's process has ended, the operating system refuses them, so the flight detects this even
+when it sends nothing else. Longer: detected later. Shorter: more packets."""
 HUB_STOP_PERIOD_S = 0.2
-"""Longest time until the driver's thread notices that it is closed, or that a sign of life is due,
-s. Longer: its socket is freed later. Shorter: it wakes up more often in vain."""
+"""Longest time until the driver's thread reacts to a close or sends the next request, s. Longer:
+its socket is freed later. Shorter: it wakes up more often for nothing."""
 HUB_ENDED = "the radio hub of this vehicle has ended"
 
 
@@ -69,11 +69,11 @@ HUB_ENDED = "the radio hub of this vehicle has ended"
 class HubReport:
     """State of one vehicle's radio link, as the hub sees it.
 
-    `problem` is None, or the sentence on why the dongle carries nothing, which ends the links of
-    all its vehicles. `answered` and `lost` count the packets since the hub's start that the vehicle
-    acknowledged, or did not in spite of the radio's own repetitions. `quality` is cflib's link
-    quality, %: 100 if no packet had to be repeated, None before the first answer. `waiting` is the
-    number of the flight's packets that wait for the radio.
+    `problem` is None, or the reason why the dongle does not work, which ends the links of all its
+    vehicles. `answered` and `lost` count the packets since the hub's start that the vehicle
+    acknowledged, and those that it did not acknowledge despite the radio's own retries. `quality`
+    is cflib's link quality, %: 100 if no packet had to be repeated, None before the first answer.
+    `waiting` is the number of the flight's packets that are waiting for the radio.
     """
 
     problem: str | None = None
@@ -103,7 +103,7 @@ def is_packet(datagram: bytes) -> bool:
 
 
 class Window:
-    """Stands for the queue of a radio's driver, which `internals.has_room` asks for room."""
+    """Stand-in for the queue of a radio driver, as read by `internals.has_room`."""
 
     def __init__(self) -> None:
         self.waiting = 0
@@ -116,9 +116,9 @@ class Window:
 class HubDriver:
     """A driver for cflib (`cflib.crtp.CLASSES`) that reaches a vehicle through the radio hub.
 
-    A dead dongle and a hub that has ended are reported once through cflib's error callback, which
-    ends the link as an error of any driver does. A hub that hangs reports nothing: the flight's
-    sender finds no room, and its telemetry grows old.
+    A dead dongle or a hub that has ended is reported once through cflib's error callback, which
+    ends the link like any driver error. A hanging hub reports nothing, but the flight's sender
+    finds the queue full and its telemetry becomes stale.
     """
 
     needs_resending = False  # the hub's radio driver has safelink
@@ -133,7 +133,7 @@ class HubDriver:
         self._socket: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._closed = threading.Event()
-        self._once = threading.Lock()  # held for good by the first report of an error
+        self._once = threading.Lock()  # acquired permanently by the first error report
         self._on_error: Callable[[str], None] = lambda message: None
         self._on_statistics: Callable[[dict[str, float]], None] | None = None
 
@@ -143,9 +143,9 @@ class HubDriver:
         on_statistics: Callable[[dict[str, float]], None] | None,
         on_error: Callable[[str], None],
     ) -> None:
-        """Ask the hub for the vehicle's packets; wait at most `HELLO_TIMEOUT_S`. Raises
-        ConnectionFailed if no hub answers or its dongle is dead, and cflib's WrongUriType for
-        another driver's URI."""
+        """Ask the hub for the vehicle's packets and wait at most `HELLO_TIMEOUT_S` for the answer.
+        Raises ConnectionFailed if no hub answers or its dongle is dead, and cflib's WrongUriType
+        for another driver's URI."""
         from cflib.crtp.exceptions import WrongUriType
 
         if not uri.startswith(SCHEME):
@@ -191,14 +191,15 @@ class HubDriver:
             return None
 
     def close(self) -> None:
-        """Take leave of the hub. The vehicle's radio link stays open, and nothing is sent to it."""
+        """Tell the hub that the flight has closed its link. The hub keeps the radio link to the
+        vehicle open and sends nothing to it."""
         if self._socket is not None and not self._closed.is_set():
             self._closed.set()  # the thread frees the socket
             with contextlib.suppress(OSError):
                 self._socket.send(BYE)
 
     def scan_interface(self, address: int | None = None) -> list[list[str]]:
-        """Find nothing: a fleet's flights are told their URIs."""
+        """Return no vehicles: the flights of a fleet get their URIs from the parent process."""
         return []
 
     def get_name(self) -> str:

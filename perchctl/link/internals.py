@@ -2,7 +2,8 @@
 
 This module contains all of them: the list (`INTERNALS`), the check that this cflib has each of them
 (`check_internals`), and the functions through which the rest of the package uses them. Without the
-check, a cflib release that renames one would silently change the behaviour after a radio failure.
+check, a cflib release that renames one of them would silently change how perchctl behaves after a
+radio failure.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from typing import Any
 from perchctl.errors import unfit_cflib
 
 CLOSE_STEP_S = 0.01
-"""Time between two looks at a driver that is being closed, s. Longer: a dead dongle is opened again
-later. Shorter: the look costs processor time while a slow dongle closes."""
+"""Polling period while a driver is being closed, s. Longer: a dead dongle is reopened later.
+Shorter: more processor time while a slow dongle closes."""
 
 
 @dataclass(frozen=True)
@@ -156,11 +157,11 @@ def check_internals() -> None:
 
 
 def replace_error_callback(cf: Any, on_error: Callable[[str], None]) -> None:
-    """Make drivers report their end to `on_error` instead of cflib's own handler.
+    """Make drivers report errors to `on_error` instead of to cflib's own handler.
 
-    A driver reports its end from inside `send_packet`, where the caller holds cflib's lock, or from
-    its own thread. cflib's handler closes the link there and joins the thread of its pings, which
-    waits for that lock: then nothing can ever be sent again.
+    A driver reports an error from inside `send_packet`, while the caller holds cflib's lock, or
+    from its own thread. cflib's handler would then close the link and join its ping thread, which
+    waits for that lock: a deadlock, after which nothing can be sent.
     """
     cf._link_error_cb = on_error
 
@@ -199,14 +200,14 @@ def driver_thread(driver: Any) -> threading.Thread | None:
 
 
 def retries_left(thread: threading.Thread | None) -> int | None:
-    """Return how many more lost packets a radio's thread tolerates; it counts down by each. None
-    for other drivers."""
+    """Return how many more lost packets a radio's thread tolerates; the count decreases with each
+    one. None for other drivers."""
     left: int | None = getattr(thread, "_retry_before_disconnect", None)
     return left
 
 
 def forget_dead_dongle(uri: str) -> None:
-    """Remove a dongle's thread that has ended, or whose dongle is closed; cflib would keep it
+    """Make cflib forget a dongle whose thread has ended or which is closed; cflib would keep it
     forever.
 
     cflib counts the links of a closed dongle wrongly once an attempt to open it has failed, and
@@ -243,7 +244,7 @@ def log_prints(logger: logging.Logger) -> None:
     vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)
 
 
-# --- What the radio hub needs of a driver that it runs without a `Crazyflie` ---
+# --- Functions for the radio hub, which runs drivers without a `Crazyflie` ---
 
 
 def count_answers(driver: Any, on_answer: Callable[[bool | None], None]) -> None:
@@ -284,10 +285,10 @@ def limit_rate(driver: Any, packets_per_s: int | None) -> None:
 
 
 def dongle_thread(uri: str) -> threading.Thread:
-    """Return the thread of an open URI's dongle.
+    """Return the thread of the dongle of an open URI.
 
-    It ends at the first setting that the dongle does not take, which with several vehicles is the
-    next packet. The drivers wait for its answers forever then, and report nothing.
+    The thread ends as soon as the dongle rejects a setting, which with several vehicles happens at
+    the next packet. The drivers then wait for its answers forever and report nothing.
     """
     from cflib.crtp.radiodriver import RadioDriver, RadioManager
 
@@ -296,8 +297,8 @@ def dongle_thread(uri: str) -> threading.Thread:
 
 
 def forget_dongle(thread: threading.Thread) -> None:
-    """Let the next driver open the dongle anew, also if its thread hangs in a call of USB. Only for
-    a process whose drivers of this dongle have all been closed."""
+    """Make the next driver reopen the dongle, even if the dongle's thread hangs in a USB call. Only
+    allowed after all drivers of this dongle in this process have been closed."""
     from cflib.crtp.radiodriver import RadioManager
 
     with RadioManager._lock:

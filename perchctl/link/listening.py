@@ -1,8 +1,8 @@
-"""Links that read a vehicle without commanding it, and the search for vehicles that answer.
+"""Links that read from a vehicle without commanding it, and a scan for vehicles.
 
-`AttitudeLink` reads how a vehicle is moved by hand. `ProbeLink` reads its configuration and the
-quality of the radio, and can blink its LEDs. Nothing that is sent here flies, arms or spins a
-motor.
+`AttitudeLink` reads the motion of a vehicle that is moved by hand. `ProbeLink` reads its
+configuration and the link quality, and can blink its LEDs. Nothing in this module makes a vehicle
+fly, arm or spin a motor.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ MOTION_BLOCK = dict.fromkeys(
 ) | {"supervisor.info": "uint16_t"}
 """Uses all 26 bytes of a log block."""
 MOST_ATTITUDE_SAMPLES = 20_000
-"""Largest number of samples that wait to be read; older ones are dropped."""
+"""Largest number of unread samples; older ones are dropped."""
 
 
 class AttitudeLink(ReadOnlyLink):
@@ -133,18 +133,20 @@ class AttitudeLink(ReadOnlyLink):
 
 
 LAST_ECHO_WAIT_S = 0.5
-"""Time for the last echo to arrive, s."""
+"""Time to wait for the last echo, s."""
 ECHO_PERIOD_S = 0.02
 """Time between echo packets, s."""
 LED_PARAMETER = "led.bitmask"
 ALL_LEDS, NO_LEDS, FIRMWARES_LEDS = 255, 128, 0
-"""Values of `LED_PARAMETER`: bit 7 takes the LEDs from the firmware, the lower ones light them."""
+"""Values of `LED_PARAMETER`: bit 7 takes control of the LEDs from the firmware, and the lower bits
+switch them on."""
 BLINK_S = 0.25
-"""For which the LEDs are on, and off, s. Longer: hard to tell from the firmware's own pattern.
-Shorter: more packets."""
+"""Time for which the LEDs are on, and then off, s. Longer: harder to distinguish from the
+firmware's own pattern. Shorter: more packets."""
 END_BLINKING_TRIES = 3
-"""A late answer to a blink may be taken for that to the last value. More: waits longer for a
-vehicle that does not answer. Fewer: LEDs may keep their state until the next restart."""
+"""Number of attempts to end blinking. A late answer to an earlier value may be mistaken for the
+answer to the last one. More: longer wait for a vehicle that does not answer. Fewer: the LEDs may
+keep their state until the next restart."""
 # same length as cflib's own echo, since cflib unpacks every echo as its own
 _ECHO = struct.Struct("<BQ")
 _ECHO_MARK = 1  # cflib's own pings start with 0
@@ -154,8 +156,8 @@ class ProbeLink(ReadOnlyLink):
     """A `ReadOnlyLink` that accepts any firmware, since its purpose is to find faults. Only
     `blinking` sets a parameter.
 
-    `quality` is that of the radio link, %: 100 if no packet had to be sent again, None without a
-    radio. `missing` names the log variables that perchctl needs and the firmware lacks.
+    `quality` is the link quality, %: 100 if no packet had to be sent again, None if there is no
+    radio. `missing` lists the log variables that perchctl needs but the firmware lacks.
     """
 
     NEEDED_PROTOCOL = NEEDED_PROTOCOL
@@ -189,7 +191,7 @@ class ProbeLink(ReadOnlyLink):
         return int(self._cf.platform.get_protocol_version())
 
     def device_type(self) -> str | None:
-        """Return the kind of vehicle as named by its firmware; None without an answer."""
+        """Return the vehicle type reported by the firmware; None if it does not answer."""
         return read_device_type(self._cf)
 
     def parameters(self) -> dict[str, float]:
@@ -202,7 +204,7 @@ class ProbeLink(ReadOnlyLink):
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
     def lost(self) -> str | None:
-        """Return why the link is lost; None while it works."""
+        """Return the reason why the link is lost; None while it works."""
         return "the link was closed" if self.connection is None else self.connection.lost
 
     @contextlib.contextmanager
@@ -219,7 +221,7 @@ class ProbeLink(ReadOnlyLink):
             for mask in itertools.cycle((NO_LEDS, ALL_LEDS)):
                 if ended.wait(BLINK_S):
                     return
-                with contextlib.suppress(Exception):  # an error of the library: no blink
+                with contextlib.suppress(Exception):  # any error from cflib: no blinking
                     cf.param.set_value(LED_PARAMETER, str(mask))
 
         thread = start_thread("perchctl-blink", blink)
@@ -268,12 +270,13 @@ class ProbeLink(ReadOnlyLink):
 
 
 SCAN_TIMEOUT_S = 20.0
-"""Longest search for vehicles, s."""
+"""Timeout of a scan for vehicles, s."""
 
 
 def find_uris_and_problem(uri: str = "") -> tuple[list[str], Problem | None]:
-    """Search for vehicles that answer now, at a radio's usual address and at that of `uri`; sends
-    only null packets. Return their URIs, and why no radio was searched; None if one was searched.
+    """Scan for vehicles that answer now, at the default radio address and at the address of `uri`.
+    Sends only null packets. Return their URIs, and the reason why no radio could be scanned (None
+    if one was).
 
     A driver may block: after `SCAN_TIMEOUT_S`, the URIs found so far are returned.
     """
@@ -289,7 +292,7 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], Problem | None]:
     def run() -> None:
         from cflib import crtp
 
-        with contextlib.suppress(Exception):  # any error of the driver
+        with contextlib.suppress(Exception):  # any driver error
             why[0] = _radio_problem()
         for driver in crtp.CLASSES:
             for address in addresses:

@@ -40,7 +40,7 @@ from perchctl.vehicle import FLYING, Arm, Command, ExternalPosition, Telemetry
 TELEMETRY_DELAY_S = 0.01
 """Simulated delay of a log packet, s."""
 SETTLE_S = 1.0
-"""Simulated time before the link is connected, s."""
+"""Simulated time that connecting takes, s."""
 WATCH_PERIOD_S = 0.05
 """Period of the guard, s."""
 
@@ -55,7 +55,7 @@ class Radio:
         return self._bursts is None or not self._bursts.is_lost(now_s)
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:
-        """Return the seconds after which a log block's packet arrives; None if it is lost."""
+        """Return the delay after which a log block's packet arrives, s; None if it is lost."""
         lost = self._bursts is not None and self._bursts.is_lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
 
@@ -92,7 +92,7 @@ class MockLink:
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
-        self._was_armed = False  # armed by an order of this session
+        self._was_armed = False  # armed by a command of this session
         self._watched_s = -math.inf
         self._call: Callable[[float], object] = lambda now_s: None
         self._call_due_s = self._call_period_s = math.inf
@@ -179,7 +179,7 @@ class MockLink:
         return None
 
     def close(self) -> None:
-        """Wait, bounded, until the vehicle no longer flies, and disarm it, as the real link
+        """Wait until the vehicle no longer flies, with a timeout, and disarm it, as the real link
         does."""
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:

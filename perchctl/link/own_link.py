@@ -44,9 +44,11 @@ class GuardedLink:
         self._lock = threading.Lock()
         self._waiting: list[Telemetry] = []  # samples that the loop has not taken yet
         self._newest: Telemetry | None = None
-        self._trouble: str | None = None  # the link's own problem or exception in the last round
-        self._answered_s: float | None = None  # end of the reader's last round
-        self._was_armed = False  # armed by an order of this session
+        self._trouble: str | None = (
+            None  # the link's own problem or exception in the reader's last cycle
+        )
+        self._answered_s: float | None = None  # end of the reader's last cycle
+        self._was_armed = False  # armed by a command of this session
         self._first_sample, self._closing = threading.Event(), threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
@@ -55,8 +57,8 @@ class GuardedLink:
     def connect(self) -> None:
         """Connect, and check that the vehicle is not armed yet.
 
-        Raises TimedOut without telemetry, which the check needs, and ConnectionFailed if the
-        vehicle is armed: its propellers would spin before the operator has confirmed the flight.
+        Raises TimedOut if no telemetry arrives for this check, and ConnectionFailed if the vehicle
+        is armed, because its propellers could spin before the operator has confirmed the flight.
         """
         self._inner.connect()
         self._answered_s = self._clock()
@@ -95,14 +97,15 @@ class GuardedLink:
         return self._sender.trouble() or hangs or self._trouble
 
     def new_notes(self) -> list[str]:
-        """Return sentences about harmless failures since the last call."""
+        """Return messages about harmless failures since the last call."""
         return self._sender.new_notes()
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
 
     def close(self) -> None:
-        """Wait, bounded, until the vehicle no longer flies, disarm it, and close the inner link."""
+        """Wait until the vehicle no longer flies, with a timeout; then disarm it and close the
+        inner link."""
         self._sender.drain(1.0)
         end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)
         while may_be_flying(self._newest, self._clock()) and time.monotonic() < end_s:
@@ -116,7 +119,7 @@ class GuardedLink:
         )
         self._closing.set()
         self._sender.stop()
-        with suppress(Exception):  # the flight is over, and its report matters more
+        with suppress(Exception):  # the flight is over, and its report must still be written
             self._inner.close()
         if self._was_armed and not disarmed:
             warn_of_armed("the vehicle of your own link")

@@ -18,7 +18,7 @@ SentCallback = Callable[[SentCommand], None]
 
 
 def ignore_sent(sent: SentCommand) -> None:
-    """Ignore the command; a `SentCallback`."""
+    """A `SentCallback` that does nothing."""
     return
 
 
@@ -37,8 +37,8 @@ class Link(Protocol):
     """
 
     def connect(self) -> None:
-        """Connect, check the firmware, set parameters and unlock the thrust. Bounded. Arms nothing:
-        a vehicle that does not arm itself receives `Arm` just before take-off."""
+        """Connect, check the firmware, set parameters and unlock the thrust, with a timeout. Does
+        not arm: a vehicle that does not arm itself receives `Arm` just before take-off."""
 
     def decks(self) -> tuple[str, ...]:
         """Return the decks that the connected vehicle found at boot, by the firmware's names."""
@@ -47,7 +47,7 @@ class Link(Protocol):
         """Return the samples that arrived since the last call, oldest first."""
 
     def send(self, command: Command) -> None:
-        """Send one command to the vehicle. Never blocks for long."""
+        """Send one command to the vehicle. Blocks only briefly."""
 
     def send_external(self, place: ExternalPosition) -> bool:
         """Send an external position to the vehicle, at once or not at all: never queued, raises
@@ -60,13 +60,13 @@ class Link(Protocol):
         """Call `guard` regularly from now on, until the link is closed.
 
         `on_sent` is called with each command that the link has sent in the loop's place: the
-        guard's, an order repeated after a lost link, and the farewell. It is called from the link's
-        own thread if it has one.
+        guard's commands, commands repeated after a lost link, and the farewell. It is called from
+        the link's own thread if it has one.
         """
 
     def close(self) -> None:
-        """Close the link, after a bounded wait until the vehicle no longer flies. A vehicle on the
-        ground that does not arm itself is disarmed, whatever ended the session."""
+        """Close the link after waiting, with a timeout, until the vehicle no longer flies. A
+        vehicle on the ground that does not arm itself is disarmed, whatever ended the session."""
 
 
 class VehicleLink(Protocol):
@@ -80,9 +80,9 @@ class VehicleLink(Protocol):
     """
 
     def connect(self) -> None:
-        """Connect to a vehicle on the ground, and prepare it for a flight; bounded in time. Must
-        not spin a motor and therefore must not arm, since nobody has confirmed the flight yet.
-        perchctl refuses a vehicle that is armed without `AUTO_ARM`, or that sends no telemetry
+        """Connect to a vehicle on the ground and prepare it for a flight, with a timeout. Must not
+        spin a motor and therefore must not arm the vehicle, because nobody has confirmed the flight
+        yet. perchctl refuses a vehicle that is armed without `AUTO_ARM`, or that sends no telemetry
         within 3 s. Raises one of `perchctl.errors`, such as ConnectionFailed."""
 
     def decks(self) -> tuple[str, ...]:

@@ -1,13 +1,13 @@
-"""Pass commands to a library that may block, fail or hang, so that the flight loop never does.
+"""Pass commands to a library that may block, fail or hang without ever blocking the flight loop.
 
-There are two threads. The first passes the commands on, in pieces (a landing is four packets), and
-may hang in the library with one. The second never calls the library: it asks the `guard` for a
-command to send while the loop hangs, and replaces a hanging first thread by a new one. No error
-ends a thread.
+There are two threads. The first thread passes commands to the library in pieces (a landing is four
+packets) and may hang there. The second thread never calls the library: it asks the `guard` for a
+command to send while the loop hangs, and it replaces the first thread with a new one if that hangs.
+No error ends either thread.
 
-Setpoints coalesce (only the newest counts). A setpoint that has waited too long is dropped, and so
-is an arming request. Orders keep their place until the library has accepted them, however long that
-takes; an emergency stop replaces all waiting commands.
+Setpoints coalesce: only the newest is kept. Setpoints and arming requests that have waited too long
+are dropped. Other commands keep their place until the library has accepted them, however long that
+takes. An emergency stop replaces all waiting commands.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _EXPIRING = (*_STREAMED, Arm)
 """Commands that are valid only for a short time: dropped when stale, and never repeated
 automatically. A late arming request would spin the propellers after the session has ended."""
 STALE_COMMAND_S = 0.25
-"""Waiting time after which such a command is stale, s, for example behind a command that hung."""
+"""Waiting time after which such a command is stale, s, for example behind a command that hangs."""
 GUARD_PERIOD_S = 0.05
 """Period of the second thread, s."""
 LIBRARY_HANG_S = 0.5
-"""Longest time for which the library may hold one piece, or fail, s (docs/firmware.md,
-"Silence")."""
+"""Longest time for which a call of the library may last, or for which its calls may fail, s
+(docs/firmware.md, "Silence")."""
 SEND_RETRY_S = 0.002
-"""Time until a piece that found no room is offered again, s: about the duration of one packet by
-radio."""
+"""Time until a piece that the library did not accept is offered again, s: about the duration of one
+radio packet."""
 NOTED_EVERY_S = 1.0
-"""Shortest time between notes about errors, s."""
+"""Shortest time between messages about errors, s."""
 
 
 @dataclass(eq=False)
@@ -96,15 +96,17 @@ class Sender:
         self._stopped = threading.Event()  # separate, so that a command does not wake the guard
         # since when the next piece has been waiting for the library
         self._waiting_since_s: float | None = None
-        self._called_s: float | None = None  # start of the present call of the library
-        self._held_since_s: float | None = None  # the call that was too long at the last check
+        self._called_s: float | None = None  # start of the current call of the library
+        self._held_since_s: float | None = (
+            None  # the call that had already lasted too long at the last check
+        )
         self._raised = False  # the library raised an error at the last attempt
         self._last: tuple[float, Command] | None = None
         self._running = True
         self.errors, self._error = 0, ""
         self._failing_since_s: float | None = None  # first error since the last success
-        self._keeper_error: str | None = None  # error of the second thread's last round
-        self._noted, self._noted_s = 0, -math.inf  # state of the notes about errors
+        self._keeper_error: str | None = None  # error in the second thread's last cycle
+        self._noted, self._noted_s = 0, -math.inf  # state of the messages about errors
         with self._ready:
             self._start_worker()
         self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
@@ -114,7 +116,7 @@ class Sender:
         """Queue a command; `by` names the sender in the loop's place, None for the loop."""
         with self._ready:
             if isinstance(command, EmergencyStop):
-                self._queue.clear()  # earlier orders are obsolete
+                self._queue.clear()  # earlier commands are obsolete
             elif self._queue and self._is_replaced(self._queue[-1], command):
                 self._queue.pop()
             self._queue.append(_Waiting(self._clock(), command, by))
@@ -123,8 +125,8 @@ class Sender:
             self._ready.notify_all()
 
     def repeat_order(self, since_s: float) -> None:
-        """Queue the newest order again if it was passed on since `since_s`, since it may be
-        lost."""
+        """Queue the newest command other than a setpoint again if it was passed on after `since_s`,
+        because it may have been lost."""
         with self._ready:
             if self._last is None:
                 return
@@ -139,7 +141,7 @@ class Sender:
         return 0.0 if since_s is None else self._clock() - since_s
 
     def trouble(self) -> str | None:
-        """Return a sentence on why no command is sent, else None."""
+        """Return the reason why commands cannot be sent, in one sentence; None if they can."""
         if self._keeper_error is not None:
             return self._keeper_error
         since_s = self._failing_since_s
@@ -205,7 +207,7 @@ class Sender:
                 elif not self._spare():
                     pause_s = GUARD_PERIOD_S
                 self._raised = False
-            except BaseException as error:  # any error of the library; this thread continues
+            except BaseException as error:  # any error from the library; this thread continues
                 self._note_error(error)
                 if waiting is not None and self._failing_since_s is None:
                     self._failing_since_s = self._clock()
@@ -222,7 +224,8 @@ class Sender:
         self._error = (str(error).strip() or type(error).__name__).splitlines()[0]
 
     def _is_mine(self) -> bool:
-        """True while this thread is the present worker: False once it was found hanging."""
+        """True while this thread is the current worker, False once it was found hanging and
+        replaced."""
         return self._running and self._worker is threading.current_thread()
 
     def _next(self) -> _Waiting | None:
@@ -243,7 +246,7 @@ class Sender:
             try:
                 waiting.rest = deque(self._pieces(waiting.command))
             except Exception:
-                # a retry cannot succeed: drop the command, and report trouble at once
+                # a retry cannot succeed: drop the command and report the problem at once
                 self._remove(waiting)
                 self._failing_since_s = -math.inf
                 raise
@@ -262,7 +265,7 @@ class Sender:
             self._last = at_s, waiting.command
             self._remove(waiting)
         if waiting.by is not None:
-            # any error of an observer; the next command is sent all the same
+            # any error from an observer; the next command is still sent
             with suppress(Exception):
                 self._on_sent(SentCommand(at_s, waiting.by, waiting.command))
         return 0.0
@@ -279,8 +282,8 @@ class Sender:
         self._ready.notify_all()
 
     def _is_replaced(self, last: _Waiting, command: Command) -> bool:
-        """True for a setpoint, which any command replaces, and for an order of which no piece was
-        sent, which an order of the same type replaces."""
+        """True if a new command replaces this one: any command replaces a setpoint, and a command
+        of the same type replaces one of which no piece has been sent."""
         if isinstance(last.command, _STREAMED):
             return True
         return not last.begun and type(last.command) is type(command)
@@ -300,8 +303,8 @@ class Sender:
     def _look_after_worker(self) -> None:
         called_s, stuck_s = self._called_s, self.stuck_s()
         too_long = called_s is not None and self._clock() - called_s > LIBRARY_HANG_S
-        # Requires two checks, since after a suspension of the computer the first one finds every
-        # call too long.
+        # Two checks are required: after the computer was suspended, every call seems too long at
+        # the first one.
         hangs = too_long and called_s == self._held_since_s
         self._held_since_s = called_s if too_long else None
         try:

@@ -1,16 +1,18 @@
-"""What runs in the radio hub: cflib's radio drivers, and the packets between each and its flight.
+"""The radio hub's process: cflib's radio drivers, and the transfer of packets between each driver
+and its flight.
 
 ```
 flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->  thread of the dongle  --> USB
 flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->        |
 ```
 
-The hub carries packets and knows nothing of flying. It uses drivers without a `Crazyflie`, whose
-`close_link` would send a zero setpoint and drop a flying vehicle; `RadioDriver.close` sends
-nothing.
+The hub only transfers packets and does not know their meaning. It uses the drivers without a
+`Crazyflie` object, whose `close_link` would send a zero setpoint and drop a flying vehicle.
+`RadioDriver.close` sends nothing.
 
-Threads: two for each vehicle, up and down; one that opens drivers, which may block in USB; and the
-main one, which looks at the dongle, reports, and never calls anything that blocks.
+Threads: two for each vehicle, uplink and downlink; one that opens drivers, which may block in a USB
+call; and the main thread, which monitors the dongle, sends reports and never calls anything that
+blocks.
 """
 
 from __future__ import annotations
@@ -39,56 +41,60 @@ from perchctl.link.hub_driver import BYE, HELLO, HUB_ENDED, ROOM, SCHEME, HubRep
 from perchctl.link.protocol import vehicle_uri
 
 TICK_S = 0.02
-"""Time between two looks at the dongle, s. Longer: a dead dongle is reported later. Shorter: more
-processor time."""
+"""Period of the dongle check, s. Longer: a dead dongle is reported later. Shorter: more processor
+time."""
 REPORT_PERIOD_S = 0.2
-"""Time between two reports, s. Longer: what a lost datagram has hidden stays hidden. Shorter: more
-processor time in each flight."""
+"""Time between two reports, s. Longer: a lost report is made up for later. Shorter: more processor
+time in each flight."""
 REFUSALS = 10
-"""Successive packets for one vehicle without any answer of the dongle, after which it is dead. An
-unplugged one refuses each at once; a vehicle out of reach is an answer. More: reported later.
-Fewer: a passing error of USB ends the flights."""
+"""Number of successive packets for one vehicle without any answer from the dongle after which the
+dongle counts as dead. An unplugged dongle rejects each packet at once; a working dongle answers
+even if the vehicle is out of range. More: reported later. Fewer: a transient USB error ends the
+flights."""
 STUCK_TICKS = 25
-"""Ticks without any answer of the dongle after which it is dead: 0.5 s, while even a lost packet is
-reported within 2 ms. Counted in ticks, so that a computer that was suspended is no dead dongle.
-More: reported later. Fewer: a call of USB that is late ends the flights."""
+"""Number of ticks without any answer from the dongle after which it counts as dead: 0.5 s, although
+a working dongle reports even a lost packet within 2 ms. Counting ticks avoids a false alarm after
+the computer was suspended. More: reported later. Fewer: a slow USB call ends the flights."""
 REOPEN_PERIOD_S = 0.1
-"""Time between two attempts to open a dead dongle, s. Longer: it is back later. Shorter: the
-computer searches its USB ports all the time."""
+"""Time between two attempts to open a dead dongle, s. Longer: it is available again later. Shorter:
+the computer scans its USB ports all the time."""
 SAFELINK_PACKETS = 10
-"""Packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md, "Safelink")."""
+"""Number of packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md,
+"Safelink")."""
 SAFELINK_PERIOD_S = 1.0
-"""Time between two offers to a vehicle that has not answered yet, s. Longer: a vehicle that is
-switched on is found later. Shorter: it takes more of the dongle's time from the others, 20 ms
-each."""
+"""Time between two safelink offers to a vehicle that has not answered yet, s. Longer: a vehicle
+that is switched on later is found later. Shorter: the offers, 20 ms each, take more of the dongle's
+time from the other vehicles."""
 LEAST_RATE = 10
-"""Lowest limit on a vehicle's packets, 1/s. Higher: an idle vehicle takes more from the others.
-Lower: a dongle whose vehicles are all idle seems dead (`STUCK_TICKS`), and commands wait longer."""
+"""Lowest permitted limit on a vehicle's packet rate, 1/s. Higher: an idle vehicle uses more of the
+dongle's time. Lower: a dongle whose vehicles are all idle seems dead (`STUCK_TICKS`), and commands
+wait longer."""
 ROOM_WAIT_S = 0.005
-"""Time for which a packet waits for the radio before its carrier looks at the socket again, s.
-Longer: a flight's new link is answered later. Shorter: more processor time."""
+"""Time for which a packet waits for the radio before its carrier checks the socket again, s.
+Longer: a new link from the flight is answered later. Shorter: more processor time."""
 IDLE_S = 0.1
-"""Time for which a thread waits for a packet before it looks whether it is to end, s. Longer: ends
-later. Shorter: more processor time."""
+"""Time for which a thread waits for a packet before it checks whether it should end, s. Longer: it
+ends later. Shorter: more processor time."""
 CLOSE_TIMEOUT_S = 3.0
-"""Longest wait for a driver to close, s: a call of USB may take 2. Longer: a dongle that hangs is
-opened anew later. Shorter: it is opened while the old driver still uses it."""
+"""Timeout for closing a driver, s; a USB call may take 2 s. Longer: a hanging dongle is reopened
+later. Shorter: it is reopened while the old driver still uses it."""
 LINGER_S = 5.0
-"""Time without a word of a flight after which it is dead, s; an open link speaks at least once a
-second. Its packets are dropped then, and a hub without parent and flights ends. Longer: a vehicle
-that was out of reach obeys an older order, and the dongle stays claimed after a crash. Shorter: a
-flight on a busy computer loses its radio while it lands."""
+"""Time without any datagram from a flight after which it counts as dead, s; an open link sends one
+at least once a second. The hub then drops its packets, and a hub without a parent and without
+flights ends. Longer: a vehicle that was out of range may execute an old command, and the dongle
+stays claimed after a crash. Shorter: a flight on a busy computer may lose its radio while it
+lands."""
 FAREWELL_S = 0.5
-"""Time for which a flight's last packets still go out after it has closed its link, s. Longer: a
-vehicle that was out of reach obeys an older order. Shorter: a landing that is sent just before the
-end may get lost."""
+"""Time for which the last packets of a flight are still sent after it has closed its link, s.
+Longer: a vehicle that was out of range may execute an old command. Shorter: a landing command sent
+just before the end may get lost."""
 MOST_QUEUED_PACKETS = 64
-"""Largest number of a flight's packets that wait for the radio; then the oldest is dropped. A
-flight waits after each, but cflib's own requests do not. Larger: more packets are out of date.
-Smaller: such requests get lost."""
+"""Largest number of a flight's packets that may wait for the radio; then the oldest one is dropped.
+A flight's sender waits after each packet, but cflib's own requests do not. Larger: more packets are
+out of date. Smaller: cflib's requests get lost."""
 NULL_PACKET = 0xF3
-"""Header of what a vehicle sends if it has nothing to send; the radio's signal strength may follow,
-which cflib's statistics have read."""
+"""Header of the packet that a vehicle sends if it has no data. The signal strength may follow,
+which cflib's statistics have already read."""
 
 logger = logging.getLogger(__name__)
 
@@ -103,19 +109,23 @@ class Carrier:
         self.vehicle = vehicle_uri(uri).removeprefix("radio/")
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
-        # Any program of this computer can send to the port; the key is told to the flight alone.
+        # Any program on this computer can send to the port, but only the flight knows the key.
         self._greeting = f"{self.vehicle}?key={secrets.token_hex(8)}"
         self.hub_uri = f"{SCHEME}127.0.0.1:{self.socket.getsockname()[1]}/{self._greeting}"
         self.driver: Any = None
-        self.opened_s = 0.0  # when the driver was opened, or closed for want of safelink
+        self.opened_s = 0.0  # when the driver was opened, or closed because it had no safelink
         self.heard_s = time.monotonic()  # when the flight's last datagram came
         self.problem: str | None = None
         self.answered = self.lost = 0
-        self.refused = self.missed = 0  # in a row: by the dongle, by the vehicle
+        self.refused = self.missed = (
+            0  # number of successive packets without an answer: from the dongle, from the vehicle
+        )
         self.has_stale_packet = False
-        """True if the driver is to be closed because a packet in it is out of date."""
-        self._offered = 0  # packets of the present driver
-        self._has_carried = False  # anything of the present flight in the present driver
+        """True if the driver must be closed because it holds an outdated packet."""
+        self._offered = 0  # packets sent by the current driver
+        self._has_carried = (
+            False  # whether the current driver has taken packets from the current flight
+        )
         self._quality: float | None = None
         self._limit: int | None = None
         self._waiting: deque[bytes] = deque(maxlen=MOST_QUEUED_PACKETS)
@@ -129,20 +139,20 @@ class Carrier:
 
     @property
     def lacks_safelink(self) -> bool:
-        """True if the driver has no safelink and will not get one. A vehicle that was not in reach
-        as the driver opened would accept at most one packet of it."""
+        """True if the driver has no safelink and will not get it. A vehicle that was out of range
+        when the driver was opened would accept at most one packet from it."""
         driver = self.driver
         offered = self._offered > SAFELINK_PACKETS
         return driver is not None and offered and not internals.has_safelink(driver)
 
     def open(self) -> None:
-        """Open a driver. Raises any error of cflib's and of USB's."""
+        """Open a driver. Raises any error from cflib or USB."""
         from cflib.crtp.radiodriver import RadioDriver
 
         driver = RadioDriver()
         self._offered = self.refused = self.missed = 0
         self.has_stale_packet = self._has_carried = False
-        # cflib reports errors and goes on; the hub counts what the dongle answers instead.
+        # cflib reports errors and continues; the hub relies on the dongle's answers instead.
         driver.connect(self.uri, self._take_statistics, lambda message: None)
         internals.count_answers(driver, self._count)
         self.opened_s, self.driver = time.monotonic(), driver
@@ -155,7 +165,7 @@ class Carrier:
             internals.limit_rate(self.driver, self._limit)
 
     def start(self) -> None:
-        """Start to carry packets."""
+        """Start transferring packets."""
         start_thread("perchctl-hub-up", self._carry_up)
         start_thread("perchctl-hub-down", self._carry_down)
 
@@ -174,7 +184,7 @@ class Carrier:
         self._send(self.report().encode())
 
     def close(self) -> None:
-        """Carry nothing any more."""
+        """Stop transferring packets and close the driver."""
         self._closed.set()
 
     def _count(self, answer: bool | None) -> None:
@@ -212,11 +222,11 @@ class Carrier:
         self.socket.close()
 
     def _drop_packets(self) -> None:
-        """Let no packet that the flight has sent so far reach the vehicle any more.
+        """Make sure that no packet sent by the flight so far reaches the vehicle.
 
         cflib's driver holds up to two: one that it repeats until the vehicle acknowledges it, and
-        one in its queue. They cannot be taken from it, but end with it; the next driver begins with
-        an offer of safelink.
+        one in its queue. They cannot be removed, so the driver is closed; the next driver starts by
+        offering safelink.
         """
         self._waiting.clear()
         driver, has_carried = self.driver, self._has_carried
@@ -230,11 +240,12 @@ class Carrier:
         except OSError:  # an earlier datagram could not be delivered
             return
         if datagram[:1] == HELLO:
-            # Another program may ask, or an old flight at a port that is another vehicle's by now.
+            # The request may come from another program, or from an old flight whose port now
+            # belongs to another vehicle.
             if datagram[1:].decode("ascii", "replace") != self._greeting:
                 return
             if sender != self._flight:
-                self._drop_packets()  # what an earlier link wanted to send is out of date
+                self._drop_packets()  # packets from an earlier link are out of date
             self._flight = sender
             self.send_report()
         elif sender != self._flight:
@@ -270,10 +281,10 @@ class Carrier:
 
 
 class Hub:
-    """The carriers of one dongle's vehicles, and the dongle's life.
+    """The carriers of all vehicles on one dongle, and the monitoring of the dongle.
 
-    `problem` is None, or the sentence on why the dongle carries nothing. A dead dongle is opened
-    again until it answers; the flights' links end at once, and open again by themselves.
+    `problem` is None, or the reason why the dongle does not work. The hub reopens a dead dongle
+    until it answers. The flights' links end at once and reopen by themselves.
     """
 
     def __init__(self, uris: Sequence[str]) -> None:
@@ -301,12 +312,12 @@ class Hub:
 
     @property
     def uris(self) -> dict[str, str]:
-        """The flights' URIs by the vehicles'."""
+        """The flights' URIs, by the URIs of their vehicles."""
         return {carrier.uri: carrier.hub_uri for carrier in self.carriers}
 
     def tick(self) -> bool:
-        """Look at the dongle, and report what is due. Call every `TICK_S`. Return True if reports
-        were sent to the flights."""
+        """Check the dongle and send the reports that are due. Must be called every `TICK_S`. Return
+        True if reports were sent to the flights."""
         cause = None if self.problem is not None else self._find_problem()
         if cause is not None:
             self._set_problem(cause)
@@ -334,7 +345,8 @@ class Hub:
         return any(carrier.has_flight for carrier in self.carriers)
 
     def close(self) -> None:
-        """End the flights' links and close all drivers, without a packet; bounded."""
+        """End the flights' links and close all drivers, with a timeout and without sending a
+        packet."""
         self._set_problem(HUB_ENDED)
         for carrier in self.carriers:
             carrier.send_report()
@@ -362,8 +374,8 @@ class Hub:
             carrier.problem = problem
 
     def _keep_open(self) -> None:
-        """Open a dead dongle again, drivers whose vehicle was out of reach, and those that hold a
-        packet of a flight that is over."""
+        """Reopen a dead dongle, drivers whose vehicle was out of range, and drivers that hold a
+        packet from a flight that has ended."""
         while not self._closed.is_set():
             self._wake.wait(REOPEN_PERIOD_S)
             self._wake.clear()
@@ -377,7 +389,9 @@ class Hub:
                 return
             try:
                 self._open_dongle()
-            except Exception as error:  # any error of cflib's and of USB's: not plugged in yet
+            except (
+                Exception
+            ) as error:  # any error from cflib or USB: the dongle is not plugged in yet
                 logger.info("the dongle does not open: %s", error)
                 continue
             self._stuck_ticks = 0
@@ -390,7 +404,7 @@ class Hub:
                 carrier.opened_s = time.monotonic()
             elif carrier.has_stale_packet and carrier.driver is not None:
                 self._close_driver(carrier)
-                carrier.opened_s = -math.inf  # to be opened again at once
+                carrier.opened_s = -math.inf  # must be reopened at once
             elif carrier.driver is None and time.monotonic() - carrier.opened_s > SAFELINK_PERIOD_S:
                 try:
                     carrier.open()
@@ -423,17 +437,17 @@ class Hub:
 
 
 def serve_parent() -> None:
-    """Run the hub for the parent that `perchctl.link.hub.RadioHub` is the handle of, until it is
-    stopped, or the parent is gone and no flight is left."""
+    """Run the hub for the parent process (see `perchctl.link.hub.RadioHub`) until it is stopped, or
+    until the parent and all flights have ended."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
-    # cflib lets its dongle's thread end by an error, which the hub finds and reports.
+    # In cflib, an error ends the dongle's thread; the hub detects and reports this.
     threading.excepthook = lambda arguments: logger.info("a thread has ended: %s", arguments)
     channel = connect_to_parent()
     try:
         hub = Hub(channel.recv())
-    except (EOFError, OSError):  # the parent is gone already
+    except (EOFError, OSError):  # the parent has already ended
         return
     except PerchError as error:
         channel.send(error)
@@ -447,14 +461,14 @@ def serve_parent() -> None:
     except SystemExit:  # by SIGTERM
         status = 0
     except Exception:
-        traceback.print_exc()  # the parent shows the last line
+        traceback.print_exc()  # the parent prints the last line
         sys.stderr.flush()
     finally:
-        os._exit(status)  # a driver that hangs in USB must not keep the process
+        os._exit(status)  # a driver that hangs in a USB call must not keep the process alive
 
 
 def run(hub: Hub, channel: Channel) -> None:
-    """Serve a hub and its parent; return once both the parent and the flights are gone."""
+    """Serve a hub and its parent. Return once the parent and all flights have ended."""
     parent = True
     while parent or hub.has_flights():
         due_s = time.monotonic() + TICK_S
@@ -466,7 +480,7 @@ def run(hub: Hub, channel: Channel) -> None:
                     hub.limit(*channel.recv())
             except (EOFError, OSError):
                 parent = False
-        # A parent that hangs reads nothing, and must not stop the hub.
+        # A hanging parent does not read its pipe, which must not block the hub.
         if hub.tick() and parent and select.select([], [channel], [], 0.0)[1]:
             with contextlib.suppress(OSError):
                 channel.send(hub.reports())

@@ -1,4 +1,5 @@
-"""Telemetry from cflib's log blocks: their variables, and the assembly of packets to samples.
+"""Telemetry from cflib's log blocks: the variables in each block, and the assembly of packets into
+samples.
 
 Only this module converts degrees to radians, and the Crazyflie's nose-up pitch to the right-handed
 nose-down pitch (docs/firmware.md, "Signs and units").
@@ -33,7 +34,8 @@ ATTITUDE_BLOCK: dict[str, str] = {
 """Uses all 26 bytes: half floats resolve a force of 0.1 g to 0.1 mg."""
 
 MOTOR_DUTIES = tuple(f"motor.m{number}" for number in (1, 2, 3, 4))
-"""Left out of their block if the firmware lacks one of them: the battery matters more."""
+"""All four are left out of their block if the firmware lacks one of them, because the battery is
+more important."""
 BATTERY_BLOCK: dict[str, str] = {
     "pm.vbat": "float",
     "pm.state": "int8_t",
@@ -46,7 +48,7 @@ POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
 VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
 """The filter's letter for the velocity in body axes is `P` (docs/firmware.md, "Variances")."""
 VARIANCE_BLOCK = dict.fromkeys((*POSITION_VARIANCES, *VELOCITY_VARIANCES), "float")
-"""Uses 24 bytes; only if the firmware has the Kalman estimator."""
+"""Uses 24 bytes. Only requested if the firmware has the Kalman estimator."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 """Log variables without which there is no telemetry."""
@@ -91,8 +93,9 @@ def telemetry_from_log(
 
 
 def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
-    """Return the largest of these variances, NaN if one is. Return None if one is missing or zero:
-    a running filter keeps each at 1e-6 at least, and one that never ran has zeros (source)."""
+    """Return the largest of these variances; NaN if one of them is NaN. Return None if one is
+    missing or zero: a running filter keeps each at 1e-6 or more, while a filter that never ran
+    reports zeros (source)."""
     found = [values.get(name, 0.0) for name in names]
     if any(variance == 0.0 for variance in found):
         return None
@@ -113,7 +116,8 @@ def _motor_duty(values: Mapping[str, float]) -> tuple[int, int, int, int] | None
 WRAP_MS = 1 << 24
 """Period of the log time stamps, which have three bytes (docs/firmware.md, "Link")."""
 CLOCK_SKEW = 1e-4
-"""Largest difference in rate of the two clocks: far above a crystal's, far below a fault's."""
+"""Largest rate difference between the two clocks: far more than that of two crystals, far less than
+after a fault."""
 REBOOTED_MS = 1000
 """Backward step of the stamps above which the vehicle has restarted, ms; reordered packets step
 back by far less."""
@@ -166,21 +170,22 @@ BLOCKS: dict[str, dict[str, str]] = {
     "state": STATE_BLOCK,
     "attitude": ATTITUDE_BLOCK,
 }
-"""In the order in which blocks of the same time are sent; the one that completes a sample is
-last."""
+"""Log blocks in the order in which they are sent for the same time; the block that completes a
+sample is last."""
 FAST_BLOCKS = ("state", "attitude")
 """A sample requires these blocks; the others arrive ten times a second if the firmware has them."""
 SLOW_PERIOD_S = 0.1
 """Period of the slow blocks, s."""
 LOG_STEP_S = 0.01
-"""The firmware counts the period of a log block in such steps, s."""
+"""Step size of a log block's period in the firmware, s."""
 MOST_CARRIED_S = 0.05
 """Longest time for which a position is extrapolated, s."""
 
 
 def telemetry_packets_per_s(period_s: float) -> float:
-    """Packets a second that a vehicle sends for its telemetry, if its firmware has all blocks:
-    `period_s` is that of the fast blocks (`link.telemetry_period_s`), rounded as in `start_block`.
+    """Number of packets per second that a vehicle sends for its telemetry if its firmware has all
+    blocks. `period_s` is the period of the fast blocks (`link.telemetry_period_s`), rounded as in
+    `start_block`.
 
     220 at 0.01 s, 120 at 0.02 s, 70 at 0.04 s.
     """
@@ -196,9 +201,9 @@ def _rounded_ms(period_s: float) -> int:
 class SampleAssembler:
     """Assemble telemetry samples from the newest values of all log blocks.
 
-    Only the attitude block completes a sample; the other values are the last ones that arrived. The
-    sample contains how much older each other block is (`Telemetry.behind_s` and similar fields),
-    since frozen values look like a vehicle at rest.
+    Only the attitude block completes a sample; the other values are the last ones that arrived.
+    Each sample says how much older the other blocks are (`Telemetry.behind_s` and similar fields),
+    because frozen values look like a vehicle at rest.
     """
 
     def __init__(self) -> None:
@@ -248,12 +253,12 @@ def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
 
 
 FIRST_SAMPLE_TIMEOUT_S = 3.0
-"""Time for the first sample to arrive, s."""
+"""Timeout for the first sample, s."""
 AWAIT_SLOW_S = 1.0
 """Time for which the first sample waits for the slow blocks, s."""
 BLOCKS_DELETED_AFTER_S = 1.0
-"""Time without radio after which a vehicle deletes its log blocks, s (docs/firmware.md, "Radio
-silence")."""
+"""Duration of a radio dropout after which a vehicle deletes its log blocks, s (docs/firmware.md,
+"Radio silence")."""
 RESUME_PERIOD_S = 0.25
 """Time between attempts to restart blocks, s; longer than the slowest block's period, so that a
 restarted block shows."""
@@ -280,7 +285,7 @@ class LogBlocks:
         self._started_s = 0.0
         self._starting: dict[str, list[Packet]] = {}  # packets that start each block
         self._arrived_s: dict[str, float] = {}  # last arrival of each block
-        self._resuming: deque[Packet] = deque()  # packets still to be sent
+        self._resuming: deque[Packet] = deque()  # packets that are still to be sent
         self._resumed_s = 0.0
         self.last_arrival_s = 0.0
         self.newest: Telemetry | None = None
@@ -321,8 +326,8 @@ class LogBlocks:
     def resume(self, send: Callable[[Packet], bool]) -> bool:
         """Send one of the packets that restart silent blocks; return True if it was sent.
 
-        Must be called from one thread whenever there is room. `send` must not wait. A vehicle that
-        still has a block reports it, and restarts the block anyway.
+        Must be called from a single thread whenever the driver has room. `send` must not wait. A
+        vehicle that still has the block reports an error but restarts the block anyway.
         """
         now_s = self._clock()
         if not self._resuming and now_s - self._resumed_s > RESUME_PERIOD_S:

@@ -1,7 +1,7 @@
-"""Estimate the camera's latency and mounting picture by picture during the flight.
+"""Estimate the camera's latency and mounting image by image during the flight.
 
 With `camera.latency_s: measured`, the estimated latency is also applied: it is subtracted from the
-pictures' times once it is certain, slowly, and within bounds. The estimation itself uses the
+images' times once it is certain, slowly, and within bounds. The estimation itself uses the
 uncorrected times.
 """
 
@@ -23,7 +23,7 @@ from perchctl.vision import CameraErrors, MarkerPose, PoseSetup, VehicleState
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
 LIKELY_S = 0.02
-"""Standard deviation of the delay below which the factors of the next pictures are computed with
+"""Standard deviation of the delay below which the factors of the next images are computed with
 that delay, s."""
 USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
@@ -32,8 +32,8 @@ SLEW = 0.02
 """Rate at which the applied latency changes, s/s: at 0.4 m/s, the target appears to move by 8 mm/s,
 as with a drift."""
 FAST_SLEW = 0.5
-"""The same rate while pictures and accelerometer agree on a very different latency. It is below 1
-because the pictures' times would otherwise run backwards. Smaller: a vehicle with late positions
+"""The same rate while images and accelerometer agree on a very different latency. It is below 1
+because the images' times would otherwise run backwards. Smaller: a vehicle with late positions
 oscillates for longer."""
 CHANGED_S = 0.05
 """Difference from a certain estimate above which the latency has changed in flight, s."""
@@ -45,10 +45,10 @@ LONGEST_STEP_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class OnlineCalibration:
-    """Estimate of the camera's latency and mounting from pictures and telemetry.
+    """Estimate of the camera's latency and mounting from images and telemetry.
 
     `newest` is the solution of `sums` at `solved_s`. `applied_delay_s` is the latency beyond the
-    profile's that is subtracted from the pictures' times, since the picture at `last_picture_s`.
+    profile's that is subtracted from the images' times, since the image at `last_picture_s`.
     `coarse_delay_s` is the goal of a correction in progress, None once it is reached. `changed_s`
     is the newest change of a latency that had been certain: its old and new value, s beyond the
     profile's.
@@ -65,7 +65,7 @@ class OnlineCalibration:
     @property
     def delay_sigma_s(self) -> float:
         """Standard deviation of a measured latency, s: that of `newest`, at most that of an unknown
-        latency, however much the pictures scatter."""
+        latency, however much the images scatter."""
         if self.newest is None:
             return UNKNOWN_SIGMA_S
         return min(UNKNOWN_SIGMA_S, self.newest.delay_sigma_s)
@@ -79,10 +79,10 @@ def update_calibration(
     setup: PoseSetup,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture in its sums and, once a second, the solution of the
+    """Return the estimate with one more image in its sums and, once a second, the solution of the
     sums.
 
-    `t_s` is the picture's arrival minus the profile's latency. A pose is ignored if it is not
+    `t_s` is the image's arrival minus the profile's latency. A pose is ignored if it is not
     finite, too close, or without the attitude at its time.
     """
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
@@ -108,7 +108,7 @@ def update_calibration(
 def apply_latency(
     old: OnlineCalibration, t_s: float, start_latency_s: float, correction_s: float | None
 ) -> OnlineCalibration:
-    """Return the calibration with the latency by which the next picture's time is corrected, for
+    """Return the calibration with the latency by which the next image's time is corrected, for
     `camera.latency_s: measured`; `t_s` as in `update_calibration`.
 
     `correction_s`, a very different latency according to the accelerometer
@@ -136,7 +136,7 @@ def apply_latency(
 
 
 # --- Estimation of latency and mounting from a flight ---
-# If the pictures are later than the profile says by d, the target appears displaced by d times the
+# If the images are later than the profile says by d, the target appears displaced by d times the
 # speed at which the vehicle's translation and rotation sweep the line of sight. If the camera is
 # rotated, the target appears displaced by the rotation times the vector to it. The target's
 # position in the estimate's world is therefore linear in the delay and the rotation, and one
@@ -161,7 +161,7 @@ NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
 """Noise of the vehicle's speed and rotation rates; a motion that is not well above it counts as
 rest."""
 PICTURE_JITTER_S = 0.008
-"""Jitter of single pictures' times, s."""
+"""Jitter of single images' times, s."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
 """Lower bounds of the rows' noise, standard deviations."""
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)

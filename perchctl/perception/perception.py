@@ -1,7 +1,7 @@
 """Estimate the target from the frames of one stream and the vehicle's telemetry.
 
 Flying, tracking, measuring the mounting and replaying all use a `Perception`. It decides whether a
-frame can be a measurement, separates the fields of an interlaced frame, runs each picture through
+frame can be a measurement, separates the fields of an interlaced frame, runs each image through
 the pipeline of `perchctl.vision`, and keeps the required memory.
 """
 
@@ -53,7 +53,7 @@ class Perception:
         history: the vehicle's telemetry; empty without a vehicle.
         attitude: function that returns the vehicle's attitude at a time; replaces the history's.
         state: the pipeline's memory.
-        calibration, motion: estimates, from pictures and telemetry, of latency and mounting, and of
+        calibration, motion: estimates, from images and telemetry, of latency and mounting, and of
             the vehicle's motion.
         refused: why a target was refused as another vehicle's; None if none was.
         health: decides whether a frame can be a measurement at all.
@@ -121,7 +121,7 @@ class Perception:
         return 0.0 if self._measured_latency is None else self.calibration.delay_sigma_s
 
     def camera_errors(self) -> CameraErrors | None:
-        """Return the errors of latency and mounting from all pictures so far; None if there are too
+        """Return the errors of latency and mounting from all images so far; None if there are too
         few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 

@@ -1,8 +1,8 @@
-"""Check whether the pictures show the motion that the accelerometer measures.
+"""Check whether the images show the motion that the accelerometer measures.
 
 The vector from the body to the target, rotated by the attitude at the exposure, plus the body's own
 motion from the accelerometer, is a fixed position, except for the unknown speed at the start of the
-window and a constant accelerometer offset. If the pictures are later than assumed, or if the camera
+window and a constant accelerometer offset. If the images are later than assumed, or if the camera
 is rotated about the upward axis, the sum moves; with the correct delay or rotation, it is at rest.
 """
 
@@ -36,7 +36,7 @@ AGREED = 3
 false mismatch is reported."""
 AGREED_MEASURED = 2
 """The same number for a latency that the flight measures: a false correction is undone, and at ten
-pictures per second, a third judgement costs a tenth of a second."""
+images per second, a third judgement costs a tenth of a second."""
 STEP_S = 0.02
 """Step of the delay hypotheses, s."""
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
@@ -48,12 +48,12 @@ OFFSET_MPS2, SIGMA_M = 0.2, 0.003
 # a smaller error makes an alignment oscillate by centimetres and is reported after the flight
 LEAST_LATER_S = 0.1
 BEYOND_S = 0.03
-"""Tolerance of a measured latency beyond the usable range, s: the step of the grid plus a picture's
+"""Tolerance of a measured latency beyond the usable range, s: the step of the grid plus an image's
 jitter. Larger: an error that cannot be corrected counts as correctable."""
 MEASURED_LATER_S = 0.03
 """Smallest error of a measured latency that is corrected here, s; a smaller one is left to the more
 accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment
-oscillates for longer. Smaller: the step of the grid and the jitter of single pictures count as an
+oscillates for longer. Smaller: the step of the grid and the jitter of single images count as an
 error."""
 # m, and ratio to the motion with the right delay, that show a mismatch
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
@@ -242,7 +242,7 @@ def _best_about(mismatch: CameraImuMismatch, wanders_m: Array, later_s: Array) -
 def _found(
     wanders_m: Array, later_s: Array, measured: MeasuredLatency | None
 ) -> CameraImuMismatch | None:
-    """Return the mismatch that explains the pictures; None if the latency in use does, or one close
+    """Return the mismatch that explains the images; None if the latency in use does, or one close
     to it.
 
     A measured latency is first searched among the usable ones: just after the lift-off, any delay

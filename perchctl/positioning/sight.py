@@ -59,7 +59,7 @@ NOWHERE = Place(np.zeros(3), 0.0)
 
 
 def target_place(pose: MarkerPose, attitude: VehicleState, setup: PoseSetup) -> Place:
-    """Return the target's place from its pose in a picture and the body's attitude and position."""
+    """Return the target's place from its pose in an image and the body's attitude and position."""
     return Place(*target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
@@ -97,7 +97,7 @@ class TargetFeed:
             self.send_known(self._origin_m, now_s)
 
     def send_known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """Send a position known without a picture: standing, in contact or hanging."""
+        """Send a position known without an image: standing, in contact or hanging."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
@@ -130,12 +130,12 @@ class TargetFeed:
         *,
         at_rest: bool,
     ) -> None:
-        """Send the vehicle's position from a pose in this tick's picture. While the target's place
+        """Send the vehicle's position from a pose in this tick's image. While the target's place
         is unknown, learn it instead if the vehicle is `at_rest`. `then` and `now` are the vehicle's
         attitude and estimated position at the exposure and at `now_s`."""
         if pose.t_s <= self._seen_s:
             return
-        # A known position may be newer than a picture that has not arrived yet.
+        # A known position may be newer than an image that has not arrived yet.
         silent_s = max(0.0, min(pose.t_s - max(self._seen_s, self._placed_s), GATE_LONGEST_S))
         if self.target is None:
             self._seen_s = pose.t_s

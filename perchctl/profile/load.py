@@ -177,7 +177,7 @@ def find_calibration(name: str) -> Path:
 
 
 MOST_MASKED_SHARE = 0.75
-"""Largest covered share of the picture. Larger: no room is left for a target."""
+"""Largest covered share of the image. Larger: no room is left for a target."""
 _WHITE = 127
 
 
@@ -193,7 +193,7 @@ def find_mask(name: str) -> Path:
 
 
 def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return where the vehicle covers a picture of that width and height: booleans (height, width),
+    """Return where the vehicle covers an image of that width and height: booleans (height, width),
     true where the file is white. Errors: NotFound, InvalidValue."""
     path = find_mask(name)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)

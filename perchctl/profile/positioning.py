@@ -39,7 +39,7 @@ System = Annotated[
     WithJsonSchema({"anyOf": [{"enum": list(SYSTEMS)}, {"type": "string", "pattern": PATTERN}]}),
 ]
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
-"""Other defaults for positions from pictures, which arrive late and with gaps."""
+"""Other defaults for positions from images, which arrive late and with gaps."""
 
 
 class PositionSource(Enum):

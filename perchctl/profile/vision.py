@@ -109,9 +109,9 @@ USUAL_LATENCY_S = 0.07
 """Default latency, s: most cameras are 60 to 100 ms late."""
 START_LATENCY_S = 0.1
 """Latency at the start of a flight that measures it, s. It is the middle of the usable range, so
-until the flight knows more, pictures are at most 0.1 s newer or older than assumed."""
+until the flight knows more, images are at most 0.1 s newer or older than assumed."""
 USED_LATENCY_S = (0.02, 0.2)
-"""Latencies that such a flight uses, s. No camera is faster, and later pictures are of no use for
+"""Latencies that such a flight uses, s. No camera is faster, and later images are of no use for
 steering."""
 
 
@@ -135,7 +135,7 @@ class CameraConfig(Section):
     start_timeout_s: float = key(8.0, "time limit for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
     mask: str | None = key(None, "mask file, white where the vehicle covers the view")
-    fields: ClassVar[str] = "auto"  # of interlaced pictures: which field comes first is measured
+    fields: ClassVar[str] = "auto"  # of interlaced images: which field comes first is measured
     readout_s: float | None = key(
         0.0, "rolling shutter: time from the first to the last row; none if unknown", ge=0, le=0.05
     )
@@ -275,9 +275,9 @@ class DetectorConfig(Section):
     )
     own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
     blurred: ClassVar[bool] = True  # only with lines: searched for where blur may hide the target
-    # number of pictures in a stream without the target before that search
+    # number of images in a stream without the target before that search
     blurred_every: ClassVar[int] = 4
-    # only with lines: measured where the picture's edge cuts both markers
+    # only with lines: measured where the image's edge cuts both markers
     cut: ClassVar[bool] = True
     correction_bits_large: ClassVar[int] = 0  # number of wrong cells that are corrected
     correction_bits_small: ClassVar[int] = 1

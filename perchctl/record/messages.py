@@ -43,7 +43,7 @@ SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
 def image_message(time_ns: int, frame: Frame) -> CompressedImage:
-    """A picture's message: the camera's own JPEG, or else a PNG."""
+    """An image's message: the camera's own JPEG, or else a PNG."""
     data = frame.encoded
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]

@@ -1,4 +1,4 @@
-"""Read the pictures of a flight from its recording. It is read from the beginning, because the
+"""Read the images of a flight from its recording. It is read from the beginning, because the
 recording of a killed flight has no index."""
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from perchctl.record.messages import FRAME, IMAGE
 from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
-"""A flight's chunk contains 4 MB and one picture; a longer record has a damaged length."""
+"""A flight's chunk contains 4 MB and one image; a longer record has a damaged length."""
 _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 """What the libraries raise for a record that is cut or damaged; lz4's errors among them."""
 
 
 class RecordedPicture(NamedTuple):
     """One frame: its number and time of exposure on the loop's clock, as the source gave
-    them, and the grey picture (height, width) that the pipeline saw."""
+    them, and the grey image (height, width) that the pipeline saw."""
 
     number: int
     t_s: float
@@ -40,10 +40,10 @@ class RecordedPicture(NamedTuple):
 def recorded_pictures(
     path: Path | str, numbers: Container[int] | None = None
 ) -> Iterator[RecordedPicture]:
-    """Yield the pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it
-    lies beside; a cut-off last picture is left out.
+    """Yield the images `(number, t_s, image)`, oldest first, of a recording or of the log that it
+    lies beside; a cut-off last image is left out.
 
-    If `numbers` is given, only these frames are decoded. Errors, with the first picture: NotFound
+    If `numbers` is given, only these frames are decoded. Errors, with the first image: NotFound
     without a recording; InvalidValue for any other file.
     """
     path = recording_path(path)
@@ -58,7 +58,7 @@ def recorded_pictures(
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield each frame's record in a recording, and its picture, None if it was not stored.
+    """Yield each frame's record in a recording, and its image, None if it was not stored.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """

@@ -1,4 +1,4 @@
-"""Records a flight while it flies: pictures, transforms and ticks.
+"""Records a flight while it flies: images, transforms and ticks.
 
 The flight passes on its data and continues; a separate thread encodes and writes it. The recording
 is less important than the log: losses are counted and reported, but never make the vehicle land.
@@ -48,7 +48,7 @@ RECORDING_CLOSE_TIMEOUT_S = 5.0
 MOST_WAITING_BYTES = 64_000_000
 """Largest amount of memory for data that waits for the disk, bytes."""
 TURN_BYTES = 10_000
-"""Size of a turn without its picture, bytes."""
+"""Size of a turn without its image, bytes."""
 FLUSH_PERIOD_S = 1.0
 RESERVE_BYTES = 200_000_000
 """Space that the recording leaves free on the disk, bytes. The flight log needs it, without which
@@ -113,7 +113,7 @@ class Recorder:
         self._hand_over()  # before take-off no tick does
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
-        # A repeated frame contains its picture, too.
+        # A repeated frame contains its image, too.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
     def write_tick(self, record: Mapping[str, Any]) -> None:

@@ -25,7 +25,7 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 class RecordingEnd(NamedTuple):
-    """Summary of a recording: the file's name, the numbers of stored and of missing pictures, and
+    """Summary of a recording: the file's name, the numbers of stored and of missing images, and
     the first reason for a loss."""
 
     recording: str

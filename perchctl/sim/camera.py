@@ -49,7 +49,7 @@ class SimCamera:
       exposures from start on; these are not rendered;
     - late: a frame arrives after `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`,
       cut at 2.5 sigma), but never before the end of its exposure or before an earlier frame;
-    - frozen: exposures from `camera_freeze_at_s` on repeat the last picture before that time.
+    - frozen: exposures from `camera_freeze_at_s` on repeat the last image before that time.
     """
 
     def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
@@ -69,7 +69,7 @@ class SimCamera:
         rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
-        self._newest: DeliveredFrame | None = None  # a picture that the receiver gives out again
+        self._newest: DeliveredFrame | None = None  # an image that the receiver gives out again
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -141,7 +141,7 @@ class SimCamera:
 
 # --- When each row of a frame is exposed and in what light ---
 # A rolling shutter exposes its rows one after another within the read-out time. An interlaced
-# camera takes two pictures per frame, half a period apart, each with its own rows.
+# camera takes two images per frame, half a period apart, each with its own rows.
 
 
 POSES_PER_EXPOSURE = 3

@@ -286,7 +286,7 @@ class HostRunner:
             return False, f"{type(error).__name__}: {error}"
 
 
-# --- The simulated camera's pictures over HTTP, as from a network camera ---
+# --- The simulated camera's images over HTTP, as from a network camera ---
 # Each part of a multipart answer is one JPEG. A slow client misses frames, but always gets the
 # newest.
 
@@ -297,7 +297,7 @@ _CLIENT_TIMEOUT_S = 5.0
 
 
 class MjpegServer(ThreadingHTTPServer):
-    """Serves the newest published picture on loopback, for any path."""
+    """Serves the newest published image on loopback, for any path."""
 
     daemon_threads = True
     block_on_close = False
@@ -310,13 +310,13 @@ class MjpegServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def publish(self, image: Picture) -> None:
-        """Publish a picture, grey uint8 (h, w)."""
+        """Publish an image, grey uint8 (h, w)."""
         with self._changed:
             self._newest = self._newest[0] + 1, image
             self._changed.notify_all()
 
     def wait_for_newer(self, number: int) -> tuple[int, Picture]:
-        """Wait for a picture newer than `number`; return it with its number."""
+        """Wait for an image newer than `number`; return it with its number."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest[0] > number)
             return self._newest

@@ -33,14 +33,14 @@ LEAST_RISE = 0.02
 class RayGrid:
     """Undistorted rays (x, y, 1) at nodes `stride` px apart.
 
-    With a stride above 1 px, a margin of one node surrounds the picture.
+    With a stride above 1 px, a margin of one node surrounds the image.
 
     Node (j, i) then sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
     cv2.resize by `stride` puts its sample centres.
     """
 
     xy: NDArray[np.float32]  # (rows, cols, 2)
-    row_share: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
+    row_share: NDArray[np.float32]  # (rows,), 0 in the image's first row, 1 in its last
     boundary_xy: NDArray[np.float32]  # (n, 2), the outermost rays
 
 
@@ -80,7 +80,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
     ray that misses it, (rows, cols).
 
     `to_plane` is the map (3, 3) of `ray_to_plane_map`, or with a rolling shutter the maps (n, 3, 3)
-    of n rows at equal distances from the picture's first to its last.
+    of n rows at equal distances from the image's first to its last.
     """
     x, y = grid.xy[..., 0], grid.xy[..., 1]
     if to_plane.ndim == 2:
@@ -115,7 +115,7 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
     return 2.0 * stride / math.sqrt(max(area, 1e-12))
 
 
-# --- How a lens maps its pixels, the same for all pictures and flights ---
+# --- How a lens maps its pixels, the same for all images and flights ---
 
 
 VIGNETTING_EXPONENT = 0.6
@@ -125,7 +125,7 @@ VIGNETTING_EXPONENT = 0.6
 @dataclass(frozen=True, eq=False)
 class Lens:
     """`coarse` holds the rays of every eighth pixel, `pixels` the rays of all; `shade` is the
-    vignetting (height, width), 255 for no loss; `sample_rays` (3, 5) go through the picture's
+    vignetting (height, width), 255 for no loss; `sample_rays` (3, 5) go through the image's
     middle and its quarters; `focal_px` is the mean focal length of x and y."""
 
     coarse: RayGrid

@@ -1,4 +1,4 @@
-"""Render the picture of the ceiling and its target from a camera pose.
+"""Render the image of the ceiling and its target from a camera pose.
 
 Each pixel is a ray that is traced to the plane of the ceiling and looked up in textures. The rays
 are precomputed and contain the lens distortion. The map of the sheets is exact at each pixel. The
@@ -50,10 +50,10 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""Margin by which the bank of noise is larger than a picture, px: each frame uses another part of
+"""Margin by which the bank of noise is larger than an image, px: each frame uses another part of
 it."""
 _PLAIN_PX = 1.5
-"""Blur of the lens above which the whole picture is blurred, px. A smaller blur does not show on
+"""Blur of the lens above which the whole image is blurred, px. A smaller blur does not show on
 the bare ceiling, which is drawn at half the size or less."""
 _COVERING_SIGMA = 4.0
 """Noise, grey levels, which hides that the ceiling is drawn at a quarter of the size."""
@@ -128,7 +128,7 @@ class Renderer:
         defocus_px: float | None = None,
         frame_index: int = 0,
     ) -> Picture:
-        """The picture of one exposure.
+        """The image of one exposure.
 
         Args:
             T_world_cam_samples: poses (4, 4) at equal steps over the exposure,
@@ -182,7 +182,7 @@ class Renderer:
     def _projected(
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
     ) -> Picture:
-        """Return the picture at the poses T_target_cam (n, 4, 4) of its rows."""
+        """Return the image at the poses T_target_cam (n, 4, 4) of its rows."""
         count = blur_sample_count(length_px)
         by_row = [ray_to_plane_map(resample_poses(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
@@ -282,11 +282,11 @@ class Renderer:
         return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
-# --- Sums, look-ups and shading of whole pictures ---
+# --- Sums, look-ups and shading of whole images ---
 
 
 def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
-    """A view of a picture (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
+    """A view of an image (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
     height, width, *rest = pixels.shape
     shape = (height // COARSE_PX, COARSE_PX, width // COARSE_PX, COARSE_PX, *rest)
     return pixels.reshape(shape).swapaxes(1, 2)
@@ -304,7 +304,7 @@ def draw_sheet_over(below: Picture, view: SheetView, maps: Array, rays: RayGrid)
 
 
 def mean_picture(pictures: Sequence[Picture]) -> Picture:
-    """The mean of the pictures, rounded once."""
+    """The mean of the images, rounded once."""
     if len(pictures) == 1:
         return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
@@ -331,8 +331,8 @@ def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
 
 
 # --- A camera that does not move ---
-# If the picture moves by less than `STILL_EXPOSURE_PX` within the exposure, the pose is rounded, so
-# that a vehicle at rest sees the same picture each time, apart from the noise.
+# If the image moves by less than `STILL_EXPOSURE_PX` within the exposure, the pose is rounded, so
+# that a vehicle at rest sees the same image each time, apart from the noise.
 
 
 STILL_EXPOSURE_PX = 0.005
@@ -427,7 +427,7 @@ SNOW_LINES_PER_FRAME = 12.0
 def add_analogue_faults(
     image: NDArray[np.uint8], strength: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return the picture as a receiver shows it; `strength` is 0 (clean) to 1 (about to be
+    """Return the image as a receiver shows it; `strength` is 0 (clean) to 1 (about to be
     lost)."""
     height, width = image.shape
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)

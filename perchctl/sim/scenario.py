@@ -48,11 +48,11 @@ class Scenario:
         target_xy_m, target_yaw_rad: centre and heading of the target.
         gear_body_m: tip of the magnet gear in body axes (its truth).
         T_body_cam_true: rows of the camera's true pose, mounting error included.
-        camera_mirrored: the camera flips its pictures left to right.
+        camera_mirrored: the camera flips its images left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
         first_contact_force_n: pull at the first contact; None: `magnet_force_n`.
-        camera_freeze_at_s: from then on the camera repeats its last picture; None: never.
+        camera_freeze_at_s: from then on the camera repeats its last image; None: never.
         parameters: firmware parameters that differ from the release's at boot.
         gyro_bias_radps, acc_bias_mps2: biases in body axes, of the gyroscope after and of the
             accelerometer before the firmware's calibration on the ground; only for a vehicle

@@ -1,5 +1,5 @@
 """The scene of the simulated camera: printed sheets and the ceiling as textures, and the part of a
-picture that a sheet covers in one exposure.
+image that a sheet covers in one exposure.
 
 Textures are kept at several resolutions, each the exact or filtered mean over its texels' areas,
 so that sampling near one texel a pixel is correct near and far. Pure.
@@ -160,10 +160,10 @@ _LOOK_UP_TEXELS = 2.5
 
 
 class SheetView(NamedTuple):
-    """A sheet in one exposure: `box` is its part of the picture, `to_texels` (3, 3) maps the plane
+    """A sheet in one exposure: `box` is its part of the image, `to_texels` (3, 3) maps the plane
     of the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows,
     columns), `is_uniform` are those whose pixels all show one `value` and `alpha`. `covers_all`:
-    nothing else is in the picture."""
+    nothing else is in the image."""
 
     texture: SheetTexture
     box: Box
@@ -186,7 +186,7 @@ class PlacedSheet:
         """The sheet as seen at the coarse nodes' points (rows, columns, 2), m, in the own
         target's axes; None if the sheet is out of view.
 
-        `length_px` is the picture's longest motion in the exposure."""
+        `length_px` is the image's longest motion in the exposure."""
         if self.to_sheet is not None:
             turn, shift = self.to_sheet[:2, :2].T, self.to_sheet[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)

@@ -41,7 +41,7 @@ class SimulatedVehicle:
             renderer = Renderer(scenario, camera, target or TargetConfig())
             self.camera = SimCamera(scenario, renderer)
         self.capture = None if capture is None else SimCapture(capture)
-        self.watched = True  # the camera's pictures are being used; otherwise none are rendered
+        self.watched = True  # the camera's images are being used; otherwise none are rendered
         self._past: deque[tuple[Vector, tuple[float, float, float, float]]] = deque(maxlen=_PAST)
 
     @property

@@ -2,7 +2,7 @@
 
 z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the whole
 large one (paper, section III-B: 115, 25, 12 cm). They depend on the smallest side that can be read
-through the blur, and on the picture's edge.
+through the blur, and on the image's edge.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class TargetDesign:
     is never detected.
 
     Attributes:
-        blur_px: sigma of the picture's blur.
-        large_px, small_px: smallest sides, px, that the detector finds in blurred trial pictures.
+        blur_px: sigma of the image's blur.
+        large_px, small_px: smallest sides, px, that the detector finds in blurred trial images.
         z1_m, z2_m: farthest range of the large and of the small marker, at any turn.
         z3_m: nearest range of the whole large marker, at any turn; z3_upright_m: with its sides
-            parallel to the picture's.
+            parallel to the image's.
         small_nearest_m: nearest range from the gear's tip to the target at which the small marker
             is whole at any turn, the gear right under the target's centre.
         start_range_m: from the camera to the target at the start of the search, at the height

@@ -80,7 +80,7 @@ class TargetDrawing:
 
     def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
         """The whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its
-        area; row 0 is at the top of the print, the centre in the middle of the picture."""
+        area; row 0 is at the top of the print, the centre in the middle of the image."""
         size = max(1, int(np.ceil(self.sheet_side_m * px_per_m - 1e-9)))
         return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 

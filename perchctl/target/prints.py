@@ -107,7 +107,7 @@ class PrintCheck:
     _ratios: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, output: PipelineOutput | None) -> None:
-        """Add a picture's ratio if it shows both markers with refined corners."""
+        """Add an image's ratio if it shows both markers with refined corners."""
         if output is None:
             return
         large = output.detections.large
@@ -116,7 +116,7 @@ class PrintCheck:
             self.add_corners(large.corners_px, small.corners_px)
 
     def add_corners(self, large_px: Array, small_px: Array) -> None:
-        """Add a picture's ratio by its markers' corners, (4, 2) px each."""
+        """Add an image's ratio by its markers' corners, (4, 2) px each."""
         ratio = size_ratio(large_px, small_px, self.camera, self.target)
         if ratio is not None:
             self._ratios.append(ratio)

@@ -1,4 +1,4 @@
-"""Read a target with a plain detector: its drawing before it is printed, and small pictures with
+"""Read a target with a plain detector: its drawing before it is printed, and small images with
 blur and noise.
 
 The smallest readable side is found by trial, which takes a second.
@@ -29,7 +29,7 @@ class ArucoReader:
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
-        """The corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
+        """The corners (4, 2) px of the markers in a grey image (TL TR BR BL)."""
         corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
         if ids is None or len(corners) == 0:
             return {}
@@ -59,7 +59,7 @@ SIDE_RANGE_PX = (6.0, 400.0)
 _READING_STREAM = 801
 _PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
 _MIN_PICTURE_PX = 64
-_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
+_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the image
 
 
 @cache
@@ -67,11 +67,11 @@ def smallest_side_px(
     target: TargetConfig, marker: str, blur_px: float, picture_px: int
 ) -> float | None:
     """The smallest side, px, at which the marker, facing the camera at any turn, is found in
-    `FOUND_RATE` of the pictures; None if even `SIDE_RANGE_PX[1]` is too small.
+    `FOUND_RATE` of the images; None if even `SIDE_RANGE_PX[1]` is too small.
 
     Args:
         blur_px: sigma of lens, focus and link together.
-        picture_px: the larger side of the camera's picture.
+        picture_px: the larger side of the camera's image.
     """
     drawing = draw_target(target)
     reader = ArucoReader(target)
@@ -91,7 +91,7 @@ def smallest_side_px(
         # Three neighbours together: between 0.8 and 1 the rate rises slowly.
         return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
 
-    # Trying the largest sides first would be slow: large pictures. Upwards by doubling,
+    # Trying the largest sides first would be slow: large images. Upwards by doubling,
     # then bisection.
     low, high, stride = -1, 0, 4
     while not found(high):
@@ -109,7 +109,7 @@ def smallest_side_px(
 def sample_pictures(
     drawing: TargetDrawing, px_per_m: float, side_px: float, blur_px: float
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield `TRIALS` pictures of the drawing's centre, at least 3 `side_px` wide, blurred with
+    """Yield `TRIALS` images of the drawing's centre, at least 3 `side_px` wide, blurred with
     sigma `blur_px`, at various rotations and offsets."""
     fine = 2 if blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))

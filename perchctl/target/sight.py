@@ -1,4 +1,4 @@
-"""The part of the ceiling in a camera's picture: from the ground, and as the gear comes near.
+"""The part of the ceiling in a camera's image: from the ground, and as the gear comes near.
 
 The vehicle stands or flies level. Directions are the vehicle's: forward and left.
 """
@@ -21,13 +21,13 @@ from perchctl.vision import (
 )
 
 ARUCO_MARGIN_PX = 3.0
-"""cv2.aruco drops markers nearer than this to the picture's edge."""
+"""cv2.aruco drops markers nearer than this to the image's edge."""
 NEAREST_M, FARTHEST_M = 1e-3, 50.0
 _EDGE_POINTS = 200
 
 
 class FieldOfView:
-    """The picture's edge, as the tangent of its angle from the camera's axis in each direction."""
+    """The image's edge, as the tangent of its angle from the camera's axis in each direction."""
 
     def __init__(self, camera: CameraModel, margin_px: float = ARUCO_MARGIN_PX) -> None:
         low = margin_px - 0.5
@@ -43,7 +43,7 @@ class FieldOfView:
         self._reach = np.hypot(*rays.T)[order]
 
     def contains(self, points_cam_m: Array) -> bool:
-        """True if all points (n, 3) of the camera frame are in the picture."""
+        """True if all points (n, 3) of the camera frame are in the image."""
         x, y, z = points_cam_m.T
         if (z <= 0.0).any():
             return False
@@ -51,7 +51,7 @@ class FieldOfView:
         return bool((np.hypot(x, y) <= reach * z).all())
 
     def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
-        """The distance d from which on ``R (x, y, d) + offset`` is in the picture for all
+        """The distance d from which on ``R (x, y, d) + offset`` is in the image for all
         points (x, y) of `outline_m` (n, 2); None without such a distance."""
 
         def seen(d: float) -> bool:
@@ -90,7 +90,7 @@ def outline_points_3d(outline_m: Array, z_m: float) -> Array:
 
 
 SURE_PX = 18.0
-"""Side of a marker that the search finds reliably, px: it finds 15 px in all rendered pictures, and
+"""Side of a marker that the search finds reliably, px: it finds 15 px in all rendered images, and
 a fifth is added."""
 BLURRED = 1.15
 """Factor on the least side that a plain search reads through a measured blur."""
@@ -132,7 +132,7 @@ def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
     """Return how far off the axis of a camera, `height_m` below, a marker of `side_m` is wholly in
-    the picture in any rotation; None if not even on the axis, or if the camera does not look up."""
+    the image in any rotation; None if not even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -157,11 +157,11 @@ class TargetView:
     """A target's position in the view of a level vehicle.
 
     Attributes:
-        has_marker: True if a marker is whole in the picture, and large enough.
+        has_marker: True if a marker is whole in the image, and large enough.
         height_m: height above the camera.
         aside_m: offset from the camera's axis, forward and left; NaN unless the axis points up.
         reach_m: largest distance from the axis at which the large marker is wholly in the
-            picture in any rotation; None if not even on the axis.
+            image in any rotation; None if not even on the axis.
     """
 
     has_marker: bool
@@ -274,7 +274,7 @@ def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """True if the whole small marker is in the picture with the gear `range_m` below it."""
+    """True if the whole small marker is in the image with the gear `range_m` below it."""
     R, gear = camera_rotation_and_gear(profile)
     outline = outline_points_3d(square_outline(profile.target.small.side_m), range_m)
     return FieldOfView(camera).contains(outline @ R.T + gear)

@@ -43,7 +43,7 @@ from perchctl.weights.data import HEADER, csv_row
 SEEN_SHARE = 0.9
 """Share of a position's frames that must show both markers."""
 MOST_WANDER_PX = 1.0
-"""Largest drift and largest jitter of the target's picture within a position, px."""
+"""Largest drift and largest jitter of the target's image within a position, px."""
 MOST_MISMATCH_M = 0.03
 """Difference from the camera's pose above which an actual pose is a mistake, m. Larger: a mistake
 is taken for an error of the camera."""

@@ -36,7 +36,7 @@ class CameraPlace:
 
 
 class SimulatedStand:
-    """The simulated camera on its stand. Same seed, same places, same pictures."""
+    """The simulated camera on its stand. Same seed, same places, same images."""
 
     def __init__(self, profile: Profile, camera: CameraModel, positions: int, seed: int) -> None:
         self._profile, self._camera, self._seed = profile, camera, seed
@@ -90,7 +90,7 @@ class SimulatedStand:
         )
 
     def frames(self, position: int, place: CameraPlace, count: int) -> Iterator[Frame]:
-        """Yield `count` pictures of a place; `position` is its number."""
+        """Yield `count` images of a place; `position` is its number."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)

@@ -1,1 +1,1 @@
-"""Calibration of the lens from pictures of a printed board."""
+"""Calibration of the lens from images of a printed board."""

@@ -1,4 +1,4 @@
-"""Views of a board from pictures, a video or a live camera, and how alike two views are."""
+"""Views of a board from images, a video or a live camera, and how alike two views are."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.vision import Frame
 
-# --- Pictures ---
+# --- Images ---
 
 
 def find_views(
@@ -36,10 +36,10 @@ def find_views(
     board: Board,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Detect the board in picture files. Pictures that are broken or show no board are returned
-    separately. `progress` is called with the number of pictures done and their total number.
+    """Detect the board in image files. Images that are broken or show no board are returned
+    separately. `progress` is called with the number of images done and their total number.
 
-    Raises InvalidValue, before the search, if the pictures differ in size.
+    Raises InvalidValue, before the search, if the images differ in size.
     """
     names = [path.name for path in pictures]
     if len(set(names)) < len(names):  # a glob may match files in several folders
@@ -83,7 +83,7 @@ def _picture_size(path: Path) -> tuple[int, int] | None:
 
 
 def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
-    """Raise InvalidValue, which names all pictures that differ in size from most."""
+    """Raise InvalidValue, which names all images that differ in size from most."""
     counts = Counter(size for size in sizes.values() if size)
     if len(counts) < 2:
         return
@@ -97,7 +97,7 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
 
 
 def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Rejection]]:
-    """Return the views of the layout that most pictures show, and reject the others: there is only
+    """Return the views of the layout that most images show, and reject the others: there is only
     one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
     reason = "its markers have another layout than in most pictures"
@@ -122,7 +122,7 @@ _TILT_GAIN = 2.0
 
 def view_signature(view: BoardView, board: Board) -> Array:
     """Return how a view shows the board, (5,): the corners' centre x, y and the board's size,
-    relative to the picture, and the tilts: how much farther away the right side is than the left,
+    relative to the image, and the tilts: how much farther away the right side is than the left,
     and the lower side than the upper."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
@@ -134,7 +134,7 @@ def view_signature(view: BoardView, board: Board) -> Array:
     affine = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
     columns, rows = board.squares
     size = np.sqrt(abs(np.linalg.det(affine)) * columns * rows / (w * h))
-    # Rotated from the board's axes to those of the picture.
+    # Rotated from the board's axes to those of the image.
     rotation = affine / max(float(np.linalg.norm(affine[:, 0])), 1e-9)
     tilt = _TILT_GAIN * 0.5 * max(columns, rows) * (rotation @ H[2, :2])
     return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
@@ -156,7 +156,7 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
 
 def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
     """The bar of each of `COVERAGE_AXES`. Those of the positions and the size reach from the least
-    to the most in the view signatures, in shares of the picture, so a gap shows what is missing.
+    to the most in the view signatures, in shares of the image, so a gap shows what is missing.
     That of the skew is its share of the goal."""
     shares = covered_shares(signatures)
     reach = dict.fromkeys(COVERAGE_AXES, (0.0, 0.0))
@@ -249,7 +249,7 @@ class GuidedCapture:
         self._count("repeated")
 
     def update(self, view_or_reason: BoardView | str) -> bool:
-        """Process the next picture: extract its view of the board, or find out why it has none.
+        """Process the next image: extract its view of the board, or find out why it has none.
 
         Return True if the view was taken because it is new, sharp and still.
         """
@@ -312,7 +312,7 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """Return how to move or tilt the board next, in directions of the picture: towards what the
+    """Return how to move or tilt the board next, in directions of the image: towards what the
     view `signatures` cover least."""
     done = covered_shares(signatures)
     least = min(COVERAGE_AXES, key=lambda axis: done[axis])

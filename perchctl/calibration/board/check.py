@@ -1,4 +1,4 @@
-"""Check an existing calibration against new pictures.
+"""Check an existing calibration against new images.
 
 The camera of the file, with only the poses of the boards fitted, is compared with a camera fitted
 to the new views. Its reprojection error reveals a wrong lens. The poses absorb a wrong focal
@@ -7,9 +7,9 @@ check fails
 
 - when the file's RMS is more than twice that of the free camera and above 0.3 px, or
 - when these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
-  distance) and by more than the 95 % bound of the new pictures.
+  distance) and by more than the 95 % bound of the new images.
 
-If the 95 % bound of the new pictures is above twice the limit, they cannot decide, and the check is
+If the 95 % bound of the new images is above twice the limit, they cannot decide, and the check is
 refused.
 """
 
@@ -52,10 +52,10 @@ class Deviation:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Verdict on a calibration by new pictures, and its `reason`.
+    """Verdict on a calibration by new images, and its `reason`.
 
     rms_px: reprojection error of the checked camera (infinite if boards are out of its view);
-    best_rms_px: error of the camera refitted to the pictures; rejections: outliers left out.
+    best_rms_px: error of the camera refitted to the images; rejections: outliers left out.
     """
 
     passed: bool
@@ -84,8 +84,8 @@ def check_calibration(
     """Judge a calibration against new views of a board.
 
     Args:
-        own_hashes: `BoardView.picture_hash` of the pictures that the calibration was made from.
-            These pictures are left out: a calibration always fits its own pictures, even if both
+        own_hashes: `BoardView.picture_hash` of the images that the calibration was made from.
+            These images are left out: a calibration always fits its own images, even if both
             are wrong.
 
     Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
@@ -140,7 +140,7 @@ def _verdict(
 
 
 def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
-    """Raises InvalidValue if the pictures could not reveal a wrong focal length."""
+    """Raises InvalidValue if the images could not reveal a wrong focal length."""
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(

@@ -1,4 +1,4 @@
-"""Find a board in a picture and refine its corners, or explain why there is none."""
+"""Find a board in an image and refine its corners, or explain why there is none."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from perchctl.vision import deinterlace_image
 MIN_CORNERS = 6
 """Least number of corners in a view. Fewer determine a pose, but nothing about the lens."""
 SEARCH_PX = 1600
-"""Size to which larger pictures are scaled down for the search; corners are fitted at full size."""
+"""Size to which larger images are scaled down for the search; corners are fitted at full size."""
 _HASH_BYTES = 6
-"""Length of a picture's hash, bytes. With a shorter one, the probability that two of a thousand
-pictures have the same hash by chance would exceed 1 in 10^8."""
+"""Length of an image's hash, bytes. With a shorter one, the probability that two of a thousand
+images have the same hash by chance would exceed 1 in 10^8."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-# an exhaustive search would take a second in a picture without a board
+# an exhaustive search would take a second in an image without a board
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """Detected board corners of one picture.
+    """Detected board corners of one image.
 
     Attributes:
         name: the file's name, or the frame's number.
-        size_px: the picture's width and height.
+        size_px: the image's width and height.
         ids: index of each corner on the board, (n,).
         corners_m: corner positions on the board, z = 0, (n, 3).
-        corners_px: corner positions in the picture, (n, 2); the top-left pixel's centre is (0, 0).
+        corners_px: corner positions in the image, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
         legacy: the layout that was seen, as in `perchctl.target.Board`.
-        picture_hash: equal for pictures of the same pixels, whatever their file; empty if unknown.
+        picture_hash: equal for images of the same pixels, whatever their file; empty if unknown.
     """
 
     name: str
@@ -133,9 +133,9 @@ class FoundViews:
     """The detected views of a board.
 
     Attributes:
-        without_board: pictures without a board, each with the reason.
-        frames: the results of a video's or camera's frames; None for pictures.
-        other_board: if there are no views, the board that the pictures show instead; empty without
+        without_board: images without a board, each with the reason.
+        frames: the results of a video's or camera's frames; None for images.
+        other_board: if there are no views, the board that the images show instead; empty without
             one.
     """
 
@@ -150,8 +150,8 @@ class FoundViews:
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """Return the view of a board in a grey picture (h, w), or the reason why no board was found. In
-    an interlaced picture, the first field is used, since a moving board has two positions. Both
+    """Return the view of a board in a grey image (h, w), or the reason why no board was found. In
+    an interlaced image, the first field is used, since a moving board has two positions. Both
     layouts of a ChArUco board are tried, whatever `board` says."""
     picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
     image = deinterlace_image(image)[0]
@@ -208,7 +208,7 @@ def _charuco(image: Grey, board: Board) -> _Corners | str:
 def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array, int]:
     """Return the indices (n,) and positions (n, 2), px, of the corners in the board's layout, and
     the number of markers that were found."""
-    # Each call has its own detector, because pictures are searched on several threads.
+    # Each call has its own detector, because images are searched on several threads.
     detector = cv2.aruco.CharucoDetector(board.cv2_board())
     finding = detector.getDetectorParameters()
     finding.minMarkerPerimeterRate = 0.01
@@ -237,7 +237,7 @@ def _chessboard(image: Grey, board: Board) -> _Corners | str:
 
 
 def _without_board(image: Grey) -> str:
-    """Return why a picture shows no board: it may show the target, the other print that lies
+    """Return why an image shows no board: it may show the target, the other print that lies
     about."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
@@ -269,7 +269,7 @@ def _local_axes(cells: Array, corners: Array) -> Array:
     return np.asarray((H[:2, :2] - at * H[2, :2]) / w)
 
 
-# --- The corner where four squares meet, found by fitting the picture around it ---
+# --- The corner where four squares meet, found by fitting the image around it ---
 # `cv2.cornerSubPix` with a fixed window takes in the neighbouring corners of small squares, and a
 # ChArUco board's markers: it errs by 0.03 to 0.5 px where this errs by 0.02. Here the window
 # follows the square's own size and slant, and the grey levels in it are fitted by what a lens
@@ -308,9 +308,9 @@ def fit_saddles(
     """The corners refined to hundredths of a pixel.
 
     Args:
-        image: grey picture (h, w).
+        image: grey image (h, w).
         corners_px: first guess, good to a fifth of a square, (n, 2).
-        axes_px: in the picture, the vectors from each corner to its two neighbours on the board,
+        axes_px: in the image, the vectors from each corner to its two neighbours on the board,
             as the columns of (n, 2, 2).
         white_rim: width of the blank rim of the white squares, in squares (1: no markers inside).
     """
@@ -352,7 +352,7 @@ def fit_saddles(
 
 
 def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The grey levels (n, m) at places (n, m, 2), and which of these are in the picture."""
+    """The grey levels (n, m) at places (n, m, 2), and which of these are in the image."""
     h, w = image.shape
     inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)

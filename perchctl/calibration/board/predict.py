@@ -34,7 +34,7 @@ _LIMIT_FLOOR_MM = 1.0
 class ErrorAtRange:
     """95 % bound of the target's position error at distance z_m.
 
-    mm95: largest over the part of the picture that the calibration boards covered and that shows a
+    mm95: largest over the part of the image that the calibration boards covered and that shows a
     whole marker; axis_mm95: straight ahead.
     """
 
@@ -49,7 +49,7 @@ def allowed_error_mm(z_m: float) -> float:
 
 
 def covered_cells(views: Sequence[BoardView]) -> NDArray[np.bool_]:
-    """A mask (rows, columns) of the picture's grid cells that a board covers in some view."""
+    """A mask (rows, columns) of the image's grid cells that a board covers in some view."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
     for view in views:
@@ -65,7 +65,7 @@ def predict_errors(
     ranges_m: Sequence[float] = RANGES_M,
 ) -> tuple[ErrorAtRange, ...]:
     """Predict the target's position error at each distance from the covariance of the lens
-    parameters, for markers wholly within `covered` cells (None: the whole picture)."""
+    parameters, for markers wholly within `covered` cells (None: the whole image)."""
     result = []
     for z_m in ranges_m:
         lines_mm = []
@@ -82,9 +82,9 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Return the position errors (n,) that result from evaluating pictures of a target that were
+    """Return the position errors (n,) that result from evaluating images of a target that were
     taken with the camera `truth` by the model `camera` (inf if out of its view). The n targets at
-    distance z_m lie on a grid within the `covered` cells of the picture (None: all); the first is
+    distance z_m lie on a grid within the `covered` cells of the image (None: all); the first is
     on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
@@ -129,7 +129,7 @@ def _cells(camera: CameraModel, place: Array, corners_m: Array) -> NDArray[np.in
     w, h = camera.size_px
     if not ((pixels >= 0).all() and (pixels <= (w - 1, h - 1)).all()):
         return None
-    # Far outside its field of view, the polynomial of a lens folds back into the picture.
+    # Far outside its field of view, the polynomial of a lens folds back into the image.
     straight = corners_m[:, :2] * (1.0, -1.0) + place[:2]
     if not np.allclose(undistort_to_normalised(pixels, camera), straight / place[2], atol=1e-3):
         return None

@@ -1,6 +1,6 @@
-"""Find out which board the pictures show if it is not the one that was named.
+"""Find out which board the images show if it is not the one that was named.
 
-For chessboards, this is the grid of corners that most pictures show, at least two. For boards with
+For chessboards, this is the grid of corners that most images show, at least two. For boards with
 markers, it is the dictionary that decodes most of them, and the layout whose corners OpenCV then
 finds. A board is named only if it is certain.
 """
@@ -20,7 +20,7 @@ from perchctl.profile import aruco_dictionary
 from perchctl.target import Board, mm_text
 
 MOST_PICTURES = 5
-"""Number of pictures that are searched for a chessboard, each within some tenths of a second."""
+"""Number of images that are searched for a chessboard, each within some tenths of a second."""
 MARKER_PICTURES = 3
 """Number of them that are searched for markers, each within about a second."""
 MIN_MARKERS = 4
@@ -45,7 +45,7 @@ _GRID_FLAGS = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
-    """Return the board in the grey pictures and its notation; empty if none is clearly visible, or
+    """Return the board in the grey images and its notation; empty if none is clearly visible, or
     if it is the board that was named."""
     images = [_small(picture) for picture in pictures[:MOST_PICTURES]]
     if not images:
@@ -104,7 +104,7 @@ def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
 def _marker_ids(
     image: Grey, dictionaries: Sequence[str], border_bits: int = 1
 ) -> dict[str, set[int]]:
-    """Return the ids of the markers in a picture, by dictionary."""
+    """Return the ids of the markers in an image, by dictionary."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.errorCorrectionRate = 0.0  # squares of a chessboard decode with this dictionary
@@ -147,7 +147,7 @@ def _layouts(named: Board, markers: int) -> list[Board]:
 
 
 def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
-    """Return the board with the most corners in the picture in either layout, the first of several;
+    """Return the board with the most corners in the image in either layout, the first of several;
     None if none has enough."""
     best, most = None, MIN_MARKER_CORNERS - 1
     for board in boards:

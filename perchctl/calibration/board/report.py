@@ -2,7 +2,7 @@
 to add.
 
 A residual is the found corner minus the corner that the camera model predicts. Residuals that point
-at random come from noise in the pictures. Neighbouring residuals that point the same way in many
+at random come from noise in the images. Neighbouring residuals that point the same way in many
 views mean that the model does not describe the lens, or that the board is not flat.
 """
 
@@ -31,11 +31,11 @@ from perchctl.target import Board
 
 _VERDICT_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
 _LONG_SHARE = 0.04
-"""Length at which a long residual is drawn, in picture widths. Larger: neighbours cross. Smaller:
+"""Length at which a long residual is drawn, in image widths. Larger: neighbours cross. Smaller:
 their directions cannot be seen."""
 _LONG_PERCENTILE = 95.0
 """Percentile of the residuals' lengths that counts as a long residual. Larger: a few outliers
-shrink the others. Smaller: the longest ones leave the picture."""
+shrink the others. Smaller: the longest ones leave the image."""
 _LEAST_RESIDUAL_PX = 1e-3
 """Length as which shorter residuals are drawn, px: exact corners have none."""
 _LEAST_STEPS = 2
@@ -54,7 +54,7 @@ class ReportedView:
         predicted_px, residuals_px: its corners by the camera model, and the found ones minus those.
         distance_m: of the board's middle from the camera.
         tilt_deg: between the board and the image plane.
-        facing: unit vector (2,) in the picture, right and down, of the side that the board faces.
+        facing: unit vector (2,) in the image, right and down, of the side that the board faces.
         rejected_corners: number of corners that were rejected as outliers.
     """
 
@@ -116,7 +116,7 @@ class CalibrationReport:
 
     @property
     def rejections(self) -> list[Rejection]:
-        """The views and pictures that were not used, with the reasons. Single corners are not
+        """The views and images that were not used, with the reasons. Single corners are not
         included."""
         whole = [r for r in self.result.rejections if not r.corner_ids]
         return [*whole, *self.result.without_board]
@@ -185,7 +185,7 @@ class CalibrationReport:
 
     @property
     def uncovered_boxes_px(self) -> list[tuple[float, float, float, float]]:
-        """Left, top, width and height of the parts of the picture that no board covered: the runs
+        """Left, top, width and height of the parts of the image that no board covered: the runs
         of empty cells in each row of the grid."""
         w, h = self.result.camera.size_px
         rows, columns = CELLS

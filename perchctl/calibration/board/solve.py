@@ -51,11 +51,11 @@ class Calibration:
         fit: the camera, and the poses and residuals of the `views`.
         covariance: covariance (p, p) of the p lens parameters.
         views: the views used, without rejected corners.
-        without_board: pictures without a board, and why.
+        without_board: images without a board, and why.
         errors: predicted position error of the target, by distance.
-        covered_cells: mask (rows, columns) of the picture's grid cells that boards covered.
+        covered_cells: mask (rows, columns) of the image's grid cells that boards covered.
         defects: sentences on the views' defects, with remedies; any rules out the best verdict.
-        frames: the results of a video's or camera's frames; None for pictures.
+        frames: the results of a video's or camera's frames; None for images.
     """
 
     board: str
@@ -209,7 +209,7 @@ def robust_fit(
     views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
     """Fit the views without outliers, with the simplest of the `models` that describes the lens. (A
-    model that does not fit would reject views at the edge of the picture.) Return the fit, the
+    model that does not fit would reject views at the edge of the image.) Return the fit, the
     views used, and the rejected views and corners.
 
     Raises InvalidValue if the views fit no camera.

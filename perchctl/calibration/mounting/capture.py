@@ -24,11 +24,11 @@ LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5
-"""Age at the beginning of a part above which an attitude belongs to none of its pictures, s."""
+"""Age at the beginning of a part above which an attitude belongs to none of its images, s."""
 MIRRORED_PICTURES = 60
-"""Number of mirrored pictures, with no others, after which the recording ends."""
+"""Number of mirrored images, with no others, after which the recording ends."""
 SHARE_OVER = 60
-"""Number of newest pictures over which the displayed share with a target is computed."""
+"""Number of newest images over which the displayed share with a target is computed."""
 LEAST_TARGET_SHARE = 0.3
 
 
@@ -51,7 +51,7 @@ def record_mounting(
 
     Raises:
         TimedOut: camera or vehicle are lost; the recording keeps the data until then.
-        InvalidValue: the picture is mirrored.
+        InvalidValue: the image is mirrored.
     """
     oldest_s = clock() - BEFORE_S
     progress = _Progress(recording)
@@ -65,7 +65,7 @@ def record_mounting(
             continue
         poses = reader.read_poses(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
-        if frame.repeated and not reader.trouble:  # a picture without a target counts as no picture
+        if frame.repeated and not reader.trouble:  # an image without a target counts as no image
             continue
         recording.poses += poses
         recording.mirrored_pictures = reader.mirrored

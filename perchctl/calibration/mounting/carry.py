@@ -1,6 +1,6 @@
 """The carry: find the camera's rotation and latency from the rotations of vehicle and target.
 
-One rotation chain holds at each picture's exposure: ``R_cam_target = R_body_cam^T R_world_body(t -
+One rotation chain holds at each image's exposure: ``R_cam_target = R_body_cam^T R_world_body(t -
 latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body, in the world that
 is the body frame at the first sample. The solution contains the rotations of camera and target, the
 latency, the bias and scale error of the gyroscope, and a random walk of the integrated rotation.
@@ -49,7 +49,7 @@ class RotationSolution:
 
     Attributes:
         rotation_cov_rad2: covariance (3, 3) of a small rotation of R_body_cam in body axes.
-        latency_s: from exposure to the picture's timestamp; positive if pictures are late.
+        latency_s: from exposure to the image's timestamp; positive if images are late.
     """
 
     R_body_cam: Array
@@ -78,7 +78,7 @@ class RotationSolution:
 def solve_rotation(recording: MountingRecording) -> RotationSolution:
     """Solve for the camera's rotation in the body and its latency.
 
-    Raises InvalidValue, with advice, for too little motion or a mirrored picture, or if vehicle and
+    Raises InvalidValue, with advice, for too little motion or a mirrored image, or if vehicle and
     camera do not agree.
     """
     check_recording(recording, "carry")
@@ -136,7 +136,7 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """Return the target's rotation in the world, the middle one of all pictures."""
+    """Return the target's rotation in the world, the middle one of all images."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam
@@ -254,7 +254,7 @@ def _vectors(R: Array) -> Array:
 
 
 # --- The camera's rotation and latency without an initial guess ---
-# Between two pictures, the camera rotates by the same rotation as the body, expressed in its own
+# Between two images, the camera rotates by the same rotation as the body, expressed in its own
 # axes: ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid, the best
 # R_body_cam follows in closed form; the latency with the smallest misfit is used.
 
@@ -269,7 +269,7 @@ _HALF_COUNTED_RAD = 0.02
 
 def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
     """Return a first estimate of R_body_cam and of the latency in s. Raises InvalidValue if no two
-    pictures are some tenths of a second apart."""
+    images are some tenths of a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         raise InvalidValue(
@@ -368,7 +368,7 @@ class PoseResiduals:
 
     def parameter_covariance(self) -> Array:
         """Return the parameters' covariance (p, p) by a block jackknife, since errors of successive
-        pictures may be correlated."""
+        images may be correlated."""
         blocks = [
             self.normal_equations(k)
             for k in np.array_split(np.arange(len(self.misfit)), JACKKNIFE_BLOCKS)

@@ -1,10 +1,10 @@
 """The pivot: find the position of the gear's tip, which stands on one point while the vehicle is
 tilted around it.
 
-The point c in the target's frame and the tip in the camera's frame are the same in every picture:
+The point c in the target's frame and the tip in the camera's frame are the same in every image:
 ``tip = R_cam_target c + p_cam_target``. Both are found by linear least squares, in which each
-picture is weighted by its own covariance and outliers count little. Neither the vehicle's attitude
-nor the pictures' timestamps are needed.
+image is weighted by its own covariance and outliers count little. Neither the vehicle's attitude
+nor the images' timestamps are needed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         size_sigma: relative sigma of the printed sizes (`target.size_sigma`), which scale all
             distances.
 
-    Raises InvalidValue for too few or too similar tilts, a tip that slipped, or a mirrored picture.
+    Raises InvalidValue for too few or too similar tilts, a tip that slipped, or a mirrored image.
     """
     check_recording(recording, "pivot")
     poses = pose_arrays(recording)

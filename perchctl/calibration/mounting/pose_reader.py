@@ -1,4 +1,4 @@
-"""Read the target's poses from the pictures of a stream, as far as measuring the mounting needs
+"""Read the target's poses from the images of a stream, as far as measuring the mounting needs
 them."""
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from perchctl.vision import (
 class PoseReader:
     """Reads the target's pose from each frame of a stream.
 
-    `mirrored` counts pictures with only a mirrored target. Of the newest picture, `outlines` are
+    `mirrored` counts images with only a mirrored target. Of the newest image, `outlines` are
     the markers' names and corners (4, 2) px, and `trouble` names its defect, or is empty.
     """
 

@@ -60,7 +60,7 @@ class TargetPose:
 @dataclass(eq=False)
 class MountingRecording:
     """Recording of one part (carry or pivot), appended to while it runs. `mirrored_pictures` counts
-    the pictures with only a mirrored target."""
+    the images with only a mirrored target."""
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
