@@ -12,8 +12,8 @@ from typing import Protocol
 from perchctl.children import SharedTime
 
 SIM_PATIENCE_S = 5.0
-"""Time without progress of the simulator after which the flight's clock runs on by the wall clock.
-It is longer than the simulator waits for the loop."""
+"""Time without progress in the simulator after which the flight's clock continues with the wall
+clock. It is longer than the simulator's own wait for the loop."""
 _CLOCK_POLL_S = 0.001
 
 
@@ -21,7 +21,7 @@ class Clock(Protocol):
     """The time and the waits of one flight, in seconds, real or simulated."""
 
     def now(self) -> float:
-        """Return the present time, s, monotonic."""
+        """Return the current monotonic time, s."""
 
     def wait_until(self, t_s: float) -> None:
         """Wait until the clock reads `t_s`; return at once if that is past."""
@@ -43,8 +43,8 @@ class SimulatedClock:
     """Clock of a simulator in real time: simulator and flight loop wait for each other.
 
     The simulator advances the clock, which stands still on a busy computer. Any thread may call
-    `now`. `zero_s`: the reading at the simulator's start, such that the first reading agrees with
-    `time.monotonic`.
+    `now`. `zero_s`: the clock's reading at the simulator's start, chosen so that the first reading
+    agrees with `time.monotonic`.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class SimulatedClock:
             wall_s, reached_s = self._wall(), self._shared.reached_s
             if reached_s != self._reached_s:
                 self._reached_s, self._moved_s = reached_s, wall_s
-                # Time that passed without the simulator is kept, so that the clock never runs
-                # backwards.
+                # Time that passed without the simulator is added permanently, so that the clock
+                # never runs backwards.
                 self.zero_s = max(self.zero_s, self._now_s - reached_s)
             alone_s = max(0.0, wall_s - self._moved_s - SIM_PATIENCE_S)
             self._now_s = max(self._now_s, self.zero_s + reached_s + alone_s)

@@ -44,14 +44,16 @@ from perchctl.vision import TargetEstimate
 KNOWN_SUPERVISOR_BITS = 0x0FFF
 READING_AGE_S = 1.0  # battery and variances arrive ten times a second
 REST_ACC_G = 0.15  # tolerance on the 1 g that the accelerometer reads at rest
-WITHIN_REACH_M = 0.35  # from the gear: a take-off needs more height, so no target is that near
-ROOM_M = 50.0  # no capture volume is larger: a position farther off is in another unit
-# between attitude and capture: somebody has aligned the rigid body's axes by eye
+WITHIN_REACH_M = (
+    0.35  # distance from the gear; a take-off needs more height, so no target can be that close
+)
+ROOM_M = 50.0  # no capture volume is larger: a more distant position must be in another unit
+# between attitude and capture; the rigid body's axes were aligned by eye
 UP_AXIS_AGREE_DEG = 20.0
 WANDERED_M = 0.1  # far above the noise of a motion capture
 REST_S = 1.9
 """Time for which the state estimate must have stood still before a take-off. The loop keeps no
-older samples. A shorter time shows less of a slow drift."""
+older samples. Shorter: a slow drift is harder to detect."""
 DRIFT_M = 0.07
 """Largest distance by which the estimate may move in that time (0.037 m/s). A healthy estimate
 moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from images, and
@@ -109,8 +111,7 @@ class GroundCriteria:
 
     @property
     def supervisor_fault(self) -> Problem | None:
-        """Problem: the supervisor reports a fault, such as a crash, that does not go away by
-        waiting."""
+        """Problem: the supervisor reports a fault that waiting does not clear, such as a crash."""
         raw = f"0x{self.telemetry.supervisor:04X}"
         for bit, what, advice in _FORBIDDEN:
             if self.telemetry.has_bit(bit):
@@ -140,7 +141,7 @@ class GroundCriteria:
 
     @property
     def battery_too_low(self) -> Problem | None:
-        """Problem: the battery is too low to take off; see `battery_unknown`, too."""
+        """Problem: the battery is too low for take-off. See also `battery_unknown`."""
         rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
         if not NO_BATTERY_READING_V <= rests_v < needed_v:
             return None
@@ -153,7 +154,8 @@ class GroundCriteria:
 
     @property
     def battery_too_high(self) -> Problem | None:
-        """Problem: the battery has more volts than one cell, so none of the limits holds for it."""
+        """Problem: the battery has a higher voltage than a single cell, so the limits do not
+        apply."""
         rests_v = self.telemetry.battery_v
         if not rests_v > MOST_CELL_V:
             return None
@@ -165,7 +167,7 @@ class GroundCriteria:
 
     @property
     def battery_unknown(self) -> Problem | None:
-        """Problem: there is no reading of the battery, or an old one."""
+        """Problem: the battery voltage is unknown, or its last reading is too old."""
         telemetry = self.telemetry
         if "battery" in self.profile.link.unreported:
             return None
@@ -184,7 +186,8 @@ class GroundCriteria:
 
     @property
     def variances(self) -> tuple[Variance, ...]:
-        """The variances by which the state estimate is judged (docs/firmware.md, "Variances").
+        """The variances that decide whether the state estimate is good enough for take-off
+        (docs/firmware.md, "Variances").
 
         The velocity's variance shows whether anything corrects the estimate. The position's
         variance shows whether the estimate has received a position since the estimator last
@@ -239,7 +242,8 @@ class GroundCriteria:
 
     @property
     def off_ground(self) -> Problem | None:
-        """Problem: the settled state estimate is off the ground: the vehicle hangs, or is held."""
+        """Problem: according to the settled state estimate, the vehicle is not on the ground: it
+        hangs or is held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
@@ -303,7 +307,7 @@ class GroundCriteria:
 
     @staticmethod
     def target_too_near(target: TargetEstimate | None) -> Problem | None:
-        """Problem: the target is too near for a vehicle on the ground."""
+        """Problem: the target is too close for a vehicle that stands on the ground."""
         if target is None or not target.tracked:
             return None
         away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -322,8 +326,8 @@ class GroundCriteria:
 
         The vehicle stands still, so something misleads its estimate: optical flow over a dark
         floor, a base station that was moved, or the positions of another body. Or somebody carries
-        the vehicle too smoothly for its accelerometer to notice. If there are fewer samples, only
-        those are judged.
+        the vehicle too smoothly for its accelerometer to notice. If the samples span less time,
+        only those are checked.
         """
         if not samples:
             return None
@@ -383,8 +387,8 @@ class GroundCriteria:
         return up_axis_problem(place, self.telemetry) or standing or self._unreachable(place)
 
     def _unreachable(self, place: ExternalPosition) -> Problem | None:
-        """Problem: no flight from this position reaches the expected target. It may be another
-        vehicle's."""
+        """Problem: no flight from this position can reach the expected target. The position may
+        belong to another vehicle."""
         target, (x, y, _) = self.profile.target, place.position_m
         if target.expected_xy_m is None:
             return None

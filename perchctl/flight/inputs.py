@@ -1,4 +1,5 @@
-"""The inputs of one tick of the loop: telemetry, at most one frame, and what follows from them."""
+"""The inputs of one tick of the loop: telemetry, at most one frame, and the values computed from
+them."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ from perchctl.vision import (
 )
 
 DOUBTFUL_KINDS = ("dark", "uniform")
-"""Kinds of doubtful images that are searched anyway. A target may still be visible in a dark one,
+"""Kinds of doubtful images that are searched anyway. A target may still be visible in a dark image,
 and a bare ceiling looks like an empty screen."""
 HEARD_S = 0.15  # extrapolating a detection with an older estimate would make the vehicle oscillate
 
@@ -78,7 +79,7 @@ class FlightInputs:
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    is_logged: bool = False  # then with the images' checksums
+    is_logged: bool = False  # whether the log also stores checksums of the images
     # Called with each frame as the source delivered it.
     on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
@@ -155,7 +156,7 @@ class FlightInputs:
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
-        # a source of another size; a single image of another size is only torn
+        # the source has another image size; a single image of another size is just corrupted
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         self._frame_kind = "ok"
@@ -196,9 +197,9 @@ class FlightInputs:
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def picture_problem(self, now_s: float) -> str | None:
-        """Return why there is no good image now; None if there is one. Either none has arrived,
-        the newest could not be used as a measurement, or the last good one is older than
-        `safety.camera_hold_s`. An image that is only dark or empty counts as good."""
+        """Return why there is no good image now; None if there is one. Possible reasons: no image
+        has arrived, the newest one could not be used as a measurement, or the last good one is
+        older than `safety.camera_hold_s`. An image that is only dark or empty counts as good."""
         age_s = now_s - self.last_good_frame_s
         if self.frames == 0:
             return self.camera_problem or "none has arrived"
@@ -259,7 +260,7 @@ class FlightInputs:
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """The target's estimate at `now_s`; None before the target was first seen. `tracked` is
+        """The estimate of the target at `now_s`; None until the target has been seen. `tracked` is
         False while no good frames arrive or the frames are not searched, because the filter counts
         its coasting in frames."""
         target = self.perception.target(now_s)
@@ -271,8 +272,8 @@ class FlightInputs:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Return why this frame cannot be used as a measurement: it has another size, is frozen, is
-        not an image at all, or is too old."""
+        """Return why this frame cannot be used as a measurement: it has the wrong size, is frozen,
+        is not a valid image, or is too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
@@ -300,9 +301,9 @@ class FlightInputs:
 
 # --- The target as positioning system, tick by tick ---
 # While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
-# better than from any image, so the known position is sent instead. This ends with the first
-# sample in which the accelerometer no longer shows that something carries the vehicle. Otherwise a
-# vehicle that falls would be told that it still hangs, and would look as if it did.
+# better than from any image, so the known position is sent instead. This ends with the first sample
+# in which the accelerometer no longer shows that something carries the vehicle. Otherwise a falling
+# vehicle would receive the position of a hanging one, and its estimate would agree.
 
 
 SUPPORTED_FOR_S = 0.1
@@ -319,13 +320,13 @@ FROZEN_ATTITUDE_S = 0.06
 """Age above which an unchanged attitude no longer counts as the attitude at the exposure, s. An
 error of 0.1 rad displaces a vehicle 1.2 m below the target by 12 cm."""
 PICTURE_AHEAD_S = 0.1
-"""Largest time by which an image may be ahead of the loop's clock, s. Beyond it, its time stamp
-comes from another clock."""
+"""Largest time by which an image may be ahead of the loop's clock, s. If it is further ahead, its
+time stamp comes from another clock."""
 
 
 class TargetPositioning:
-    """Measures positions from the target, if it is one flight's positioning system, and sends
-    them."""
+    """Measures the vehicle's position from the target and sends it, in a flight that uses the
+    target as its positioning system."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = TargetFeed(send, profile, pipeline.pose_setup)
@@ -358,7 +359,7 @@ class TargetPositioning:
     def with_fixed_target(
         self, target: TargetEstimate | None, history: History
     ) -> TargetEstimate | None:
-        """Return `target` moved to the target's known place; unchanged until that is known."""
+        """Return `target` moved to the target's known position; unchanged while that is unknown."""
         newest = history.newest
         now = None if newest is None else attitude_at(history, newest.t_s)
         return target if target is None or now is None else self.feed.with_fixed_target(target, now)
@@ -386,11 +387,11 @@ def _newest_samples(history: History, within_s: float) -> list[Telemetry]:
         if newest_s - sample.t_s > within_s:
             break
         found.append(sample)
-    found.reverse()  # the sum of floats depends on their order
+    found.reverse()  # a sum of floats depends on their order
     return found
 
 
-# --- Each turn of the loop as a value, for the log ---
+# --- A record of each loop turn, for the log ---
 
 
 Decision = tuple[PlannerState, Command, FeedStatus | None]
@@ -434,7 +435,7 @@ class TurnReporter:
     def report_discarded_turn(
         self, inputs: FlightInputs, obs: Observation, state: PlannerState, command: Command
     ) -> None:
-        """Report a turn whose command is not sent because the next turn decides again."""
+        """Report a turn whose command is discarded because the next turn makes a new decision."""
         self._report(replace(self.flown_turn(inputs, obs, state, command, None), role="redone"))
 
     def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
@@ -467,7 +468,7 @@ class TurnReporter:
         command: Command,
         feed: FeedStatus | None,
     ) -> TickRecord:
-        """The turn as it is logged after its command was sent."""
+        """The record of a turn whose command was sent."""
         self._open = None
         return TickRecord(
             number=self._counted(),

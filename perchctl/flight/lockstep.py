@@ -1,4 +1,5 @@
-"""A whole flight in lockstep: the flight loop on simulated time, exact for a seed."""
+"""A complete flight in lockstep: the flight loop runs on simulated time, and the same seed gives
+exactly the same flight."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ from perchctl.vision import Frame, Step, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2  # number of images that may wait; a newer one replaces the oldest
-HARD_LANDING_MPS = 1.0  # hitting the floor faster than this is a fall, whatever the log says
+HARD_LANDING_MPS = 1.0  # hitting the floor faster than this is a fall, regardless of the log
 FIRST_FRAME_S = 1.0
 
 
@@ -128,7 +129,7 @@ class TruthWatcher(Watcher):
 
 @dataclass(frozen=True)
 class LockstepFlight:
-    """A finished flight with its true end.
+    """A finished flight with its true final state.
 
     `miss_m`: from gear to target centre, horizontal; `hanging`: by the magnet; `locked`: by the
     supervisor.
@@ -153,7 +154,7 @@ class LockstepFlight:
         return Phase.ABORTED if self.fell else self.report.phase
 
     def close_log(self, log: LogWatcher) -> FlightSummary | None:
-        """Write the flight's summary, close its log, and return the summary."""
+        """Write the summary of the flight, close its log, and return the summary."""
         return log.close(self.report, self.perched_miss_m, self.fell)
 
 
@@ -174,14 +175,14 @@ def fly_lockstep(
 
     Args:
         log: the log file, or a watcher, which is closed only if the flight raises.
-        scenario, capture: used in place of the seed's own.
+        scenario, capture: replace those drawn from the seed.
         operator: the operator's command.
         watchers: further watchers of the flight. One that raises is detached, with a `Note` as
             warning after the flight.
         rows: your own transitions, besides those of the profile.
         camera: gets the simulated camera, and returns the source that is flown with.
-        perception: your own estimator: called instead of `perchctl.step`, with its arguments. The
-            returned state's `target` is what the planner flies to.
+        perception: your own estimator, called with the same arguments instead of `perchctl.step`.
+            The planner flies to the `target` in the state that it returns.
 
     Errors: NotFound, InvalidValue (calibration, log file, rows).
     """

@@ -53,10 +53,11 @@ from perchctl.vehicle import Idle, Telemetry
 from perchctl.vision import Pipeline
 
 TURN_HANG_S = 0.25
-"""Duration of a turn above which something hung, so that its data about the vehicle is out of date,
+"""Duration of a turn above which its data about the vehicle is out of date because something hung,
 s."""
 PERMISSION = "permission to take off"
-"""What a vehicle waits for when its own checks have passed and others fly in the same room."""
+"""What a vehicle still waits for, as shown to the operator, when its own checks have passed but
+other vehicles fly in the same room."""
 PERMISSION_PERIOD_S = 0.1
 """Period of the turns during that wait, s. Longer: take-off follows the permission later. Shorter:
 vehicles on the floor take computing time from those in the air."""
@@ -74,16 +75,16 @@ class PositionStatus(Protocol):
 class FlightParts:
     """The parts that the flight loop works with.
 
-    `watchers` look on, and end no flight (`perchctl.flight.watching`); `judges` are those of a
-    simulation, whose errors do. `positions` sends the external positions, None where decks measure
-    them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
-    `table` is flown instead of the profile's. `begin_turn` is called in the loop's own thread at
-    the beginning of each turn, also before take-off. `may_take_off` is called in each turn before
-    take-off with what the vehicle still waits for, empty once its own checks have passed; until it
-    returns True, the vehicle stays on the floor, disarmed, and goes on being checked.
-    `climb_withheld` is called in each turn of the mission; while it returns a reason, the vehicle
-    does not begin to climb to its target. What a `simulated` flight shows of latency and mounting
-    is no advice for a profile."""
+    `watchers` observe the flight and cannot end it (`perchctl.flight.watching`); `judges` observe a
+    simulated flight, and their errors do end it. `positions` sends the external positions; None if
+    decks measure them. `remarks` returns new notes on things that do not affect safety, such as a
+    recording. `table` replaces the profile's transition table. `begin_turn` is called in the loop's
+    own thread at the beginning of each turn, also before take-off. `may_take_off` is called in each
+    turn before take-off with the conditions that the vehicle still waits for, empty once its own
+    checks have passed. Until it returns True, the vehicle stays disarmed on the floor and the
+    checks continue. `climb_withheld` is called in each turn of the mission; while it returns a
+    reason, the vehicle does not begin to climb to its target. If the flight is `simulated`, its
+    measured latency and mounting are not suggested for the profile."""
 
     link: Link
     source: FrameSource
@@ -107,11 +108,12 @@ class FlightParts:
 
 
 def fly(parts: FlightParts) -> FlightReport:
-    """Wait until ready, fly the mission, and return how it ended; the link is connected.
+    """Wait until the vehicle is ready, fly the mission, and return how it ended.
 
-    If anything raises an exception, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
-    `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue. Watchers
-    that were detached are in the report, or in the error's `__notes__`, a sentence each.
+    The link must be connected. If anything raises an exception, the vehicle is landed first.
+    Errors: `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and anything
+    unforeseen after the rescue. The report, or the error's `__notes__`, contains one sentence for
+    each watcher that was detached.
     """
     watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
     try:
@@ -135,7 +137,9 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         on_frame=watchers.frame,
     )
     parts.link.set_guard(disarm_on_word(parts.operator), watchers.sent)
-    _wait_until_ready(parts, inputs, turns, watchers)  # nothing flies before it returns
+    _wait_until_ready(
+        parts, inputs, turns, watchers
+    )  # the vehicle does not fly before this returns
     watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
     parts.link.set_guard(watchdog.poll, watchers.sent)
     try:
@@ -153,9 +157,9 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
             watchers.sent,
             inputs.perception.motion.motion,
         )
-        with contextlib.suppress(Exception):  # whatever has failed may fail again
+        with contextlib.suppress(Exception):  # the part that failed may fail again
             turns.report_failure(inputs, error)
-        with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
+        with contextlib.suppress(Exception):  # if several judges fail, the first error is raised
             watchers.event(Event.make_rescue_note(parts.clock.now(), error, rest.state, rest.text))
         raise
 
@@ -227,8 +231,8 @@ def _wait_until_ready(
 
 
 def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetry) -> None:
-    """Raises SafetyAbort if the target is the positioning system and would leave the camera's view
-    on the way up."""
+    """Raise SafetyAbort if the target is the positioning system and would leave the camera's view
+    during the climb."""
     positioning = inputs.target_positioning
     if positioning is not None and positioning.feed.target:
         camera, place = parts.pipeline.camera, positioning.feed.target
@@ -236,7 +240,8 @@ def _refuse_lost_view(parts: FlightParts, inputs: FlightInputs, newest: Telemetr
 
 
 def _end_on_word(word: OperatorRequest, arming: Arming) -> None:
-    """Raises Interrupted on the operator's command; the link then disarms as it is closed."""
+    """Raise Interrupted if the operator has given a command. The link disarms the vehicle when it
+    is closed."""
     if word is not OperatorRequest.NONE:
         ending = "disarming" if arming.has_begun else "nothing was started"
         raise Interrupted(f"interrupted before take-off: {ending}")
@@ -281,7 +286,7 @@ def _mission(
         turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_before_landing and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > TURN_HANG_S):
-            redone = True  # a decision from before a hang is not sent after it
+            redone = True  # a decision made before a hang is not sent after it
             turns.report_discarded_turn(inputs, obs, new, command)
             continue
         state, redone = new, False
@@ -330,7 +335,7 @@ def _mission(
             )
         due_s += period_s
         if due_s < now_s:
-            due_s = now_s + period_s  # never make up for missed ticks with a burst
+            due_s = now_s + period_s  # missed ticks are not made up for with a burst
         clock.wait_until(due_s)
 
 

@@ -1,7 +1,7 @@
 """The operator's commands: Ctrl-C, the other signals, the panel's key and the live page's buttons.
 
-Ctrl-C reaches the program as one signal a press, whether a finger presses it again or the keyboard
-repeats a key that is held down. Which of the two it is has to be told from the times alone:
+Each press of Ctrl-C reaches the program as one signal, and so does each repeat of a key that is
+held down. The program can distinguish the two only by their timing:
 
 ========================================================  ==========================================
 presses                                                   order
@@ -19,9 +19,10 @@ spaced as a key repeats, and let go within that second    land if no hand presse
 ========================================================  ==========================================
 
 A held key waits 0.25 to 1 s and then repeats 5 to 33 times a second, evenly (terminals on Linux:
-after 250 to 660 ms, every 30 to 92 ms). A hand hammers 3 to 10 times a second, unevenly, and its
-first gap is no longer than the next ones. Whatever both could have done is a stop, since a vehicle
-that falls does less harm than one that flies on against the operator's word.
+after 250 to 660 ms, every 30 to 92 ms). A person presses a key 3 to 10 times a second, unevenly,
+and the first interval is no longer than the next ones. If both could have caused the presses, they
+count as a stop, because a falling vehicle does less harm than one that flies on against the
+operator's command.
 """
 
 from __future__ import annotations
@@ -45,10 +46,11 @@ from perchctl.mission import OperatorRequest
 
 STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
 KEY_HELP = "The space bar cuts the motors at once."
-"""The operator's stop in one sentence, used in every help text, panel, page and document."""
+"""How the operator stops a flight, in one sentence. Every help text, panel, page and document uses
+it."""
 
 SAME_PRESS_S = 0.3
-"""Two presses closer together than this count as one, s. Larger: a hurried second press is
+"""Two presses that are closer together than this count as one, s. Larger: a quick second press is
 missed."""
 LONGEST_DELAY_S = 1.0
 """Longest time for which a keyboard waits before it repeats a key, s. Until then, a second press
@@ -84,12 +86,13 @@ _EPS_S = 1e-9
 class OperatorSwitch:
     """The operator's command, by the table above, for planner and watchdog.
 
-    `press` is Ctrl-C. `land` is for Land on the live page and for the signals that ask a program to
-    end: it lands however often it comes, and never stops the motors. `cut` is for the panel's key
-    and Cut motors on the page: it stops them at once. All methods may be called from any thread.
+    `press` is Ctrl-C. `land` is for the Land button on the live page and for the signals that ask a
+    program to end: it lands the vehicle, never stops the motors, and may be repeated. `cut` is for
+    the panel's key and the Cut motors button: it stops the motors at once. All methods may be
+    called from any thread.
 
-    Until the flight loop listens there is nothing to land, and `STOP_HANG_S` after a stop nothing
-    is left to do: then `interrupt` raises `Interrupted`.
+    `interrupt` raises `Interrupted` if the flight loop is not listening yet, because there is
+    nothing to land, and from `STOP_HANG_S` after a stop on, because nothing is left to do.
     """
 
     listening: bool = False
@@ -97,7 +100,7 @@ class OperatorSwitch:
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _presses_s: list[float] = field(default_factory=list)  # recorded until they are a stop
+    _presses_s: list[float] = field(default_factory=list)  # recorded until they amount to a stop
     _stopped_s: float = math.inf
 
     def read(self) -> OperatorRequest:
@@ -116,8 +119,8 @@ class OperatorSwitch:
             self._stopped_s = min(self._stopped_s, self.clock())
 
     def press(self, count: int = 1) -> None:
-        """Note that Ctrl-C was pressed. `count` is the number of presses since the last call. Their
-        times are not known and are assumed to be evenly spaced, as presses by hand would be."""
+        """Record that Ctrl-C was pressed `count` times since the last call. The exact times are
+        unknown, so the presses are assumed to be evenly spaced, like presses by hand."""
         with self._lock:
             now_s = self.clock()
             self._decide(now_s)
@@ -208,7 +211,8 @@ _NO_SUSPENDING = "Ctrl-Z cannot suspend a flight: landing"
 
 @contextlib.contextmanager
 def operator_signals(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
-    """Let Ctrl-C press the switch during a flight, and `LANDING_SIGNALS` land (main thread only).
+    """During a flight, connect Ctrl-C to the switch and let `LANDING_SIGNALS` land the vehicle
+    (main thread only).
 
     A separate thread reads the signals from Python's wakeup socket, so they take effect even while
     the main thread hangs in a library. An ignored SIGHUP (nohup) stays ignored. `report` prints a
@@ -249,7 +253,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if any(number in LANDING_SIGNALS for number in numbers):
             switch.land()
         if switch.listening and signal.SIGTSTP in numbers:
-            # Not from this thread, which a terminal stopped by Ctrl-S would block.
+            # Not printed from this thread, which would block if the terminal is stopped by Ctrl-S.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 
@@ -264,15 +268,15 @@ _KEYS_AT_ONCE = 1024
 def cut_key(
     switch: OperatorSwitch, terminal: int, on_keys: Callable[[bytes], None] = lambda keys: None
 ) -> Iterator[bool]:
-    """Let the space bar cut the motors while the block runs; yield True if it does.
+    """Let the space bar cut the motors while the block runs.
 
-    `on_keys` is then called with all keys, in another thread; it must return at once.
+    Yields True if this is possible: it needs the file descriptor of a terminal with this process in
+    the foreground; otherwise nothing is changed.
 
-    It needs the file descriptor of a terminal, and this process must run in its foreground;
-    otherwise nothing is changed. Keys take effect without Enter and are not echoed; Ctrl-C and
-    Ctrl-Z still cause signals. Keys pressed before or during the block are discarded, so that a
-    stale one neither cuts the motors nor reaches the shell. The terminal is restored however the
-    block ends.
+    `on_keys` is called with all keys in another thread and must return at once. Keys take effect
+    without Enter and are not echoed; Ctrl-C and Ctrl-Z still cause signals. Keys pressed before or
+    during the block are discarded, so that a stale one neither cuts the motors nor reaches the
+    shell. The terminal is restored however the block ends.
     """
     before = _terminal_mode(terminal)
     if before is None:

@@ -31,14 +31,14 @@ from perchctl.vision import CameraModel, TargetEstimate
 
 
 def abort_on(problem: Problem | None) -> None:
-    """Raise SafetyAbort with the problem's sentence; do nothing if it is None."""
+    """Raise SafetyAbort with the text of the problem; do nothing if it is None."""
     if problem is not None:
         raise SafetyAbort(problem.sentence)
 
 
 def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
-    """Raises SafetyAbort for a supervisor fault or an unfit battery, which waiting does not
-    cure."""
+    """Raise SafetyAbort if waiting cannot help: the supervisor reports a fault, or the battery is
+    unfit."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
         battery = criteria.battery_too_low or criteria.battery_too_high
@@ -46,8 +46,8 @@ def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
 
 
 def refuse_armed(telemetry: Telemetry | None) -> None:
-    """Raises SafetyAbort if a vehicle that does not arm itself is armed before perchctl has armed
-    it: another program may be commanding it."""
+    """Raise SafetyAbort if a vehicle that does not arm itself was already armed, because another
+    program may be commanding it."""
     if telemetry is not None and is_armed_by_request(telemetry.supervisor):
         raise SafetyAbort(
             "the vehicle is armed, but not by perchctl: keep away from its propellers, and "
@@ -56,8 +56,8 @@ def refuse_armed(telemetry: Telemetry | None) -> None:
 
 
 def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:
-    """Raises SafetyAbort without any position source. `has_feed`: the positions of a motion
-    capture are being sent."""
+    """Raise SafetyAbort if the vehicle has no position source. `has_feed` is True if positions from
+    motion capture are being sent."""
     if profile.positioning.source.is_deck:
         abort_on(GroundCriteria.no_position_source(link.decks(), profile))
     elif profile.positioning.source.is_mocap and not has_feed:
@@ -73,15 +73,16 @@ def refuse_wrong_positions(
     now_s: float,
     rest_check: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body.
+    """Raise SafetyAbort if positions are in another unit, or belong to another world frame or
+    another body.
 
-    Old data and a tilted or moving vehicle are not checked. `rest_check` keeps the place of earlier
-    turns.
+    Nothing is checked if the data is old or if the vehicle is tilted or moving. `rest_check`
+    remembers the position from earlier turns.
     """
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
-        return  # unknown: neither judged nor reset
+        return  # unknown: neither checked nor reset
     criteria = GroundCriteria(telemetry, profile)
     stands = criteria.stands
     # The last position before a problem may have been somewhere else.
@@ -99,10 +100,10 @@ def refuse_wrong_positions(
 class GroundTurn:
     """What the loop knows in one turn before take-off.
 
-    `waited_s`: how long it has waited in all; `took_s`: how long this turn took so far;
-    `samples`: the telemetry of the last moments, oldest first, the newest `telemetry_age_s` old;
-    `picture_problem`: why there is no good and fresh image, `unseen_s` after the last one;
-    `link_problem`: what is wrong with the link.
+    `waited_s` is the total waiting time, and `took_s` the duration of this turn so far. `samples`
+    is the recent telemetry, oldest first; the newest sample is `telemetry_age_s` old.
+    `picture_problem` says why there is no good and fresh image, `unseen_s` after the last one.
+    `link_problem` says what is wrong with the link.
     """
 
     profile: Profile
@@ -119,9 +120,9 @@ class GroundTurn:
 
 
 def still_waiting_for(turn: GroundTurn) -> str:
-    """Return in words what take-off still waits for; empty if ready. Only this turn counts: a check
-    that passed earlier and fails now is waited for again. Errors: TimedOut after too long a wait,
-    SafetyAbort off the ground or too near to the target."""
+    """Return the conditions that take-off still waits for, in words; empty if the vehicle is ready.
+    Only this turn counts: if a check passed earlier but fails now, take-off waits for it again.
+    Errors: TimedOut after too long a wait, SafetyAbort off the ground or too near to the target."""
     profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_target = profile.safety.estimator_wait_s, profile.positioning.source.is_target
     if not turn.samples:
@@ -160,7 +161,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     if not waiting and turn.picture_problem:
         waiting = f"a good picture ({turn.picture_problem})"
         others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
-        if waited_s <= others_s + limit_s:  # it may have failed during the wait for the others
+        if waited_s <= others_s + limit_s:  # it may have failed while waiting for the others
             waited_s = min(waited_s, turn.unseen_s)
     waiting = waiting or _first({"a view of the target, which measures the position": unsent})
     if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
@@ -172,8 +173,8 @@ def still_waiting_for(turn: GroundTurn) -> str:
 
 
 def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-    """Problem: the estimate moves, or has not been seen to stand still for long enough. Nothing is
-    known about a pause in the telemetry."""
+    """Problem: the estimate moves, or has not stood still for long enough. A gap in the telemetry
+    does not count as standing still."""
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
@@ -200,9 +201,9 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
 
 
 ARMS_WITHIN_S = 5.0
-"""Longest time from the first request until the supervisor allows flight, s: the firmware gives up
-on motors that do not start after 2 s. Longer: the propellers of a vehicle that does not fly keep
-turning."""
+"""Longest time from the first arming request until the supervisor allows flight, s. The firmware
+gives up after 2 s if the motors do not start. Longer: the propellers of a vehicle that cannot fly
+turn for longer."""
 REQUEST_PERIOD_S = 0.25
 ARMING_PAUSE_S = 0.5
 """Longest time for which another check may fail once arming has begun, s, for example because of a
@@ -211,11 +212,11 @@ state is unknown. Shorter: a brief disturbance ends the flight."""
 
 
 class Arming:
-    """Arms a vehicle that does not arm itself, once nothing else is waited for.
+    """Arms a vehicle that does not arm itself once all other checks have passed.
 
-    Arming comes last, after the operator's confirmation, because the propellers turn from then on.
-    After the first request, other checks may fail for no longer than `ARMING_PAUSE_S`. A vehicle
-    that disarms itself is not armed again, since somebody may have reached for it.
+    Arming is the last step, after the operator's confirmation, because the propellers turn from
+    then on. After the first request, other checks may fail for no longer than `ARMING_PAUSE_S`. A
+    vehicle that disarms itself is not armed again, since somebody may have reached for it.
     """
 
     def __init__(self) -> None:
@@ -229,8 +230,8 @@ class Arming:
         return self._requested_s > -math.inf
 
     def note_waiting(self, waiting: str, began_s: float, now_s: float) -> None:
-        """Note the checks that failed in a turn that began at `began_s` and is now over; `waiting`
-        is empty if none did.
+        """Record which checks failed (`waiting`, may be empty) in a turn that began at `began_s`
+        and has just ended.
 
         Raises SafetyAbort if any has failed for longer than `ARMING_PAUSE_S` since the first
         request to arm. A turn that hangs counts, because nothing was observed during it.
@@ -285,19 +286,19 @@ def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm
     return poll
 
 
-# --- Whether a target that is the positioning system stays in view on the way up. Pure ---
+# --- Whether a target that is the positioning system stays in view during the climb. Pure ---
 
 
-LEAN_DEG = 5.0  # allows for the lean on the way up, including against a draught
+LEAN_DEG = 5.0  # allowance for the tilt during the climb, also against a draught
 Start = tuple[float, float, float]  # where it stands, in the world of the target's place
 
 
 def view_problem(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
-    """Problem: the target would be lost on the way up. With the vehicle leaning a little at
-    take-off height, over the start or over `planner.approach_xy_m`, no marker would be completely
-    in the image. `yaw_rad` is the vehicle's heading."""
+    """Problem: the camera would lose the target during the climb. With the vehicle slightly tilted
+    at take-off height, above the start or above `planner.approach_xy_m`, no marker would be
+    completely in the image. `yaw_rad` is the vehicle's heading."""
     planner, (x, y, z) = profile.planner, start_m
     advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
     for over in ((x, y), planner.approach_xy_m):
@@ -338,7 +339,7 @@ def target_view_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """The view of a vehicle that leans so that the target moves to the image's edge."""
+    """The view of a vehicle that tilts so that the target moves towards the image border."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.has_marker and aside_m > 1e-9):

@@ -1,4 +1,5 @@
-"""One flight in real time, from options to report: opens the edges, flies, closes them."""
+"""One flight in real time, from options to report: opens link, camera and log, flies, and closes
+them."""
 
 from __future__ import annotations
 
@@ -50,14 +51,14 @@ class FlyOptions:
     profile_path: Path
     uri: str
     source: str
-    # for a newcomer's first flight, in which nothing goes wrong that needs explaining
+    # for a newcomer's first flight, which should not raise questions
     seed: int = 11
     log_dir: Path = Path("perchctl-logs")
     record: bool = False
     sim_target_xy_m: tuple[float, float] | None = None
     """Position of a simulated target relative to the vehicle; None: drawn from the seed."""
     link_uri: str | None = None
-    """What the link opens instead of `uri`: the vehicle behind a radio hub."""
+    """URI that the link opens instead of `uri`, for a vehicle behind a radio hub."""
     serve_pictures: bool = False
     """The process of a vehicle in a fleet provides its images for the fleet's page."""
 
@@ -122,10 +123,10 @@ def fly_session(
     Returns the report, and the gear's distance from the target's centre, m, where a simulator
     measures it.
 
-    `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`,
-    `climb_withheld`: as in `FlightParts`.
-    `before_arming` is called once vehicle and camera have answered; what it raises ends the session
-    on the ground. `rows` are added to the profile's table.
+    `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`, and
+    `climb_withheld`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
+    answered. If it raises an exception, the session ends on the ground. `rows` are added to the
+    profile's table.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
@@ -187,7 +188,7 @@ def fly_session(
                     waiting.enter_context(clock.waiting_for_loop())
                 report = fly(parts)
         finally:
-            switch.listening = switch.closing = True  # Ctrl-C must not cut it short
+            switch.listening = switch.closing = True  # Ctrl-C must not interrupt it
             link.close()
         return report, _true_miss_m(simulated)
 
@@ -222,8 +223,9 @@ def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProc
 
 
 def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
-    """Raises SafetyAbort unless this vehicle was recently compared with the motion capture by hand
-    (`perchctl check --lift`): swapped axes do not show at rest. A simulated vehicle passes."""
+    """Raise SafetyAbort unless this vehicle was recently compared with the motion capture by hand
+    (`perchctl check --lift`), because swapped axes do not show at rest. A simulated vehicle
+    passes."""
     if not config.source.is_mocap or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection_and_advice(
@@ -240,8 +242,9 @@ def start_position_feed(
     clock: Clock,
     ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
-    """Settle the state estimate, and send it a capture's positions until `stack` closes, which is
-    after the link has closed: a landing vehicle needs them. None without a capture.
+    """Settle the state estimate, then send positions from motion capture to the vehicle until
+    `stack` closes. That is after the link has closed, because a landing vehicle needs them. Returns
+    None if the profile uses no motion capture.
 
     Errors: those of `CflibLink.settle_estimator`, InvalidValue, UsageError, ConnectionFailed."""
     if config.source.is_target:

@@ -1,14 +1,14 @@
 """Landing in the loop's place: the watchdog for a silent loop, and the rescue after an error.
 
-The watchdog decides what the link sends (`Link.set_guard`) in a thread that a hang of the loop
-cannot block. Before the loop's first tick nothing flies, and the watchdog only obeys the operator:
-it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the last position, but
-never one above the vehicle, so that the vehicle neither climbs nor presses against the ceiling. The
-exception is a vehicle that sinks: it keeps a setpoint above itself, which brakes it. The lander of
-`perchctl.mission` takes over after `safety.loop_late_land_s`, on the operator's order, or if the
-loop was already descending or had put the weight on the magnet. With decks or motion capture it
-orders the vehicle's own landing at once, three to six times, since a late loop can steer nothing;
-by the target alone it comes down level.
+The watchdog decides what the link sends (`Link.set_guard`), in a thread that a hanging loop cannot
+block. Before the loop's first tick the vehicle does not fly, and the watchdog only obeys the
+operator: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the last
+position, but never one above the vehicle, so that the vehicle neither climbs nor presses against
+the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above itself, which brakes
+it. The lander of `perchctl.mission` takes over after `safety.loop_late_land_s`, on the operator's
+command, or if the loop was already descending or had put the weight on the magnet. With decks or
+motion capture, it commands the firmware's own landing at once, three to six times, because a late
+loop cannot steer. With the target as the only position source, it descends level.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from perchctl.vehicle import (
 )
 
 REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
-# the loop has this long to obey the operator's stop itself, so that it is recorded
+# time for the loop to obey the operator's stop itself, so that the stop is recorded
 STOP_AFTER_S = 0.1
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 RESCUE_SINK_MPS = -0.1
 RESCUE_STILL_MPS = 0.06
-LOOK_S = 0.5  # a rescue ends once the motors have been seen off for this long
+LOOK_S = 0.5  # a rescue ends once telemetry has shown the motors off for this long
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class LastTick:
 
     next_due_s: float  # when the next tick is due, from which the loop measures its lateness
     state: PlannerState
-    command: Command  # the last one that was streamed
+    command: Command  # the last setpoint that was sent
     obs: Observation
 
 
@@ -105,7 +105,7 @@ class Watchdog:
     def tick(
         self, next_due_s: float, state: PlannerState, command: Command, obs: Observation
     ) -> None:
-        """Note a tick whose command is being sent; the next is due at `next_due_s`."""
+        """Record a tick whose command is being sent. The next tick is due at `next_due_s`."""
         if isinstance(command, (PositionSetpoint, RawThrust)):
             self._streamed = command
         if isinstance(command, EmergencyStop):
@@ -113,11 +113,13 @@ class Watchdog:
         self._last = LastTick(next_due_s, state, self._streamed or command, obs)
 
     def note_rescue(self) -> None:
-        """Note that the loop has ended by an error: `poll` then only obeys the operator's stop."""
+        """Record that the loop has ended with an error. From then on, `poll` only obeys the
+        operator's stop."""
         self._closing = True
 
     def end(self, *, motors_off: bool) -> None:
-        """Note that the flight is over; `motors_off` if that is proven."""
+        """Record that the flight is over. `motors_off` is True if the motors are known to be
+        off."""
         self._closing, self._motors_off = True, motors_off
 
     @property
@@ -130,7 +132,8 @@ class Watchdog:
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """The command to send in the loop's place, or None. `waiting`: unread samples."""
+        """Return the command to send in the loop's place, or None. `waiting` are the unread
+        telemetry samples."""
         last = self._last
         if self._loop_has_cut or self._cut_ordered:
             return self._cut(now_s, newest)
@@ -162,16 +165,17 @@ class Watchdog:
     def _before_first_tick(
         self, operator: OperatorRequest, now_s: float, newest: Telemetry | None
     ) -> Command | None:
-        """Obey the operator's command in the loop's place, because a first turn that hangs or fails
-        does not read it. That turn's command may have been sent anyway, so a stop cuts the motors,
-        and a landing disarms only on the ground."""
+        """Obey the operator's command in the loop's place if the first turn hangs or fails and so
+        does not read it. The command of that turn may have been sent already. A stop therefore cuts
+        the motors, and a landing disarms only on the ground."""
         if operator is OperatorRequest.STOP:
             self._cut_ordered = True
             return self._cut(now_s, newest)
         return self._on_ground(now_s, newest)
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
-        """The emergency stop until the vehicle is seen to be locked. Bounded."""
+        """Return the emergency stop until telemetry shows that the vehicle is locked, with a
+        timeout."""
         due = now_s - self._cut_s >= CUT_PERIOD_S - 1e-9
         if is_emergency_stopped(newest, now_s) or not due or self._cuts >= MAX_CUTS:
             return None
@@ -226,7 +230,8 @@ class Watchdog:
 
 
 def _is_on_its_way_down(state: PlannerState) -> bool:
-    """True also while the weight is on the magnet: its monitored release continues."""
+    """True while the vehicle descends, and also while its weight is on the magnet, because the
+    monitored release continues."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
         and (state.release_began_at_s is not None or state.motor_stop_commanded_at_s is not None)
@@ -245,7 +250,7 @@ def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
 
 
-# --- After an error: the last resort of every error path ---
+# --- After an error: the last resort on every error path ---
 
 
 def rescue(
@@ -259,8 +264,8 @@ def rescue(
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
 ) -> RestReport:
-    """Land a vehicle that still flies, without planner, camera and log, in at most a landing's
-    time. Returns where the vehicle came to rest.
+    """Land a vehicle that still flies, without planner, camera and log, within the time of a normal
+    landing. Returns where the vehicle came to rest.
 
     Args:
         state: the planner's last state; None before its first tick.
@@ -268,11 +273,11 @@ def rescue(
         position_age_s: age of the newest external position at a time; positions are no longer
             sent if the target is the positioning system.
         on_sent: called with each command that was sent.
-        motion: the motion that images and accelerometer last agreed on.
+        motion: the last motion on which images and accelerometer agreed.
     """
 
     def send(command: Command) -> None:
-        with suppress(Exception):  # the link itself may have failed: send the next one anyway
+        with suppress(Exception):  # the link itself may have failed: still send the next command
             link.send(command)
             on_sent(SentCommand(clock.now(), "rescue", command))
 

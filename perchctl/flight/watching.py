@@ -1,9 +1,10 @@
-"""Observers of a flight. An observer that raises is detached; the flight goes on.
+"""Observers of a flight. If an observer raises an exception, it is detached and the flight
+continues.
 
-A panel, a page, a callback or a log may fail in any tick. It is then detached, which is reported to
-the others, and the flight goes on without it. Two things are raised, and the loop lands the vehicle
-first: an error of the judges, without which a simulated flight would prove nothing, and an exit
-(KeyboardInterrupt, SystemExit), by which a program asks for its end.
+A panel, a page, a callback or a log may fail in any tick. It is then detached, the other observers
+are told, and the flight continues without it. Two kinds of exceptions are raised after the loop has
+landed the vehicle: errors from the judges, without which a simulated flight would prove nothing,
+and requests to exit (KeyboardInterrupt, SystemExit).
 """
 
 from __future__ import annotations
@@ -31,26 +32,28 @@ class FrameWatcher(Watcher, Protocol):
 
 
 class TurnWatcher(Watcher, Protocol):
-    """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
-    or decided again, and of the commands that the link sends in the loop's place."""
+    """A watcher that receives everything that a flight log contains, including turns without a tick
+    (before take-off, or with a discarded decision) and the commands that the link sends in the
+    loop's place."""
 
     def turn(self, turn: TickRecord) -> None: ...
 
     def sent(self, sent: SentCommand) -> None:
-        """Take a command sent in the loop's place; in another thread, so never wait."""
+        """Receive a command that was sent in the loop's place. Called in another thread; must not
+        block."""
 
     def note_detached(self, reason: str) -> None:
-        """Record as the `problem` that nothing more will be written, since writing raised for
+        """Record in `problem` that nothing more will be written, because writing failed for
         `reason`."""
 
 
 class Watchers:
-    """Hands a flight's frames, events, ticks, turns and sent commands to each watcher.
+    """Passes the frames, events, ticks, turns and sent commands of a flight to each watcher.
 
     `judges` are never detached. `now` is the loop's clock, `remarks` returns new notes.
 
     Attributes:
-        detached: a sentence for each watcher that was detached, in their order.
+        detached: one sentence for each detached watcher, in the order of detachment.
     """
 
     def __init__(
@@ -71,12 +74,12 @@ class Watchers:
 
     @property
     def have_log(self) -> bool:
-        """True if one of them takes whole turns."""
+        """True if one of the watchers records turns."""
         return any(takes_turns(watcher) for watcher in self._active)
 
     @property
     def problem(self) -> str | None:
-        """Why records of the flight are lost, else None."""
+        """The reason why records of the flight are lost; None if they are not."""
         for watcher in self._active:
             try:
                 if watcher.problem:
@@ -106,8 +109,8 @@ class Watchers:
                 self._call(watcher, watcher.turn, turn)
 
     def sent(self, sent: SentCommand) -> None:
-        """Hand on a command sent in the loop's place, in the link's thread. Never raises: the next
-        command must go out all the same."""
+        """Pass on a command that was sent in the loop's place. Runs in the link's thread and never
+        raises, because the next command must still be sent."""
         for watcher in self._active:
             if takes_turns(watcher):
                 try:
@@ -116,8 +119,8 @@ class Watchers:
                     self._detach(watcher, error)
 
     def take_notes(self) -> list[str]:
-        """Return what deserves a line in the flight's events since the last call: remarks on the
-        recording, and watchers that were slow or detached."""
+        """Return new notes for the flight's events since the last call: remarks on the recording,
+        and watchers that were slow or detached."""
         try:
             remarks = [*self._remarks()]
         except Exception as error:
@@ -147,9 +150,9 @@ class Watchers:
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
             self.detached.append(f"{sentence}: it was detached, and perchctl continued without it")
-            if takes_turns(watcher):  # the loop reports it, like any problem of a log
+            if takes_turns(watcher):  # the loop reports it like any log problem
                 self._log_problem = self._log_problem or sentence
-                with suppress(Exception):  # it has raised before
+                with suppress(Exception):  # it has already raised an exception
                     watcher.note_detached(sentence)
                 return
         self._report(f"{sentence}: it was detached, and the flight continues")

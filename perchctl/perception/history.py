@@ -22,8 +22,8 @@ KEEP_S = 2.0
 SMEARED_S = 0.15
 """Time over which a jump of the estimate may be spread, s."""
 FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
-"""Limits of a flight between two samples: 400 deg/s and 2 g. Smaller: a fast motion counts as a
-jump of the estimate."""
+"""Limits of the vehicle's motion between two samples: 400 deg/s and 2 g. Smaller: a fast motion
+counts as a jump of the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,8 @@ def add_samples(
 
 
 def attitude_at(history: History, t_s: float) -> VehicleState | None:
-    """Return attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
+    """Return attitude, position and velocity at `t_s`, interpolated linearly between samples (yaw
+    on the circle).
 
     Before the oldest sample, its values are used. After the newest sample, the position is
     extrapolated with its velocity for at most 0.1 s. Returns None without samples.
@@ -117,8 +118,8 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """Return the velocity of the first sample at or after `t_s`, else of the newest, else zero;
-    world axes."""
+    """Return the velocity in world axes of the first sample at or after `t_s`, or else of the
+    newest sample; zero without samples."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)

@@ -169,7 +169,7 @@ WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
 MOST_GAP_S = 0.5
 """Longest gap between frames, s; after a longer one, the level restarts."""
 GATE_SIGMAS = 5.0
-"""Standard deviations beyond which a change of the target's position is a jump."""
+"""Number of standard deviations beyond which a change of the target's position counts as a jump."""
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
 """Factors for the gate beyond the noise: 200 ms, and 0.4 rad."""
 LEAST_RANGE_M = 0.15
@@ -178,7 +178,8 @@ follows soon."""
 STAMPS_S = 0.003
 """Errors of the time stamps of telemetry and exposure that averaging does not reduce, s."""
 LARGE_TURN = 0.03
-"""Relative error of a large rotation, since the speeds assume the profile's mounting."""
+"""Relative error of the estimate if the rotation is large, because the speeds assume the profile's
+mounting."""
 LEAST_FRAMES = 30
 """Number of frames that a solution requires."""
 
@@ -248,7 +249,7 @@ def consistency_rows(
 
 
 def _above(size: float, noise: float) -> float:
-    """Return the share of a motion that counts: 0 if noise may explain it."""
+    """Return the part of a motion that exceeds the noise; 0 if noise alone may explain it."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
@@ -304,7 +305,7 @@ def add_rows(
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
     """Return the errors of latency and mounting; None with less than a second of frames.
 
-    `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
+    `attitude_sigma_rad` is the standard deviation of the bias of the estimated roll and pitch.
     """
     if sums.row_count < 3 * LEAST_FRAMES:
         return None
@@ -313,7 +314,7 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Camer
     covariance = np.linalg.inv(information)
     found = covariance @ moved
     left = float(sums.information[PLACE, PLACE] - found @ moved)
-    # More scatter than claimed widens the covariance; less scatter does not narrow it.
+    # More scatter than expected increases the covariance; less scatter does not reduce it.
     covariance *= max(1.0, left / sums.row_count)
     sigma = np.sqrt(np.diagonal(covariance))
     tilt_x, tilt_y = (

@@ -1,8 +1,8 @@
 """Estimate the target from the frames of one stream and the vehicle's telemetry.
 
 Flying, tracking, measuring the mounting and replaying all use a `Perception`. It decides whether a
-frame can be a measurement, separates the fields of an interlaced frame, runs each image through
-the pipeline of `perchctl.vision`, and keeps the required memory.
+frame can be used as a measurement, separates the fields of an interlaced frame, runs each image
+through the pipeline of `perchctl.vision`, and keeps the required memory.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ class Perception:
     """The session that estimates the target from the frames of one stream.
 
     Attributes:
-        stills: each frame is searched thoroughly, without memory of other frames.
+        stills: each frame is searched thoroughly and independently of other frames.
         history: the vehicle's telemetry; empty without a vehicle.
         attitude: function that returns the vehicle's attitude at a time; replaces the history's.
         state: the pipeline's memory.
         calibration, motion: estimates, from images and telemetry, of latency and mounting, and of
             the vehicle's motion.
-        refused: why a target was refused as another vehicle's; None if none was.
-        health: decides whether a frame can be a measurement at all.
+        refused: why a target was rejected as another vehicle's; None if none was.
+        health: decides whether a frame can be used as a measurement.
     """
 
     pipeline: Pipeline
@@ -130,7 +130,7 @@ class Perception:
         self.motion = drop_sightings(self.motion)
 
     def _calibrate(self, output: PipelineOutput, used_s: float) -> None:
-        # Use the source's stamp: a correction of the latency in progress must not change it.
+        # Use the source's time stamp: a latency correction in progress must not change it.
         pose, t_s = self.state.marker_poses.most_certain_pose, output.detections.t_s + used_s
         if pose is None:
             return
@@ -163,7 +163,7 @@ class Perception:
 
     @property
     def _measured_latency(self) -> MeasuredLatency | None:
-        """The latency in use if the flight measures it, else None."""
+        """The latency in use if it is measured in flight; otherwise None."""
         camera, (least_s, most_s) = self.profile.camera, USED_LATENCY_S
         if camera.latency_s != "measured":
             return None

@@ -25,18 +25,18 @@ Vector = tuple[float, float, float]
 MISMATCH_WINDOW_S = 1.2
 """Age at which a sighting is dropped, s."""
 MISMATCH_LEAST_S = 0.6
-"""Time that the sightings must span for a judgement, s. Larger: a mismatch is found later."""
+"""Time that the sightings must span for a check, s. Larger: a mismatch is found later."""
 MISMATCH_LEAST_SIGHTS = 8
-"""Number of sightings, and of samples, that a judgement requires. Larger: a mismatch is found
-later."""
+"""Number of sightings, and of samples, that a check requires. Larger: a mismatch is found later."""
 MISMATCH_PERIOD_S = 0.05
-"""Time between judgements, s. Smaller: successive judgements use nearly the same sightings."""
+"""Time between checks, s. Smaller: successive checks use nearly the same sightings."""
 AGREED = 3
-"""Number of successive judgements that must agree. Larger: a mismatch is found later. Smaller: a
-false mismatch is reported."""
+"""Number of successive checks that must agree. Larger: a mismatch is found later. Smaller: a false
+mismatch may be reported."""
 AGREED_MEASURED = 2
-"""The same number for a latency that the flight measures: a false correction is undone, and at ten
-images per second, a third judgement costs a tenth of a second."""
+"""The same number for a latency that is measured in flight. It can be smaller because a false
+correction is undone, and at ten images per second a third check would take another tenth of a
+second."""
 STEP_S = 0.02
 """Step of the delay hypotheses, s."""
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
@@ -64,8 +64,8 @@ ALIKE_S = 3 * STEP_S
 
 @dataclass(frozen=True)
 class MeasuredLatency:
-    """A latency that the flight measures, in seconds beyond the profile's: the one in use, and the
-    smallest and largest usable one."""
+    """A latency that is measured in flight, in seconds beyond the profile's: the current value, and
+    the smallest and largest usable values."""
 
     in_use_s: float
     least_s: float
@@ -112,7 +112,7 @@ class FeltSamples:
 
 @dataclass(frozen=True)
 class VisualInertialWindow:
-    """The sightings of the last `MISMATCH_WINDOW_S`, and the mismatch and motion that follow from
+    """The sightings of the last `MISMATCH_WINDOW_S`, and the mismatch and motion computed from
     them.
 
     Times and delays are relative to the profile's latency. `mismatch` is for the planner: None if
@@ -122,10 +122,10 @@ class VisualInertialWindow:
 
     sights: tuple[tuple[float, Vector], ...] = ()  # time, vector from body to target, body axes, m
     judged_s: float = -math.inf
-    # newest judgement; once enough judgements agree, it stays
+    # result of the newest check; kept once enough checks agree
     latest: CameraImuMismatch | None = None
     latest_s: float = -math.inf
-    agree_count: int = 0  # number of successive judgements that agree
+    agree_count: int = 0  # number of successive checks that agree
     is_corrected: bool = False  # `latest` is an error of a measured latency
     in_use_s: float = 0.0  # delay relative to which `mismatch` is given
     motion: VisualInertialMotion | None = None  # newest motion for which the sum moved by at most
@@ -134,8 +134,8 @@ class VisualInertialWindow:
 
     @property
     def mismatch(self) -> CameraImuMismatch | None:
-        """The newest mismatch, once enough successive judgements agree; None before that, and for
-        one that is being corrected. Its `later_s` is relative to the latency in use."""
+        """The newest mismatch, once enough successive checks agree; None before that, or while it
+        is being corrected. Its `later_s` is relative to the latency in use."""
         if self.latest is None or self.is_corrected or self.agree_count < AGREED:
             return None
         later_s = (
@@ -188,8 +188,8 @@ def estimate_motion(
     if old.mismatch is None or measured is not None:  # otherwise the mismatch stays
         found, before = _found(wanders_m, hypotheses_s, measured), old.latest
         if found is None and measured is not None:
-            # An ascent has little lateral motion. A rotation of the camera does not show
-            # vertically.
+            # During an ascent there is little lateral motion, and a camera rotation does not affect
+            # vertical motion.
             found = _found(np.hypot(wanders_m, upwards_m), hypotheses_s, measured)
             found = None if found is not None and found.camera_yaw_error_rad else found
         agreed = 0 if found is None else 1
@@ -242,8 +242,8 @@ def _best_about(mismatch: CameraImuMismatch, wanders_m: Array, later_s: Array) -
 def _found(
     wanders_m: Array, later_s: Array, measured: MeasuredLatency | None
 ) -> CameraImuMismatch | None:
-    """Return the mismatch that explains the images; None if the latency in use does, or one close
-    to it.
+    """Return the mismatch that explains the images; None if the current latency, or one close to
+    it, explains them.
 
     A measured latency is first searched among the usable ones: just after the lift-off, any delay
     explains a target that stood still. A usable latency that leaves more motion than the pictures'

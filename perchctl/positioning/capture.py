@@ -33,9 +33,10 @@ LATE_S = 0.5
 KEPT = 64
 """Largest number of frames that wait to be read; older ones are dropped."""
 LONGEST_LINE = 300
-"""Bytes that are read of a line of the child's output."""
+"""Largest number of bytes read from one line of the child's output."""
 UP_TIMEOUT_S = 15.0
-"""Time for the child's Python to start, s: a busy computer is not a silent motion capture."""
+"""Timeout for the start of the child's Python, s. It is separate so that a slow computer is not
+mistaken for a silent motion capture."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
 CAPTURE_PROGRAM = "from perchctl.positioning.capture import serve_parent; serve_parent()"
@@ -73,7 +74,7 @@ class LateFrames:
     pause_s: float
 
     def error(self, who: str) -> ConnectionFailed:
-        """Return what is wrong with the capture `who`, and what to do."""
+        """Return an error that says what is wrong with the capture `who` and what to do."""
         if self.count == 0:
             return ConnectionFailed(
                 f"{who} has paused for {self.pause_s:.2f} s: frames after a pause may be old, "
@@ -93,8 +94,8 @@ class LateFrames:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return the connection of the child process. Vicon and VRPN take the port as a part of the
-    host's name, the other systems as a separate option."""
+    """Return the connection of the child process. Vicon and VRPN expect the port as part of the
+    host name, the other systems as a separate option."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -166,7 +167,7 @@ class MotionCapture:
         return None if error is None else str(error)
 
     def error(self, now_s: float) -> ConnectionFailed | None:
-        """Return the problem as an error, which holds its advice separately."""
+        """Return the problem as an error object with separate advice."""
         if self._ended is not None:
             return ConnectionFailed(self._ended)
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
@@ -262,14 +263,15 @@ class MotionCapture:
 
 
 START_TIMEOUT_S = 30.0
-"""Time for which the child waits for its set-up, s."""
+"""Time for which the child waits for its `CaptureSetup`, s."""
 MOST_HZ = 500.0
 """Largest frame rate, Hz. No system is faster; faster frames are not measurements and would keep
 the parent busy."""
 QUEUE_PAUSE_S = 0.1
 """Length of a pause after which the library may return frames that waited in its queue, s."""
 AT_ONCE_S = 1e-3
-"""Time between frames below which they waited in the queue, s: no system sends so fast."""
+"""Interval between frames below which they must have waited in the queue, s. No system sends this
+fast."""
 
 Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
 """Position and quaternion (w, x, y, z) by name; no objects of the library cross the process
@@ -288,7 +290,7 @@ def serve_parent() -> None:
         import motioncapture
 
         is_loaded, options = True, setup.options
-        if setup.kind == "optitrack":  # its reader does not resolve names
+        if setup.kind == "optitrack":  # Qualisys's reader does not resolve host names
             options = options | {"hostname": socket.gethostbyname(options["hostname"])}
         client = motioncapture.connect(setup.kind, options)
         faulthandler.cancel_dump_traceback_later()
@@ -300,7 +302,7 @@ def serve_parent() -> None:
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
-    """Send frames as they arrive, but none of an unknown age.
+    """Send frames as they arrive, but never a frame of unknown age.
 
     After a pause, the library may return frames that waited in its queue. The first frame, and each
     further one that arrives without any waiting, is therefore not sent, and the parent receives the

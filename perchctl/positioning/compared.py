@@ -44,8 +44,8 @@ class CaptureComparison(BaseModel):
     found: str = ""
 
     def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
-        """Return why no flight may rely on this comparison, and what to do; None if it passed at
-        most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
+        """Return why a flight must not rely on this comparison, and what to do; None if the
+        comparison passed at most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
             return "the motion capture has never been compared with this vehicle", AGAIN
         when, age_s = self.text(now), (now - self.at).total_seconds()

@@ -1,9 +1,8 @@
 """Send the vehicle its external position, or explain why it is not sent.
 
-Any position may be the last one, late, or a duplicate, and the vehicle's estimator takes each as
-its present position. Therefore, no position is repeated, none waits in a queue, and none that the
-validator rejects is sent. The age of the position then grows, and the planner holds or lands
-because of it (fault 10).
+The vehicle's estimator treats each position as current, even if it is late or a duplicate.
+Therefore no position is repeated or queued, and positions that the validator rejects are not sent.
+The age of the position then grows, and the planner holds or lands because of it (fault 10).
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class CaptureFrame:
 
 
 class CaptureSource(Protocol):
-    """A motion-capture system, real or simulated; none of its methods block. Your own source is
+    """A motion-capture system, real or simulated. None of its methods may block. Your own source is
     called with the clock and the profile's section `positioning`. It may have another method,
     `error`, which returns the problem as a `perchctl.errors.PerchError`: `perchctl check` then
     shows the error's advice."""
@@ -82,7 +81,8 @@ BUSY = "the link is busy, and positions are not queued"
 class FeedStatus:
     """The state of a position feed, which the flight loop reads in each tick.
 
-    `age_s`: time since the exposure of the newest position that was sent; inf before the first.
+    `age_s`: time since the exposure of the newest position that was sent; infinite before the first
+    one.
     `problem`: None while positions are sent, otherwise one sentence with the cause. `sent`: number
     of positions sent so far; `rate_hz`: their rate in the last second. `pose`: the newest position
     sent. `measured`: the same position with its attitude, even if only the position is sent.
@@ -100,7 +100,7 @@ class FeedStatus:
 
 
 class SendingRate:
-    """Limit the rate at which positions are sent, and count them."""
+    """Limits the rate at which positions are sent, and counts them."""
 
     def __init__(self, rate_hz: float) -> None:
         self.period_s = 1.0 / rate_hz
@@ -112,8 +112,8 @@ class SendingRate:
         return now_s >= self._due_s - 1e-6
 
     def note_sent(self, now_s: float) -> None:
-        """Record a sent position. A late call does not delay later positions and is not made up
-        for."""
+        """Record that a position was sent. A late position neither delays later ones nor is made up
+        for by a burst."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -192,17 +192,17 @@ class PositionFeed:
             self._thread.join(END_TIMEOUT_S)
 
     def stop(self) -> None:
-        """Send nothing from now on: the positions contradict the vehicle's own sensors."""
+        """Stop sending, because the positions contradict the vehicle's own sensors."""
         self._stopped = True
 
     def poll_and_send(self, now_s: float) -> None:
         """Poll the source, and send its position if it is plausible and due.
 
-        Raises nothing: after a failure, the age in `status` grows, with the cause.
+        Raises no exceptions: after a failure, `status` shows the growing age and the cause.
         """
         try:
             problem = STOPPED if self._stopped else self._one(now_s)
-        except Exception as error:  # errors of source or link: the growing age ends the flight
+        except Exception as error:  # errors from source or link; the growing age ends the flight
             problem = f"the position cannot be sent: {type(error).__name__}: {error}"
         with self._lock:
             self._turned_s, self._problem = now_s, problem
@@ -253,29 +253,30 @@ class PositionFeed:
 
 
 # --- Validation of a capture's frames, and the vehicle's pose in them ---
-# Motion capture fails in ways that look like data: a hidden body keeps its last pose, two bodies
-# swap their names, a symmetric one flips, a pose arrives late (faults 10 and 11). Each is rejected
-# with one sentence that names the cause.
+# Faults of motion capture look like valid data: a hidden body keeps its last pose, two bodies swap
+# names, a symmetric body flips, a pose arrives late (faults 10 and 11). Each of these poses is
+# rejected with one sentence that names the cause.
 
 
 STALE_FRAME_S = 0.05
-"""Waiting time after its arrival at which a frame is too old, s: a vehicle that climbs at 0.5 m/s
-has moved by 25 mm, five times the capture's assumed error."""
+"""Time after its arrival at which a frame is too old, s. A vehicle that climbs at 0.5 m/s moves by
+25 mm in this time, five times the assumed error of the capture."""
 UNIT_WITHIN = 0.01
 """Tolerance of a quaternion's length; single precision is accurate to 1e-6."""
 NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)
 """Largest change of a pose between two frames without motion of the body."""
 FASTEST_FALL_MPS = 5.0
-"""Speed allowed for the first moment after a pose, m/s: that of a fall of 1.3 m. Smaller: the
+"""Largest plausible speed just after an accepted pose, m/s: that of a fall from 1.3 m. Smaller: the
 positions of a falling vehicle are rejected."""
 FASTEST_TIP_RADPS = 10.0
-"""Rotation rate allowed for the first moment, rad/s: that of a vehicle that is pushed over."""
+"""Largest plausible rotation rate just after an accepted pose, rad/s: that of a vehicle that is
+tipped over."""
 AT_FASTEST_S = 0.02
-"""Length of the first moment, s, after which `HELD_MPS` and `HELD_RADPS` apply. Larger: a pose that
-jumped is accepted."""
+"""Time after an accepted pose from which `HELD_MPS` and `HELD_RADPS` apply instead, s. Larger: a
+pose that jumped is accepted."""
 HELD_MPS, HELD_RADPS = 0.5, 1.0
-"""Speed, m/s, and rotation rate, rad/s, allowed after the first moment: without positions, the
-vehicle holds and drifts."""
+"""Largest plausible speed, m/s, and rotation rate, rad/s, from then on: without positions, the
+vehicle holds its position and drifts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +349,8 @@ class PoseValidator:
         )
 
     def _followed(self, placed: VehiclePose, now_s: float) -> VehiclePose | None:
-        """Return the pose; None, with a `problem`, if no vehicle can get there in time.
+        """Return the pose; None, with a `problem`, if no vehicle could have moved there in the time
+        since the last accepted pose.
 
         Waiting does not make a jump plausible: poses near a rejected one are rejected too, until
         the body is seen again near its last accepted pose. Meanwhile the age of the position grows

@@ -6,8 +6,8 @@ The world is that of the vehicle at rest on the ground, where its estimate is re
 origin is sent until the target was seen often enough from there; then the target's position is
 fixed. Ground, fence and heights thus keep their meaning.
 
-No exposure is sent twice, none out of order, and none older than `OLDEST_S`. A position that is
-further from the estimate than the errors of both explain is rejected. Its age then grows, and the
+Exposures are never sent twice, out of order, or when older than `OLDEST_S`. A position is rejected
+if it is further from the estimate than the errors of both explain. Its age then grows, and the
 planner holds, sinks and lands because of it.
 """
 
@@ -32,7 +32,7 @@ from perchctl.vision import (
 )
 
 GROUND_FRAMES = 15
-"""Number of frames at rest whose median is the target's position: half a second of a 30 Hz
+"""Number of frames at rest whose median gives the target's position: half a second for a 30 Hz
 camera."""
 OLDEST_S = 0.3
 """Age at which a sighting is no longer sent, s."""
@@ -51,28 +51,30 @@ LEARN_FAR_M = 1.0
 """Distance above which it is learned with `LEARN_FAR_S`, m: more slowly, because a pixel is a
 larger distance."""
 LEARN_NEAR_S = 0.3
-"""Time constant near the target, s. Smaller: the noise of single sightings is learned."""
+"""Time constant near the target, s. Smaller: the noise of single sightings is learned, too."""
 LEARN_FAR_S = 1.0
-"""Time constant far from the target, s. Larger: a changing difference is followed late."""
+"""Time constant far from the target, s. Larger: a change of the difference is learned later."""
 NOWHERE = Place(np.zeros(3), 0.0)
-"""Zero difference between two places."""
+"""Zero difference between two positions."""
 
 
 def target_place(pose: MarkerPose, attitude: VehicleState, setup: PoseSetup) -> Place:
-    """Return the target's place from its pose in an image and the body's attitude and position."""
+    """Return the target's position and heading from its pose in an image and the body's attitude
+    and position."""
     return Place(*target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
 def body_place(pose: MarkerPose, attitude: VehicleState, target: Place, setup: PoseSetup) -> Place:
-    """Return the body's place below a stationary target; only roll and pitch of `attitude` are
-    used."""
+    """Return the body's position and heading from its pose relative to a stationary target. Only
+    roll and pitch of `attitude` are used."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
 class TargetFeed:
-    """Send the vehicle's position from sightings of the target; called by the flight loop's thread.
+    """Sends the vehicle's position, measured from sightings of the target. Called from the flight
+    loop's thread.
 
     `target` is the target's place, None until it was seen from the ground. `off` is the body's
     place from the sightings minus its estimate, low-passed against noise: the estimator lags behind
@@ -97,7 +99,8 @@ class TargetFeed:
             self.send_known(self._origin_m, now_s)
 
     def send_known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """Send a position known without an image: standing, in contact or hanging."""
+        """Send a position that is known without an image because the vehicle stands, is in contact
+        or hangs."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
@@ -157,8 +160,8 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the feed's status; a target that was not seen from the ground is a problem,
-        too."""
+        """Return the feed's status. It also reports as a problem that the target was not seen from
+        the ground."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -209,8 +212,8 @@ class TargetFeed:
         )
 
     def _hand_over(self, place: ExternalPosition, placed_s: float, now_s: float) -> None:
-        """Send a place; `placed_s` is the time at which the body was there. A place that is not due
-        is dropped because the next one is newer."""
+        """Send a position and heading; `placed_s` is the time at which the body was there. If
+        sending is not due yet, it is dropped, because the next one will be newer."""
         if self._rate.is_due(now_s) and self._send(place) is not False:
             self._rate.note_sent(now_s)
             self._placed_s, self._pose = placed_s, place

@@ -112,7 +112,12 @@ class PrintCheck:
             return
         large = output.detections.large
         small = output.detections.small
-        if large is not None and small is not None and large.are_corners_fitted and small.are_corners_fitted:
+        if (
+            large is not None
+            and small is not None
+            and large.are_corners_fitted
+            and small.are_corners_fitted
+        ):
             self.add_corners(large.corners_px, small.corners_px)
 
     def add_corners(self, large_px: Array, small_px: Array) -> None:
