@@ -38,7 +38,8 @@ WORKERS_S = 20.0
 _CLOSE_S = 1.0
 _QUIET = ("distributed", "tornado", "asyncio")
 _LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
-"""Compute a flight's figures or carry them; OpenCV, of several names, is compared apart."""
+"""Libraries that compute or transfer the figures of a flight. OpenCV, which has several package
+names, is compared separately."""
 
 
 # --- What each worker must have ---
@@ -68,7 +69,7 @@ def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, s
 
 
 def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
-    """The requirements of a campaign that begins now."""
+    """Return the requirements for a campaign that starts now."""
     state = flight_environment(profiles, threads=1)
     return WorkerRequirements(secrets.token_hex(16), tuple(profiles), state)
 

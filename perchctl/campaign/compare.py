@@ -1,8 +1,8 @@
 """Fly the same seeds with several profiles, and find out which differences are significant.
 
 A figure's difference is the mean over the pairs of flights of one seed, with Student's interval;
-success is compared by the pairs in which only one of both succeeded (McNemar's exact test). All
-questions together err in one comparison of twenty at most: each gets its part of the 5 %.
+success is compared by the pairs in which only one of both succeeded (McNemar's exact test). The 5 %
+significance level applies to all questions together and is divided among them (Bonferroni).
 """
 
 from __future__ import annotations

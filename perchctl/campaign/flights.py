@@ -61,7 +61,7 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
 def run_measured(job: Callable[[], R]) -> R:
     """Call `job`, a unit of a campaign's work, on one core, and return its result (a dataclass)
     with its CPU time filled in. Frees its memory."""
-    cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
+    cv2.setNumThreads(1)  # each job uses one core, so that rates are per core
     cpu_began_s = time.process_time()
     result: Any = job()
     cpu_s = time.process_time() - cpu_began_s
@@ -74,7 +74,7 @@ def _give_back_memory() -> None:
     """Free a flight's memory, whose objects refer to each other, at once."""
     gc.collect()
     if not gc.get_freeze_count():
-        # What is left is kept for all flights; to look through it takes as long as 30 images.
+        # The remaining objects are kept for all flights; scanning them takes as long as 30 images.
         gc.freeze()
 
 
@@ -167,7 +167,7 @@ def simulate(
 
     Args:
         profile: a profile, its name or its file.
-        seeds: integers from 0; a seed always gives the same flight.
+        seeds: integers from 0 on. The same seed always gives the same flight.
         jobs: processes; with more than one a script needs ``if __name__ == "__main__":``.
         executor: flies instead of `jobs`: any of `concurrent.futures`' kind, such as dask's.
         log_dir: folder for the flight logs; none are written without it.

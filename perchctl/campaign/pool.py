@@ -1,4 +1,4 @@
-"""Processes that fly a campaign: they ignore signals and are killed when it ends early."""
+"""Worker processes of a campaign. They ignore signals and are killed if the campaign ends early."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class FlightProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
         """Queue the flight ``fn(*args, **kwargs)`` for the next free process; return its future."""
-        with defer_interrupts():  # threads and processes inherit the mask of who starts them
+        with (
+            defer_interrupts()
+        ):  # threads and processes inherit the signal mask of the thread that starts them
             return super().submit(fn, *args, **kwargs)
 
 
@@ -49,9 +51,9 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started in it
-    never get these signals. Python's handlers are replaced, too, as a library's thread may take a
-    signal."""
+    """Defer Ctrl-C and SIGTERM to the end of the block. Threads and processes started in the block
+    never receive these signals. Python's handlers are also replaced, because a library's thread may
+    receive a signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}
@@ -63,5 +65,5 @@ def defer_interrupts() -> Iterator[None]:
         for name, handler in handlers.items():
             signal.signal(name, handler or signal.SIG_DFL)
         for number in came:
-            signal.raise_signal(number)  # held back by the mask
+            signal.raise_signal(number)  # deferred by the mask
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -15,9 +15,9 @@ from perchctl.sim import Scenario
 
 FlightEnd = Literal["perched", "refused", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
-"""The better before the worse."""
+"""Ends of a flight, from best to worst."""
 WORST_FLIGHTS = 5
-"""The number of bad flights that the table names."""
+"""Number of bad flights that the table lists."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[t
     return rows
 
 
-# --- Rates as what is known of them: k of n, and the interval that the true rate is in ---
+# --- Rates with their uncertainty: k of n, and the confidence interval of the true rate ---
 
 
 LEVEL = 0.95

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -100,7 +100,8 @@ def camera(
     layout = targets.Board.parse(board)
 
     def checked_file(size_px: tuple[int, int]) -> Path:
-        """Return where the calibration goes; raises before a person has worked for nothing."""
+        """Return the path for the calibration file. Raises now, before the user has done any work,
+        if it cannot be written."""
         file = _file(output, size_px)
         _check_camera_output(file, force)
         return file
@@ -317,7 +318,7 @@ def capture_live_views(
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(Stopper().as_handler())
-        # The page draws the image and its corners, but no axes: any camera serves.
+        # The page draws the image and its corners, but no axes, so any camera model will do.
         any_camera = visions.CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(displays.live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guidance_display(page))
@@ -336,7 +337,7 @@ def capture_live_views(
 
 
 def _no_view_text(found: calibrations.FoundViews) -> str:
-    """Why a video or camera gave no view, and what to do."""
+    """Return why a video or camera gave no view of the board, and what to do."""
     if found.other_board:
         return f"it shows {found.other_board}"
     if found.frames is None:

@@ -17,7 +17,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -56,7 +56,7 @@ Part = Literal["carry", "pivot"]
 Sensors: TypeAlias = (
     "tuple[Callable[[], list[calibrations.AttitudeSample]], Callable[[float], str | None]]"
 )
-"""What a recording reads of the vehicle: its new samples, and what is wrong with it by a time."""
+"""What a recording reads from the vehicle: its new samples, and its problem at a given time."""
 HOW: dict[Part, str] = {
     "carry": "carry: hold the vehicle under the target (or the target in front of its "
     "camera); turn it about every axis and move it around, keeping the target in "
@@ -115,7 +115,7 @@ def mount(
         print_lines(line)
     problem: PerchError | None = None
     if not logs:
-        problem = InvalidValue("the recording was not kept")  # why has been said
+        problem = InvalidValue("the recording was not kept")  # the reason has already been printed
     written, before = None, None
     if into is not None:
         try:
@@ -123,7 +123,7 @@ def mount(
             before = profiles.write_profile_values(into, measured.new_profile_values())
             written = into
             say(f"wrote these numbers to {written}; the old version is in {before}")
-        except (InvalidValue, NotFound) as error:  # the numbers stand
+        except (InvalidValue, NotFound) as error:  # the results are still valid
             problem = error
             say(str(error))
     else:
@@ -137,7 +137,7 @@ def mount(
     return 0 if problem is None else problem.exit_code
 
 
-# --- what is refused at once ---
+# --- What is checked before anything is recorded ---
 
 
 def _live_sources(
@@ -164,7 +164,7 @@ def _live_sources(
 
 
 def _free_place(name: str) -> Path:
-    """Return the next free path for a live recording, and check that it can be written."""
+    """Return the next unused path for a live recording, and check that it can be written."""
     stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
     check_writable(place, force=False)
@@ -188,7 +188,8 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[calibrations.Mou
 
 
 def _check_unchanged(name: str, then: profiles.Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on; NotFound."""
+    """Raise InvalidValue if the values on which the results depend have changed in the profile;
+    NotFound if the profile is gone."""
     now = profiles.load_profile(name)
     if (now.camera, now.vehicle) != (then.camera, then.vehicle):
         raise InvalidValue(
@@ -210,7 +211,8 @@ def _record_live(
     log: Path,
     view: bool,
 ) -> list[calibrations.MountingRecording]:
-    """Record the parts live, also into a file. What was recorded is kept, however it ends.
+    """Record the parts live, and also to a file. The recorded data is kept even if recording ends
+    early.
 
     Args:
         uri: None: no vehicle is asked. view: with the live page.
@@ -223,7 +225,8 @@ def _record_live(
 
     recordings: list[calibrations.MountingRecording] = []
     with contextlib.ExitStack() as stack:
-        # Its images keep the camera's own time: what is taken off it is what is measured.
+        # No latency is subtracted from the images' times, because the latency is what is being
+        # measured.
         frames = cameras.open_camera(
             source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
         )
@@ -239,14 +242,14 @@ def _record_live(
         for part in parts:
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
-                with contextlib.suppress(EOFError):  # Ctrl-D goes on as Enter does
+                with contextlib.suppress(EOFError):  # Ctrl-D continues, as Enter does
                     if ask("press Enter when it is in place:").strip().lower() in NO:
                         raise UsageError("not confirmed: nothing was measured")
             recording = calibrations.MountingRecording(part)
             recordings.append(recording)
             reader = calibrations.PoseReader(profile, camera, frames.live)
             if frames.live:
-                frames.poll(time.monotonic())  # from before
+                frames.poll(time.monotonic())  # from earlier
             with Stopper().as_handler() as stop, guidance_display(page) as show:
                 stopped = stop.requested.is_set
                 calibrations.record_mounting(
@@ -285,7 +288,7 @@ def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
 
 
 def _keep(recordings: Sequence[calibrations.MountingRecording], log: Path) -> None:
-    """Write the recording. Never raises, as its numbers are wanted all the same."""
+    """Write the recording. Never raises, because the results are still needed."""
     held = [recording for recording in recordings if recording.attitudes or recording.poses]
     if not held:
         return

@@ -1,4 +1,4 @@
-"""`perchctl check`: everything that can be known on the ground, as a table or JSON."""
+"""`perchctl check`: everything that can be checked on the ground, as a table or JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import camera as cameras
 from perchctl import check as checks
 from perchctl.commands.command_line import (
@@ -42,7 +42,7 @@ SHOWN = {
     checks.Verdict.SKIPPED: "skip",
 }
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
-"""Of a failing row; `SafetyAbort`'s of all others."""
+"""Exit code of a failing row; all other rows have that of `SafetyAbort`."""
 
 app = new_app()
 
@@ -97,7 +97,8 @@ def check(
 
 
 def print_rows(rows: Iterable[checks.Row], as_json: bool) -> int:
-    """Print the rows, also those before a Ctrl-C or an error; return the exit code."""
+    """Print the rows as they come, so that none is lost on Ctrl-C or an error, and return the exit
+    code."""
     found: list[checks.Row] = []
     interrupted = False
     try:
@@ -130,8 +131,8 @@ def exit_code(rows: Sequence[checks.Row]) -> int:
 
 
 def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
-    """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. An
-    unfinished check gets no positive summary."""
+    """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. If the
+    check did not finish, there is no positive summary."""
     lines = [line for row in _folded(rows) for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in checks.Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
@@ -143,7 +144,8 @@ def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
 
 
 def _folded(rows: Sequence[checks.Row]) -> Iterator[checks.Row]:
-    """Yield the rows; those that were skipped one after the other for the same reason, as one."""
+    """Yield the rows, with successive rows that were skipped for the same reason combined into
+    one."""
     for (verdict, found, advice), same in itertools.groupby(
         rows, key=lambda row: (row.verdict, row.found, row.advice)
     ):
@@ -158,7 +160,7 @@ def _lines(row: checks.Row) -> list[str]:
     head = f"{SHOWN[row.verdict]}  {row.name:<{NAME_WIDTH}}"
     margin = " " * len(head)
     lines = _wrapped(row.found, head, margin) or [head.rstrip()]
-    if "\n" in row.advice:  # lines to be copied stay as they are
+    if "\n" in row.advice:  # lines that the user may copy are not wrapped
         return lines + [f"  {line}" for line in row.advice.splitlines()]
     return lines + _wrapped(row.advice, f"{margin}-> ", f"{margin}   ")
 
@@ -169,11 +171,12 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
     )
 
 
-# --- `perchctl check --cameras`: what this computer's cameras are called ---
+# --- `perchctl check --cameras`: the names of this computer's cameras ---
 
 
 def camera_rows() -> Iterator[checks.Row]:
-    """Yield a row for each camera; nothing is set, no image taken. Errors: NotFound if none."""
+    """Yield a row for each camera, without changing settings or taking images. Errors: NotFound if
+    there is none."""
     for camera in cameras.find_cameras():
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)

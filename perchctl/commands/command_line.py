@@ -29,7 +29,7 @@ from perchctl.errors import (
 )
 from perchctl.startup import failure_record, restore_ctrl_c
 
-# \b keeps the lines of a paragraph as they are.
+# \b keeps the line breaks in a paragraph.
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
     f"{code:>5}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
 )
@@ -44,7 +44,7 @@ _REFUSED: dict[int | None, str] = {
     errno.ENAMETOOLONG: "choose another place",
     errno.ENOTDIR: "choose another place",
 }
-"""Why the operating system refuses a place, and what to do."""
+"""Why the operating system refuses a path, and what to do."""
 _LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {
@@ -70,21 +70,21 @@ COMMANDS: dict[str, str] = {
     "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
     "log": "Show, plot, compare, export, replay, film or report a flight from its log.",
 }
-"""In the order in which one uses them, with the first sentence of their help."""
+"""The commands in the order in which a user needs them, with the first sentence of their help."""
 
 _CLOSE = 0.75
-"""Alike enough to be a misspelt command rather than a file's name."""
+"""Similarity from which a word counts as a misspelt command rather than a file name."""
 _CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
 class Group(TyperGroup):
-    """A group of subcommands; the first is the main subcommand, which runs if none is named."""
+    """A group of subcommands. The first one is the main subcommand, which runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = (*self.commands, *_CONTEXT_SETTINGS["help_option_names"])
-        # A shell that completes words asks for what may come, and wants no main one.
+        # Shell completion asks for the possible words and must not get the main subcommand.
         if not ctx.resilient_parsing and (not args or args[0] not in named):
-            # A file or a source has more in its name than letters.
+            # The name of a file or source contains more than letters.
             word = args[0] if args and args[0].isalpha() and not os.path.exists(args[0]) else ""
             if meant := difflib.get_close_matches(word, self.commands, 1, _CLOSE):
                 raise UsageError(
@@ -118,11 +118,11 @@ class _Unloaded(TyperCommand):
 
 
 class _Commands(TyperGroup):
-    """The subcommands of `COMMANDS`; what fails in one of them becomes a sentence."""
+    """The subcommands of `COMMANDS`. A failure in one of them is reported as a sentence."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        # The whole sentence: of its own accord the list of the commands cuts it.
+        # Show the whole sentence: by default, the list of commands truncates it.
         self.commands = {name: _Unloaded(name, short_help=COMMANDS[name]) for name in COMMANDS}
 
     def invoke(self, ctx: Any) -> Any:
@@ -132,7 +132,7 @@ class _Commands(TyperGroup):
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
     """Return the application of a subcommand, or with `cls=Group` of a group of them."""
-    # Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
+    # Without rich's panels, which truncate text in narrow cells.
     return typer.Typer(
         cls=cls,
         add_completion=cls is _Commands,
@@ -153,7 +153,7 @@ def command(
 ) -> Callable[[Callable[P, int | None]], Callable[P, None]]:
     """Return the decorator for a subcommand of `group`, whose help ends with `examples` and
     `ending`. The function returns the exit code (None: 0). `settings` are typer's."""
-    # \b keeps the lines as they are.
+    # \b keeps the line breaks.
     lines = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])
     epilog = f"{lines}\n\n{ending}"
 
@@ -162,7 +162,7 @@ def command(
         def do(*args: P.args, **kwargs: P.kwargs) -> None:
             restore_ctrl_c()
             code = run(*args, **kwargs)
-            sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+            sys.stdout.flush()  # report a full disk or a closed pipe here, not after the last line
             raise typer.Exit(code or 0)
 
         return group.command(epilog=epilog, **settings)(do)
@@ -217,7 +217,9 @@ ViewOption = Annotated[
 def main() -> Any:
     """Run the command line; returns the exit code."""
     try:
-        with report_failures():  # what fails outside of a subcommand, as the help on a full disk
+        with (
+            report_failures()
+        ):  # failures outside of a subcommand, such as printing the help to a full disk
             try:
                 app()
             finally:
@@ -227,7 +229,7 @@ def main() -> Any:
     except typer.Exit as end:
         return end.exit_code
     finally:
-        # A key that is still held down must not end what is over with a traceback.
+        # If Ctrl-C is still held down, a finished command must not end with a traceback.
         signal.signal(signal.SIGINT, lambda _signal, _frame: os._exit(Interrupted.exit_code))
 
 
@@ -254,7 +256,7 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        # Without a place it is stdout's disk that is full, or a device that is refused.
+        # Without a path, the disk of stdout is full, or a device is refused.
         is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
         if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:

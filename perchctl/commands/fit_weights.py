@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import positioning as positionings

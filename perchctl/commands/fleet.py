@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import campaign as campaigns
 from perchctl import check as checks
 from perchctl import fleet as fleets
@@ -236,7 +236,8 @@ def _say_reading(file: str | None) -> None:
 
 
 def plan_text(plan: fleets.FleetPlan) -> str:
-    """The plan for people: the room, who flies when and why not together, and the radio."""
+    """The plan as text: the room, which vehicles fly when and why some cannot fly together, and the
+    radio."""
     schedule = plan.schedule
     rows = [("order", f"group {n}: {', '.join(g)}") for n, g in enumerate(schedule.groups, 1)]
     rows += [("not together", f"{c.first}, {c.second}: {c.why}") for c in schedule.conflicts]

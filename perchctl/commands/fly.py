@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import check as checks
@@ -156,7 +156,8 @@ def resolve_options(
     options = flights.FlyOptions(
         profile=profile,
         profile_path=profiles.find_profile(profile_name),
-        # An empty URI or source is an unset shell variable: not the profile's, but an error.
+        # An empty URI or source comes from an unset shell variable: report an error instead of
+        # using the profile's.
         uri=profile.link.uri if uri is None else uri,
         source=profile.camera.source if source is None else source,
         seed=flights.FlyOptions.seed if seed is None else seed,
@@ -214,7 +215,7 @@ def fly_and_report(
     say(f"connecting to {options.uri}")
     switch, page = flights.OperatorSwitch(), None
     detached: tuple[str, ...] = ()
-    # Once it has landed nothing is left to stop, but much to tell.
+    # After the landing there is nothing left to stop, but the results must be reported.
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, view, switch))
@@ -222,7 +223,8 @@ def fly_and_report(
             detached = report.detached_watchers
         except BaseException as error:
             detached = tuple(getattr(error, "__notes__", ()))
-            # The page first: a disk that hangs holds up the log's end, and Land would seem ready.
+            # End the page first: a hanging disk would delay the end of the log, and the Land button
+            # would seem active.
             if page is not None:
                 page.fail(error, log.path if log.has_begun else None)
             log.abandon(str(error) or type(error).__name__)
@@ -307,8 +309,7 @@ def _session(
 def flight_page(
     options: flights.FlyOptions, view: bool, switch: flights.OperatorSwitch
 ) -> Iterator[displays.FlightPage | None]:
-    """Yield the live page, with its buttons for landing and for cutting the motors; None without
-    `view`."""
+    """Yield the live page with buttons to land and to cut the motors; None if `view` is False."""
     if not view:
         yield None
         return
@@ -318,7 +319,7 @@ def flight_page(
         yield None if page is None else displays.FlightPage.of(page, options.profile)
 
 
-# --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened
+# --- `perchctl fly --dry-run`: the resolved flight, before anything is opened
 
 
 _COLUMN, _WIDTH = 13, 80
@@ -335,7 +336,7 @@ def plan_problem(options: flights.FlyOptions) -> PerchError | None:
 
 
 def plan_record(options: flights.FlyOptions) -> dict[str, Any]:
-    """Return what would be flown, fully resolved; nothing is connected."""
+    """Return the fully resolved flight plan, without connecting to anything."""
     calibration = profiles.find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
     rows = checks.profile_rows(options.profile, source=options.source)

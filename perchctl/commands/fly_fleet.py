@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import display as displays
 from perchctl import fleet as fleets
 from perchctl import flight as flights
@@ -33,13 +33,13 @@ from perchctl.extensions import error_at
 from perchctl.files import write_files
 
 DISPLAY_PERIOD_S = 0.1
-"""Between two looks at the vehicles, for display and record. The orders do not wait for it."""
+"""Update period of display and record, s. Commands are sent at once."""
 ENDING_TIMEOUT_S = 90.0
-"""For vehicles to land and their processes to end by themselves after a failure of the parent.
-Longer than a landing and the closing of link and log take. Shorter, and a process is ended whose
-vehicle may still fly; longer, and a command that has failed ends later."""
+"""Time for vehicles to land and their processes to end after a failure of the parent, s. It is
+longer than a landing and the closing of link and log. Shorter: a process may be ended while its
+vehicle still flies. Longer: a failed command ends later."""
 NUMBER_KEYS = 9
-"""Vehicles that have a key of their own."""
+"""Number of vehicles that can be landed with a number key."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
             outcome = session.fly(asks)
         finally:
             with contextlib.suppress(OSError):
-                folder.rmdir()  # of a flight that was refused on the ground nothing is left
+                folder.rmdir()  # a flight that was refused on the ground leaves no files
     written = print_lines(outcome.text(), stdout=not settings.as_json)
     print_lines(f"{'folder':<12}{folder}", stdout=not settings.as_json)
     if settings.as_json:
@@ -86,8 +86,8 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
 
 
 def refuse_before_start(plan: fleets.FleetPlan, settings: FleetSettings) -> None:
-    """Raises the error with which `fly_fleet` would refuse this plan before it opens or starts
-    anything."""
+    """Raise the error with which `fly_fleet` would refuse this plan, before anything is opened or
+    started."""
     folder = _parent_folder(plan, settings) / plan.fleet.name
     options = fleets.flight_options(plan, folder, settings.seed, settings.record)
     fleets.warnings_before_fleet(options)
@@ -129,8 +129,8 @@ class FleetSession:
         self._unwritten: str | None = None
 
     def fly(self, asks: bool) -> fleets.FleetOutcome:
-        """Start all, wait until all are ready, ask, and fly. Raises a vehicle's failure before the
-        first take-off as an error of its kind."""
+        """Start all vehicles, wait until they are ready, ask for confirmation, and fly. If a
+        vehicle fails before the first take-off, its error is raised."""
         with ignore_signals(), contextlib.ExitStack() as stack:
             stack.callback(self._close_panel)
             stack.enter_context(flights.operator_signals(self._switch, say))
@@ -153,7 +153,7 @@ class FleetSession:
 
     @contextlib.contextmanager
     def _coordinated(self) -> Iterator[fleets.Coordinator]:
-        """Start the vehicles' processes and the thread that orders them about."""
+        """Start the vehicles' processes and the thread that coordinates them."""
         over = threading.Event()
         with contextlib.ExitStack() as stack:
             for name, each in self._options.items():
@@ -171,7 +171,7 @@ class FleetSession:
             yield coordinator
 
     def _open_page(self, coordinator: fleets.Coordinator, stack: contextlib.ExitStack) -> None:
-        """Serve the live page until the stack closes. A page that fails ends no flight."""
+        """Serve the live page until the stack closes. A failing page does not end the flight."""
         if not self._has_page:
             return
 
@@ -191,8 +191,8 @@ class FleetSession:
         say(f"live page (with buttons to land and to cut the motors): {page.url}")
 
     def _update_page(self, update: Callable[[displays.FleetPage], None]) -> None:
-        """Change what the page shows. After an error it is left as it is: its buttons still work,
-        and it tells how old it is."""
+        """Update the page. After an error, the page is no longer updated; its buttons still work,
+        and it shows the age of its values."""
         if self._page is None:
             return
         try:
@@ -216,11 +216,11 @@ class FleetSession:
         self._refuse_failed(coordinator)
 
     def _refuse_failed(self, coordinator: fleets.Coordinator) -> None:
-        """Raises the failure that has kept the fleet on the ground: the coordinator's, or that of a
-        vehicle once all have ended."""
+        """Raise the error that has kept the fleet on the ground: the coordinator's, or a vehicle's
+        once all have ended."""
         results = {v.name: v.result for v in coordinator.views if v.result is not None}
         failure = coordinator.failure
-        if coordinator.started:  # asked last: it stays so
+        if coordinator.started:  # checked last, because it does not change back
             return
         if failure is not None:
             raise PerchError(f"{_failure_text(failure)}; no vehicle was armed")
@@ -259,12 +259,12 @@ class FleetSession:
 
     @property
     def _keys(self) -> int:
-        """How many vehicles have a key of their own."""
+        """Number of vehicles that have a key."""
         return min(len(self._options), NUMBER_KEYS)
 
     def _land_by_key(self, coordinator: fleets.Coordinator, number: int) -> str:
         """Land the vehicle with this number at once; return the answer to the operator. Called in
-        the keys' thread, which must not be held up."""
+        the keyboard thread, which must not be blocked."""
         if not 1 <= number <= self._keys:
             return f"no vehicle has the key {number}: press 1 to {self._keys} to land one"
         return self._land_one(coordinator, number, f"key {number}")
@@ -280,13 +280,13 @@ class FleetSession:
         return f"{view.name}: by {how}, it lands"
 
     def _is_given_up(self) -> bool:
-        """True once vehicles had their time to end after the coordinator's failure."""
+        """True once the vehicles' time to end after a failure of the coordinator has passed."""
         now_s = time.monotonic()
         return self._failed_s is not None and now_s - self._failed_s > ENDING_TIMEOUT_S
 
     def _look(self, coordinator: fleets.Coordinator) -> None:
-        """Show what is new, and keep the record. What raises in one part is reported once; it ends
-        no flight, and keeps no other part from its work."""
+        """Show news and update the record. An exception in one part is reported once; it neither
+        ends a flight nor stops the other parts."""
         parts = (
             self._look_at_coordinator,
             self._answer_keys,
@@ -313,18 +313,18 @@ class FleetSession:
             self._tell(self._answers.popleft())
 
     def _look_at_stages(self, coordinator: fleets.Coordinator) -> None:
-        """Tell of each vehicle's new stage or phase, and how it ended."""
+        """Report each vehicle's new stage or phase, and how its flight ended."""
         for view in coordinator.views:
             stage, reason = _stage_and_reason(view)
-            # What has kept a fleet on the floor is one sentence, at its end.
+            # The reason why a fleet stayed on the floor is reported in one sentence at the end.
             is_told = coordinator.started or view.result is None
             if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
 
     def _look_at_radios(self, coordinator: fleets.Coordinator) -> None:
-        """Leave the share of a vehicle that has ended to the others. Tell of a dongle that is of no
-        use any more, or again."""
+        """Give the radio time of vehicles that have ended to the others. Report dongles that have
+        failed or recovered."""
         for view in coordinator.views:
             if view.result is not None and view.name not in self._slowed:
                 self._slowed.add(view.name)
@@ -338,8 +338,8 @@ class FleetSession:
                 self._tell(self._problems[-1])
 
     def _look_at_distances(self, coordinator: fleets.Coordinator) -> None:
-        """Tell once of each pair that came too near, and of each vehicle whose distance to the
-        others became unknown."""
+        """Report once each pair of vehicles that came too close, and each vehicle whose distance to
+        the others became unknown."""
         near = [f"{pair}: both land" for pair in coordinator.near_pairs]
         unknown = [
             f"{name}: its position is unknown, and so is its distance to the others"
@@ -354,22 +354,22 @@ class FleetSession:
             self._panel.show([_row(number, view) for number, view in views])
 
     def _show_page(self, coordinator: fleets.Coordinator) -> None:
-        """Show what the coordinator has heard since; while it hangs, the page tells how old that
-        is."""
+        """Show the newest data from the coordinator. If the coordinator hangs, the page shows how
+        old the data is."""
         if self._page is not None and coordinator.rounds != self._shown_round:
             self._shown_round = coordinator.rounds
             rows = [_row(number, view) for number, view in enumerate(coordinator.views, 1)]
             self._update_page(lambda page: page.show(rows, live=coordinator.started))
 
     def _keep_record(self, coordinator: fleets.Coordinator) -> None:
-        """Write the record again if another vehicle has ended."""
+        """Update the record file if another vehicle has ended."""
         ended = sum(view.result is not None for view in coordinator.views)
         if coordinator.started and ended > self._recorded:
             self._recorded = ended
             self._write_record(coordinator)
 
     def _report(self, problem: str) -> None:
-        """Tell a problem, and put it into the record; once only."""
+        """Report a problem and add it to the record, once only."""
         if problem not in self._problems:
             self._problems.append(problem)
             self._tell(problem)
@@ -387,7 +387,7 @@ class FleetSession:
             self._panel.event(at)
 
     def _write_record(self, coordinator: fleets.Coordinator) -> None:
-        """Write what is known so far. A full disk is no reason to land, nor is any other error."""
+        """Write the record so far. No error, such as a full disk, is a reason to land."""
         try:
             record = json.dumps(self._outcome(coordinator).record(), indent=1)
             write_files({self._folder / fleets.RECORD_NAME: f"{record}\n".encode()})
@@ -409,8 +409,8 @@ class FleetSession:
         )
 
     def _end(self, error: BaseException) -> None:
-        """Land what flies, and wait until the processes have ended by themselves; not for flights
-        that hang after the operator's stop."""
+        """Land all flying vehicles, and wait until their processes have ended. Do not wait for
+        flights that hang after the operator's stop."""
         self._switch.land()
         hung = isinstance(error, Interrupted) and self._switch.listening
         if self._panel is not None and not (hung or all(map(_has_ended, self._children.values()))):
@@ -476,7 +476,7 @@ def _row(number: int, view: fleets.VehicleView) -> displays.FleetRow:
 
 
 def _outcome_card(outcome: fleets.FleetOutcome, folder: Path) -> dict[str, Any]:
-    """What the page shows at the end."""
+    """The result card that the page shows at the end."""
     count, code = len(outcome.options), outcome.exit_code
     reason = "all vehicles hang" if code == 0 else f"exit code {code}: {EXIT_CODES[code]}"
     place = str(folder.resolve())

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import flight as flights
 from perchctl import profile as profiles
 from perchctl.commands.command_line import (

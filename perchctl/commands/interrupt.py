@@ -1,4 +1,4 @@
-"""Signals: Ctrl-C and SIGTERM in the commands that run for a while."""
+"""Signals: Ctrl-C and SIGTERM in long-running commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextlib.contextmanager
 def handle_signals(handler: Handler) -> Iterator[None]:
-    """Hand SIGINT and SIGTERM to `handler` during the block (main thread only)."""
+    """Pass SIGINT and SIGTERM to `handler` during the block (main thread only)."""
     old = {name: signal.signal(name, handler) for name in SIGNALS}
     try:
         yield

@@ -1,4 +1,4 @@
-"""`perchctl log`: what one does with a flight's log."""
+"""`perchctl log`: show, plot, compare, export, replay, film and report flights from their logs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import fleet as fleets
 from perchctl import profile as profiles
@@ -30,7 +30,7 @@ PLOTS = ((".png", ".pdf", ".svg"), "a plot")
 FILMS = ((".mp4", ".gif"), "a film")
 EXPORTS = ((".csv",), "an export")
 PAGES = ((".html", ".htm"), "a page")
-"""The suffixes of what is written, the default first, and what they are."""
+"""File suffixes of each output, the default first, and the name of the output."""
 
 LogArgument = Annotated[
     Path | None,
@@ -42,8 +42,8 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """Return the named log, else the newest of the folder (by default that of `fly`), which is
-    then printed. Errors: NotFound."""
+    """Return the named log, or else the newest log in the folder (by default the folder of `fly`),
+    whose name is then printed. Errors: NotFound."""
     if place is not None and not place.is_dir():
         say_on_terminal(f"reading {place}")
         return place
@@ -55,7 +55,8 @@ def _log_file(place: Path | None) -> Path:
 
 
 def _place(log: Path, output: Path | None, kind: tuple[tuple[str, ...], str], force: bool) -> Path:
-    """Return where to write: `output`, by default beside the log. Errors: InvalidValue."""
+    """Return the output path: `output`, or by default a path next to the log. Errors:
+    InvalidValue."""
     suffixes, content = kind
     place = output or records.path_beside(log, suffixes[0])
     check_output(place, suffixes, force, content)
@@ -71,8 +72,8 @@ def _counted(items: Iterable[T], advance: Callable[[], None]) -> Iterator[T]:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[records.FlightLog]:
-    """Yield the log. In the block, which must only read values, an error is the file's.
-    Errors: NotFound, InvalidValue."""
+    """Yield the log. Errors in the block, which must only read values, are reported as errors in
+    the file. Errors: NotFound, InvalidValue."""
     log = records.read_log(path)
     with records.wrap_log_errors(path):
         yield log

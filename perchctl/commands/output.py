@@ -1,4 +1,4 @@
-"""What a command prints: sentences for people on stderr, the result on stdout."""
+"""The output of commands: messages for people on stderr, results on stdout."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from typing import Any, TextIO
 from perchctl.errors import PerchError
 
 NO = ("n", "no", "q", "quit")
-"""Answers that stop what only waits for Enter."""
+"""Answers that cancel a prompt that only waits for Enter."""
 
 
 def say(sentence: str) -> None:
-    """Print a sentence on stderr, as stdout is for results. Never raises."""
+    """Print a message on stderr, because stdout is for results. Never raises."""
     print_lines(f"perchctl: {sentence}")
 
 
 def say_on_terminal(sentence: str) -> None:
-    """Print a sentence for a person who waits: what a command does first, before it loads the
-    libraries that do it, which takes a second and more. In a pipe or a file nobody waits."""
+    """Print a message on a terminal that says what the command is doing, before it loads libraries,
+    which takes a second or more. Nothing is printed to a pipe or a file, where nobody is
+    waiting."""
     with contextlib.suppress(OSError, ValueError):
         if sys.stderr.isatty():
             say(sentence)
@@ -51,7 +52,7 @@ def discard_output(stream: TextIO) -> None:
 
 
 def stdin_number() -> int:
-    """The file descriptor of stdin; -1, which is none, where there is no stdin."""
+    """The file descriptor of stdin; -1, which is not a valid one, if there is no stdin."""
     try:
         return sys.stdin.fileno()
     except (OSError, ValueError, AttributeError):
@@ -59,7 +60,7 @@ def stdin_number() -> int:
 
 
 def ask(question: str) -> str:
-    """Ask on stderr, on a terminal with line editing, and return the line typed. Raises EOFError at
+    """Ask on stderr, with line editing on a terminal, and return the typed line. Raises EOFError at
     the end of the input."""
     if sys.stdin.isatty() and sys.stdout.isatty():
         with contextlib.suppress(ImportError):
@@ -67,7 +68,7 @@ def ask(question: str) -> str:
         *above, last = question.rstrip().split("\n")
         if above:
             print("\n".join(above), file=sys.stderr, flush=True)
-        return input(f"{last} ")  # it draws its own prompt again while one edits
+        return input(f"{last} ")  # readline redraws its own prompt during editing
     print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
     return input()
 
@@ -91,5 +92,5 @@ def add_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[s
 
 
 def print_result(result: Mapping[str, Any] | Sequence[Any] | str | Path) -> None:
-    """Print a command's result on stdout: a text or a path as it is, all else as JSON."""
+    """Print a command's result on stdout: a text or a path as it is, anything else as JSON."""
     print(result if isinstance(result, str | Path) else json.dumps(result), flush=True)

@@ -1,4 +1,4 @@
-"""`perchctl profile`: a profile as it is flown, a new one of your vehicle, the schema of one."""
+"""`perchctl profile`: show a resolved profile, create one for your vehicle, or print the schema."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
@@ -95,8 +95,8 @@ QUESTIONS: dict[str, str] = {
     "ceiling": "2.4",
     "safety.fence_radius_m": "1.5",
 }
-"""What is asked, in this order, with the default: keys of the profile, the two edges of the
-image, and the ceiling. Some defaults depend on earlier answers (`default_answer`)."""
+"""The questions in order, with their defaults: keys of the profile, the two image edges, and the
+ceiling. Some defaults depend on earlier answers (`default_answer`)."""
 WORDS: dict[str, str] = {
     "link.uri": "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://",
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
@@ -124,14 +124,15 @@ MEASURES: dict[str, tuple[str, float]] = {
     "ceiling": ("m", 1.0),
     "safety.fence_radius_m": ("m", 1.0),
 }
-"""The unit that people answer in, and its size in the key's."""
+"""The unit in which people answer, and its value in the unit of the key."""
 EDGES_AND_CEILING = ("front", "left", "ceiling")
-"""Questions that are no keys of the profile."""
+"""Questions that are not keys of the profile."""
 BACK = "back"
 _TERMINAL_COLUMNS = 80
 CEILING_M = (1.0, 10.0)
 OVER_THE_CEILING_M = 0.4
-"""The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
+"""Distance of the height limit above the ceiling, so that a drifting estimate does not end a
+flight."""
 FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
 """The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
 higher and there is room."""
@@ -144,7 +145,7 @@ SHOWN_KEYS = (
     "safety.min_rest_v",
     "safety.min_load_v",
 )
-"""Keys that are written with their defaults, since they are changed most often."""
+"""Keys that are written even with their default values, because they are changed most often."""
 HEAD = """\
 # A perchctl profile, created by perchctl profile new. The comment above each key
 # gives its meaning (unit, allowed values). Body axes: x forward, y left, z up, from
@@ -190,7 +191,7 @@ def new(
     check_output(output, (".yaml", ".yml"), force, "a profile")
     say_on_terminal("reading the shipped profiles")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
-    profile_and_keys(given, output.stem)  # before anything is asked
+    profile_and_keys(given, output.stem)  # before the first question
     answers = dict(given)
     for name in [name for name in QUESTIONS if name not in given] if defaults else []:
         answers[name] = default_answer(name, answers)
@@ -235,7 +236,9 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "left":
         return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
-        with contextlib.suppress(ValueError):  # what is no number is refused as the large side
+        with contextlib.suppress(
+            ValueError
+        ):  # a value that is not a number is refused later, as the large side
             return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
     return QUESTIONS[name]
 
@@ -276,7 +279,7 @@ def ask_questions(given: Answers) -> Answers:
 
 
 def _wrapped(text: str, margin: str = "") -> str:
-    """Return the text in lines that a terminal of 80 columns does not break inside a word."""
+    """Return the text wrapped between words for a terminal of 80 columns."""
     return "\n".join(
         textwrap.fill(
             line,
@@ -301,7 +304,8 @@ def _typed(question: str) -> str:
 
 
 def _read(name: str, typed: str) -> str:
-    """Return a key's text for what is typed, numbers with or without unit. Raises InvalidValue."""
+    """Convert typed input, with or without a unit, to the text of a key's value. Raises
+    InvalidValue."""
     if name not in MEASURES:
         return typed
     unit, size = MEASURES[name]
@@ -325,7 +329,7 @@ def _shown(name: str, value: str) -> str:
     unit, size = MEASURES[name]
     try:
         numbers = [float(part) / size for part in value.strip("[]").split(",")]
-    except ValueError:  # a word, or a number with its unit, as --set may give it
+    except ValueError:  # a word, or a number with its unit, as in --set
         return value
     return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
 
@@ -370,7 +374,7 @@ def profile_and_keys(
         )
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    # An AI-deck's few and late images need more than their calibration.
+    # An AI-deck sends few and late images, so it needs more keys than its calibration.
     base = profiles.load_profile("aideck") if _is_aideck(source) else profiles.Profile()
     shipped = analysis.profile_differences(
         *(p.model_dump(mode="json") for p in (profiles.Profile(), base))
@@ -386,7 +390,8 @@ def profile_and_keys(
 
 
 def _mount_keys(answers: Answers) -> dict[str, Any]:
-    """Return the camera's rotation by the edges that the hands came in at. Raises InvalidValue."""
+    """Return the camera's rotation, given the image edges at which the hands appeared. Raises
+    InvalidValue."""
     front, left = answers.get("front"), answers.get("left")
     if front is None:
         return {}
@@ -442,10 +447,11 @@ def schema() -> None:
     print(json.dumps(profiles.json_schema(), indent=2))
 
 
-# --- How a camera is turned, in words: which edge of its image is the vehicle's front ---
-# People see the image and the vehicle, and no axes: a hand over the vehicle's front comes into
-# the image at one edge, over its left side at another. The two tell the camera's turn about
-# its view, and whether the image is mirrored (docs/conventions.md, "Camera mount").
+# --- The camera's rotation in words: which edge of its image is the vehicle's front ---
+# People see the image and the vehicle, but no axes. A hand over the vehicle's front appears at one
+# edge of the image, a hand over its left side at another. The two edges determine the camera's
+# rotation about its viewing direction and whether the image is mirrored (docs/conventions.md,
+# "Camera mount").
 
 
 PICTURE_EDGES: dict[str, tuple[int, int]] = {
@@ -454,13 +460,13 @@ PICTURE_EDGES: dict[str, tuple[int, int]] = {
     "bottom": (0, 1),
     "left": (-1, 0),
 }
-"""Where each is in the image, x right and y down."""
+"""Direction of each edge in the image, x right and y down."""
 UPRIGHT = math.cos(math.radians(30.0))
 
 
 def left_edges(front: str) -> tuple[str, str]:
-    """Return the image's edge at the vehicle's left side if edge `front` is at its front: in an
-    unmirrored image, and in a mirrored one."""
+    """Return the image edge at the vehicle's left side, in an unmirrored and in a mirrored image,
+    if the edge `front` is at the vehicle's front."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
@@ -473,7 +479,7 @@ def yaw_deg_and_mirrored(front: str, left: str) -> tuple[float, bool]:
     x, y = PICTURE_EDGES[front]
     mirrored = left == left_edges(front)[1]
     if mirrored:
-        x = -x  # of the image as it is flipped before use
+        x = -x  # for the image as it is used, after a mirrored one was flipped
     # The front is at the angle a in the image; x right, y down, seen from below: the turn is -a.
     turn_deg = -math.degrees(math.atan2(y, x))
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored

@@ -1,4 +1,4 @@
-"""What a person sees during a command: progress bars, and a guided measurement."""
+"""Displays during a command: progress bars, and the guidance for a measurement."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import display as displays
 
 _WHOLE_RUN_S = 1e6
-"""Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
+"""Period over which the remaining time is estimated, s. In rich's default of 30 s, no flight may
+have ended."""
 
 
 class FinishedFlight(Protocol):
@@ -102,7 +103,7 @@ def _bar(
         yield partial(progress.update, progress.add_task("", total=total))
 
 
-# --- A person is guided ---
+# --- Guidance for a person ---
 
 _BAR_WIDTH = 30
 _GUIDE_HZ = 8

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
@@ -43,7 +43,8 @@ from perchctl.errors import (
 )
 
 CAMPAIGN_SAME_PRESS_S = 0.5
-"""A second Ctrl-C counts from here on; presses closer together are one."""
+"""Time after the first Ctrl-C from which a second one counts, s. Presses that are closer together
+count as one."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
@@ -126,7 +127,7 @@ def run(
     say_on_terminal(f"reading profile {profile}")
     flown = with_positioning(profiles.load_profile(profile), positioning)
     if cluster is not None and log_dir is not None:
-        log_dir = log_dir.absolute()  # workers are started in other folders
+        log_dir = log_dir.absolute()  # workers run in other folders
     seeds = range(seed, seed + flights)
     flyers = make_executor(jobs, cluster, [flown], flights)
     if faults is None:
@@ -282,7 +283,7 @@ def _fly_by_each(
         )
 
 
-# --- Who flies, and how it may end ---
+# --- Executors, and how a campaign ends ---
 
 
 def make_executor(

@@ -1,4 +1,4 @@
-"""`perchctl track`: the pipeline on any source, without a vehicle."""
+"""`perchctl track`: run the vision pipeline on any source, without a vehicle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-# By their packages, whose names load as they are used: the first word needs none of them.
+# Imported as packages, whose contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -127,10 +127,10 @@ def track(
             paths, count = recording.paths, recording.count
         advice = ", the shipped example: name your camera's with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
-        # Files of images need not belong together.
+        # Image files may be unrelated.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
         target: TargetInCamera | None = None
-        stack.enter_context(stop.as_handler())  # until here Ctrl-C ends at once
+        stack.enter_context(stop.as_handler())  # up to this point, Ctrl-C ends the command at once
         title = f"perchctl track {cameras.without_password(source)}"
         page = stack.enter_context(displays.live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
@@ -152,7 +152,7 @@ def track(
                 if sender is not None:
                     sender.send(record)
                 if lines:
-                    # A live result is worth nothing late.
+                    # A late live result is worthless.
                     print(record if as_json else text_line(tracked), flush=opened.live)
                 if page is not None:
                     sketch = displays.make_sketch(
@@ -189,7 +189,7 @@ def poll_until_stopped(
             continue
         if source.finished:
             return
-        # With no time passed nothing can be late: what is a problem even so is the end.
+        # At time -inf nothing can be late, so any problem reported then is permanent.
         if source.problem(-math.inf) is not None:
             return
         problem = source.problem(now_s)
@@ -261,7 +261,7 @@ def target_in_camera(
         known = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
     if known is None:
         return None
-    # The filter holds position and yaw; the tilt is the image's own.
+    # The filter contains position and yaw; the tilt comes from the image.
     R = np.asarray(cv2.Rodrigues(known.rvec_rad)[0], dtype=np.float64)
     R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
     rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
@@ -344,7 +344,8 @@ def _finite(value: Any) -> Any:
 
 
 def text_line(tracked: TrackResult) -> str:
-    """Return a result as one line for a terminal, at most 100 columns but for long file names."""
+    """Return a result as one line for a terminal, at most 100 columns wide unless the file name is
+    long."""
     head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
     return f"{head}  {_target_text(tracked)}"
 
@@ -432,7 +433,9 @@ class TrackSummary:
             seen = tracked.output.detections
             self._found.update(name for name in visions.MARKERS if seen.get(name) is not None)
         for note in tracked.notes:
-            kind = re.split("[:,]", note, maxsplit=1)[0]  # without what differs between frames
+            kind = re.split("[:,]", note, maxsplit=1)[
+                0
+            ]  # without the parts that differ between frames
             if not self._noted[kind]:
                 place = tracked.name if isinstance(tracked.name, str) else f"frame {tracked.name}"
                 say(f"{place}: {note}")

@@ -1,7 +1,7 @@
 """The live page of a fleet: a tile for each vehicle with its image, and buttons to stop.
 
-Each vehicle's own process serves its images (`FlightPage`). The page's threads fetch one when a
-browser asks for it, so that no image ever goes through the line on which the orders go.
+Each vehicle's own process serves its images (`FlightPage`). The page's threads fetch an image when
+a browser asks for it, so that images never use the connection that carries commands.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from perchctl.display.serve import Page
 from perchctl.mission import Phase
 
 EVENTS_SHOWN = 200
-"""Number of lines of events. More: each answer to a browser is larger. Fewer: a page that is opened
-late does not show the beginning of a long flight."""
+"""Number of event lines on the page. More: larger answers to the browser. Fewer: a page that is
+opened late does not show the beginning of a long flight."""
 PICTURE_TIMEOUT_S = 0.5
-"""Time for a vehicle's process to deliver an image, s. Longer: a process that hangs delays the
-other tiles. Shorter: images from a busy computer are missing."""
+"""Timeout for a vehicle's process to deliver an image, s. Longer: a hanging process delays the
+other tiles. Shorter: images are missing if the computer is busy."""
 LARGEST_PICTURE_BYTES = 2_000_000
-"""Largest JPEG, bytes. Larger: data that is no image fills the memory. Smaller: large cameras
-show no image."""
+"""Largest JPEG, bytes. Larger: invalid data may fill the memory. Smaller: cameras with large images
+show none."""
 
 
 class FleetPage(Page):
     """Serves the page until closed. Only `end` and `close` wait.
 
     Args:
-        count: how many vehicles the fleet has.
+        count: number of vehicles in the fleet.
         on_land: called by STOP ALL, from a thread of the page.
         on_cut: called by STOP ALL pressed again, likewise.
         on_land_one: called by a tile's Land with the vehicle's number, from 1 on, likewise.
@@ -71,11 +71,11 @@ class FleetPage(Page):
         self.set_state(self._tiles, live=live and not all(row.has_ended for row in rows))
 
     def event(self, line: str) -> None:
-        """Add a line to the events, which is also shown to those who open the page later."""
+        """Add a line to the events. It is also shown if the page is opened later."""
         self._events.append(line)
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image of the vehicle with this number; None if there is none now."""
+        """The newest image of the vehicle with this number; None if there is currently none."""
         port = next((r.picture_port for r in self._rows if str(r.number) == name), None)
         return None if port is None else _fetch_picture(port)
 

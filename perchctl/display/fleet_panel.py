@@ -25,7 +25,7 @@ _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRow:
-    """What panel and page show of one vehicle. Unknown numbers are None.
+    """The values that panel and page show for one vehicle. Unknown numbers are None.
 
     Attributes:
         link_s: age of the newest telemetry.

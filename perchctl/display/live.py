@@ -89,7 +89,7 @@ class LivePage(Page):
             newest, sketch = self._number, self._sketch
             if sketch is None or newest <= number:
                 return None
-        with self._drawing:  # drawn once for all readers
+        with self._drawing:  # drawn once for all browsers
             if self._jpeg is None or self._jpeg[0] < newest:
                 picture = draw_sketch(sketch, self.camera)
                 quality = [cv2.IMWRITE_JPEG_QUALITY, LIVE_JPEG_QUALITY]

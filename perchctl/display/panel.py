@@ -1,4 +1,4 @@
-"""The live display on a terminal: what it shows of one moment of a flight, and its drawing."""
+"""The live display of a flight on a terminal: its content for one tick, and how it is drawn."""
 
 from __future__ import annotations
 

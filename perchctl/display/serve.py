@@ -1,4 +1,4 @@
-"""A page on 127.0.0.1, with its content, buttons and HTTP server in threads of its own.
+"""A page on 127.0.0.1, with content, buttons and an HTTP server in separate threads.
 
 The flight only stores values here. An error in the page's threads is stored in `problem` and never
 raised.
@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 READS_S, LAST_READ_S = 2.5, 1.0
-"""A reader that has asked within the first time, s, is given the second time, s, to read the last
+"""If a browser has polled within the first time, s, it gets the second time, s, to read the final
 state before the page closes."""
 
 
@@ -28,8 +28,8 @@ class Page:
 
     Args:
         title: heading of the page.
-        orders: what each button calls, from a thread of the page, by its name; ``land`` and ``cut``
-            stop all. Both None: no buttons.
+        orders: the function that each button calls, by the button's name, from a thread of the
+            page; ``land`` and ``cut`` stop all. Both None: no buttons.
 
     `url` holds the token that the buttons need.
     """
@@ -161,15 +161,16 @@ class Page:
 
 
 # --- HTTP of the live page: only on loopback, and only under the names of loopback ---
-# A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
-# name this machine (a rebound DNS name does not), a button needs the token of the printed
-# address, in a header that a foreign site may not send, and nothing allows its reading.
+# A site in the same browser can send requests to 127.0.0.1 too. Therefore the Host header must name
+# this machine (a rebound DNS name does not), and a button needs the token from the printed address,
+# in a header that a foreign site cannot send. No response header permits a foreign site to read the
+# answers.
 
 
 HOSTS = ("127.0.0.1", "localhost", "::1")
 TOKEN_HEADER = "X-Perchctl-Token"
 LEAST_PERIOD_S = 0.04
-"""Time between two images to one reader, s: the eye needs no more than 25 a second."""
+"""Shortest time between two images for one browser, s: 25 per second are enough for the eye."""
 _CLIENT_TIMEOUT_S = 5.0
 _BOUNDARY = "perchctlpicture"
 
