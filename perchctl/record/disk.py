@@ -1,4 +1,4 @@
-"""Files that contain only whole records, and a thread that writes to a disk that may hang."""
+"""Files that only contain complete records, and a thread for writing to a disk that may hang."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ T = TypeVar("T")
 
 
 class DiskFile:
-    """A file of whole records only: a failed write leaves no partial record."""
+    """A file that only contains complete records: a failed write leaves no partial record."""
 
     def __init__(self, path: Path, sync: bool = True) -> None:
-        """Create the file. With `sync`, flushed data is on the disk, not only passed to the system.
-        Raises OSError, FileExistsError if the file exists."""
+        """Create the file. With `sync`, flushing writes the data to the disk instead of only
+        passing it to the operating system. Raises OSError, FileExistsError if the file exists."""
         self._path = path
         self._sync = sync
         self._good_bytes = 0
@@ -55,7 +55,10 @@ class DiskFile:
 
     def close(self) -> None:
         """Close the file; a second call does nothing. Raises OSError."""
-        fd, self._fd = self._fd, -1  # by the second call, the number may belong to another file
+        fd, self._fd = (
+            self._fd,
+            -1,
+        )  # by the second call, the file descriptor may belong to another file
         if fd >= 0:
             os.close(fd)
 
@@ -73,16 +76,17 @@ def create_file(path: Path, sync: bool, build: Callable[[DiskFile], T]) -> T:
 
 
 class BackgroundWriter:
-    """Runs jobs in order: at once, or if `live` in a thread, from a bounded queue.
+    """Runs jobs in order: at once or, if `live`, in a thread from a bounded queue.
 
-    Exceptions of a job are dropped: the job itself has to record failures.
+    Exceptions from a job are ignored; the job itself must record failures.
 
     Attributes:
         refused_jobs: number of jobs refused because the queue was full.
     """
 
     def __init__(self, most: int, name: str, live: bool) -> None:
-        """Begin with room for jobs that weigh `most` together; `name` is the thread's."""
+        """Start with room for jobs with a total weight of `most`. `name` is the name of the
+        thread."""
         self.refused_jobs = 0
         self._most = most
         self._jobs: SimpleQueue[tuple[Job, int] | None] = SimpleQueue()
@@ -94,7 +98,7 @@ class BackgroundWriter:
             self._thread.start()
 
     def put(self, job: Job, weight: int = 1) -> bool:
-        """Queue a job that takes `weight` of the room; False if the queue is too full for it."""
+        """Queue a job of the given `weight`. Returns False if the queue has no room for it."""
         if self._thread is None:
             _do(job)
             return True

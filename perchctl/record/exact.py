@@ -1,9 +1,9 @@
-"""Convert values to JSON and back to the same bits, which a replay requires.
+"""Convert values to JSON and back bit for bit, as a replay requires.
 
-A float is written by its shortest text that reads back to the same one, infinities and NaN as
+A float is written as the shortest text that reads back as the same float, infinities and NaN as
 ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its type and
-shape; an enum by its value; where a field takes one of several dataclasses, such as a command, the
-class's name stands before it. None is left out if it is the field's default.
+shape; an enum by its value; if a field may hold one of several dataclasses, such as a command, the
+class name comes first. None is left out if it is the field's default.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _AS_IT_IS = (bool, int, str)  # in JSON, too
 def to_exact_json(value: Any) -> Any:
     """Convert a value to JSON types from which `from_exact_json` restores it exactly.
 
-    Raises TypeError for what has no exact form.
+    Raises TypeError for a value that has no exact form.
     """
     kind = type(value)
     if kind is float:  # nearly all of a record
@@ -116,9 +116,9 @@ class ExactField:
 
 
 def exact_fields(hint: Any, path: str = "") -> list[ExactField]:
-    """Return the fields of all dataclasses that a value of type `hint` can hold, at every depth.
+    """Return the fields of all dataclasses that a value of type `hint` can contain, at every depth.
 
-    `path` stands before the dotted names.
+    `path` is the prefix of the dotted names.
     """
     found: list[ExactField] = []
     for kind in _members(hint):
@@ -161,9 +161,10 @@ def collect_written_names(hint: Any, data: Any, names: dict[str, set[str]]) -> N
 
 
 def from_exact_json(kind: type[T], data: Any) -> T:
-    """The value of `kind` that `to_exact_json` wrote. A missing field has its default.
+    """Restore the value of type `kind` that `to_exact_json` has written. A missing field gets its
+    default.
 
-    Raises ValueError, which names the field, for data of another form.
+    Raises ValueError, which names the field, for data in any other form.
     """
     try:
         return typing.cast(T, _from_exact(kind, data))
@@ -269,7 +270,7 @@ _ENCODER = json.JSONEncoder(
     check_circular=False,  # a value that contains itself has no exact form
     separators=(",", ":"),
 )
-"""Made once: `json.dumps` makes one for each line."""
+"""Created once, because `json.dumps` would create one for each line."""
 
 
 def json_line(values: Mapping[str, Any]) -> bytes:
@@ -278,7 +279,8 @@ def json_line(values: Mapping[str, Any]) -> bytes:
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
-    """The record of a line. Raises ValueError for anything that is not one JSON object."""
+    """Return the record in a line. Raises ValueError for anything that is not a single JSON
+    object."""
     try:
         record = json.loads(line.decode("utf-8"))
     except RecursionError:

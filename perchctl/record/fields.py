@@ -31,8 +31,8 @@ SCHEMA_VERSION = 5
 READABLE_VERSIONS = (1, 2, 3, 4, SCHEMA_VERSION)
 """Version 1 had no `tracked`, and no events with several fields; its missing values read as None.
 Version 2 had no turns. Version 3 did not contain the reason for a turn's decision, nor the commands
-sent in the loop's place. Up to version 4, the variance of the velocity had the position's name, and
-that of the position was not recorded."""
+sent in the loop's place. Up to version 4, the velocity variance was stored under the position's
+name, and the position variance was not recorded."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -110,7 +110,7 @@ FIELDS: dict[str, str] = {
     "unseen": "frames since the target was last detected",
     **_axes("t{}_m", "target in the world of the state estimate"),
     "tyaw_rad": "heading of the target in the world of the state estimate",
-    # what was sent
+    # the command that was sent
     "cmd": "idle, position, thrust, stop, land or emergency",
     **_axes("cmd_{}_m", "position setpoint; z also the height of a landing"),
     "cmd_yaw_rad": "setpoint's heading",
@@ -144,7 +144,8 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """A tick as a flat record of all `FIELDS` in order; the truth is known in simulation only."""
+    """Return a tick as a flat record of all `FIELDS` in order. The ground truth is only known in
+    simulation."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
         "t_s": tick.t_s,
@@ -249,7 +250,7 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
 
 
 def command_values(command: Command) -> Mapping[str, Any]:
-    """The values of a command by the names of a tick's fields: ``cmd`` and its numbers."""
+    """Return the values of a command under the tick's field names: ``cmd`` and its numbers."""
     match command:
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}

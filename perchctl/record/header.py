@@ -1,4 +1,4 @@
-"""The log's header: the set-up of a flight, complete enough to replay it on another computer.
+"""The log's header: the setup of a flight, complete enough to replay it on another computer.
 
 It contains the profile with every key. The camera files that the profile names may have changed by
 the time of a replay, so their content is included, too, and so is a fingerprint of the computer's
@@ -40,8 +40,8 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """A log's first record. Without `started` it depends only on the other arguments and
-    the files that the profile names. `t0_s` is the loop's time at the log's beginning."""
+    """A log's first record. Without `started`, it only depends on the other arguments and the files
+    named in the profile. `t0_s` is the loop time at the start of the log."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -63,10 +63,10 @@ def make_header(
 
 @cache
 def turn_fields() -> dict[str, list[str]]:
-    """Return the names of the fields that a turn is written with, by dataclass.
+    """Return the names of the fields that are written for a turn, by dataclass.
 
-    They tell a later perchctl which of its fields a log cannot contain: a turn leaves out a field
-    that is None, just like one that did not exist yet.
+    They tell a later version of perchctl which of its fields this log cannot contain. Otherwise a
+    field that is left out because it is None would look like one that did not exist yet.
     """
     names: dict[str, list[str]] = {}
     for field in exact_fields(TickRecord):
@@ -106,9 +106,9 @@ def _packed(mask: NDArray[np.bool_]) -> str:
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
 
 
-# --- A fingerprint of how this computer calculates ---
-# Libraries choose their code by the processor: numpy's BLAS and vector functions, OpenCV's filters,
-# the sine of the C library. The last bits of a pose therefore depend on the processor.
+# --- A fingerprint of this computer's arithmetic ---
+# Libraries choose code for the processor: numpy's BLAS and vector functions, OpenCV's filters, the
+# sine of the C library. The last bits of a pose therefore depend on the processor.
 
 
 _SIDES = (2, 3, 4, 6, 8, 12)
@@ -116,9 +116,9 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 
 @cache
 def arithmetic_fingerprint() -> str:
-    """Return eight hexadecimal digits for the processor's arithmetic.
+    """Return eight hexadecimal digits that identify the processor's arithmetic.
 
-    If they and the libraries are the same, single-threaded results are bit-identical.
+    If the digits and the libraries are the same, single-threaded results are bit-identical.
     """
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
     for part in (_libm_probe(), *_numpy_probes(), *_opencv_probes()):

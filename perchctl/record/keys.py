@@ -1,7 +1,7 @@
-"""The names in a log's turns that differ from those in the program.
+"""Names in a log's turns that differ from the names in the program.
 
-A turn is written field by field. So that a field or dataclass may be renamed while logs stay
-readable, both ways, the log keeps the names that it has had from the start.
+A turn is written field by field. The log keeps its original names when a field or dataclass is
+renamed, so that old and new versions of perchctl can read each other's logs.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "acceleration_bias_mps2": "bias_mps2",
     },
 }
-"""The key of a field in the log, by the names of its dataclass and of itself in the program."""
+"""The key of a field in the log, by the names of the dataclass and the field in the program."""
 
 
 @dataclass(frozen=True)
 class LogNames:
-    """The names by which a log knows a dataclass: its own, and the key of each field by the field's
-    name in the program."""
+    """The names of a dataclass in a log: its own, and the key of each field by the field's name in
+    the program."""
 
     owner: str
     keys: dict[str, str]
@@ -126,7 +126,7 @@ class LogNames:
 
 @cache
 def log_names(kind: type) -> LogNames:
-    """Return the names by which a log knows a dataclass and its fields."""
+    """Return the names of a dataclass and its fields in a log."""
     keys = FIELD_KEYS.get(kind.__name__, {})
     names = (each.name for each in dataclasses.fields(kind))
     owner = CLASS_KEYS.get(kind.__name__, kind.__name__)

@@ -36,14 +36,14 @@ TICK = "/tick"
 
 NS = 1_000_000_000
 PNG_LEVEL = 1
-"""Compression level: fast; the next levels take twice the time and save a twentieth of the size."""
+"""A fast compression level. The next levels take twice the time and save 5 % of the size."""
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
 def image_message(time_ns: int, frame: Frame) -> CompressedImage:
-    """An image's message: the camera's own JPEG, or else a PNG."""
+    """Return the message for an image: the camera's own JPEG, or else a PNG."""
     data = frame.encoded
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]

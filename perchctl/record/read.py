@@ -52,9 +52,10 @@ class PhaseSpan:
 
     Attributes:
         reason: why the phase was entered.
-        row: the row of the mission's transition table that led there.
+        row: the row of the mission's transition table that led to the phase.
         severity: as in the log's event.
-        simulated: what the simulated scenario did that led there. Empty texts if unknown.
+        simulated: the event in the simulated scenario that led to the phase. Empty texts if
+            unknown.
     """
 
     phase: str
@@ -118,7 +119,8 @@ class FlightLog:
     def _written_names(self) -> dict[str, set[str]]:
         """By dataclass the names of the fields that a log without ``turn_fields`` may hold.
 
-        A field that is left out while it is None counts as held: None may be what it was.
+        A field that is left out while it is None counts as contained, because its value may have
+        been None.
         """
         names: dict[str, set[str]] = {}
         if self.turns:  # readable
@@ -230,7 +232,7 @@ class FlightLog:
 
     @property
     def profile_name(self) -> str | None:
-        """The flown profile's name; None where the header holds none."""
+        """Name of the flown profile; None if the header contains none."""
         profile = self.header.get("profile")
         name = profile.get("name") if isinstance(profile, dict) else None
         return None if name is None else str(name)
@@ -269,7 +271,7 @@ class FlightLog:
 
     @property
     def has_position_variance(self) -> bool:
-        """True if the log tells the position's variance, where the vehicle reported it."""
+        """True if the log contains the position variance whenever the vehicle reported it."""
         return bool(self.header.get("version", 0) >= NAMED_VERSION)
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
@@ -287,8 +289,8 @@ class FlightLog:
 
     @property
     def computer_differences(self) -> str:
-        """How the flight's computer differs from the present one, in words; empty if equal, or if
-        the log does not record it."""
+        """The differences between the flight's computer and this one, in words; empty if there are
+        none or if the log does not record them."""
         was, here = self.header.get("computer"), computer_record()["computer"]
         if not isinstance(was, dict):
             return ""
@@ -307,7 +309,7 @@ TIMES = ("t_s", "frame_t_s")
 
 
 def read_log(path: Path | str) -> FlightLog:
-    """Read a flight log, packed by gzip or not; an unreadable tail is ignored and counted.
+    """Read a flight log, compressed by gzip or not. An unreadable tail is ignored and counted.
 
     Raises NotFound when there is no such file, and InvalidValue, with the line, when it is not a
     flight log or is damaged elsewhere than at its end.
@@ -363,7 +365,7 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
 
 def _lines(path: Path) -> list[bytes]:
     """Read the lines of a file; none of a file that cannot be a log, since it may be a video of
-    gigabytes. The end of a packed file that was cut off is lost."""
+    gigabytes. The end of a truncated compressed file is lost."""
     lines: list[bytes] = []
     try:
         with path.open("rb") as file:
@@ -419,8 +421,8 @@ _NAMES = {"position_variance_m2": "velocity_variance_m2ps2", "var_m2": "vel_var_
 
 
 def _with_named_variance(value: Any) -> Any:
-    """Return the value of an older log with the velocity's variance under its own name instead of
-    that of the position's variance."""
+    """Return a value from an older log with the velocity variance under its own name instead of
+    under that of the position variance."""
     if isinstance(value, list):
         return [_with_named_variance(part) for part in value]
     if isinstance(value, dict):
@@ -436,12 +438,13 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_turn(record: dict[str, Any]) -> TickRecord:
-    """The turn of a record, to the same bits. Errors: InvalidValue."""
+    """Return the turn in a record, bit-identical. Errors: InvalidValue."""
     return parse_exact(TickRecord, _whole_turn(record))
 
 
 def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
-    """The record with the observation's telemetry, which a line holds once: among the samples."""
+    """Return the record with the observation's telemetry added. A line only contains it once, among
+    the samples."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
         samples = taken.get("late") or taken.get("samples")

@@ -25,7 +25,7 @@ from perchctl.record.write import recording_path
 MOST_RECORD_BYTES = 64_000_000
 """A flight's chunk contains 4 MB and one image; a longer record has a damaged length."""
 _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
-"""What the libraries raise for a record that is cut or damaged; lz4's errors among them."""
+"""Exceptions that the libraries raise for a truncated or damaged record, including lz4's."""
 
 
 class RecordedPicture(NamedTuple):
@@ -40,8 +40,8 @@ class RecordedPicture(NamedTuple):
 def recorded_pictures(
     path: Path | str, numbers: Container[int] | None = None
 ) -> Iterator[RecordedPicture]:
-    """Yield the images `(number, t_s, image)`, oldest first, of a recording or of the log that it
-    lies beside; a cut-off last image is left out.
+    """Yield the images `(number, t_s, image)`, oldest first, of a recording, or of the recording
+    next to a log. A truncated last image is left out.
 
     If `numbers` is given, only these frames are decoded. Errors, with the first image: NotFound
     without a recording; InvalidValue for any other file.

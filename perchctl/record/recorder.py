@@ -1,7 +1,7 @@
 """Records a flight while it flies: images, transforms and ticks.
 
 The flight passes on its data and continues; a separate thread encodes and writes it. The recording
-is less important than the log: losses are counted and reported, but never make the vehicle land.
+is less important than the log: lost data is counted and reported, but never makes the vehicle land.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Recorder:
     and nothing is dropped.
 
     Attributes:
-        problem: None, or one sentence about the first thing that the recording lacks.
+        problem: None, or one sentence about the first data that is missing in the recording.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class Recorder:
         """Begin the file at the times of the log's header. Raises OSError."""
         self.path = path
         self.problem: str | None = None
-        # Of the loop's thread.
+        # Used by the loop's thread:
         self._writer = BackgroundWriter(MOST_WAITING_BYTES, "perchctl-recording", live)
         self._turn: list[Job] = []
         self._turn_bytes = TURN_BYTES
         self._pictures = 0
         self._closed = False
-        # Of the thread that writes.
+        # Used by the writer thread:
         self._stream = stream
         sink: Any = stream  # of IO[bytes] the writer needs no more
         self._mcap = Writer(sink, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
@@ -110,7 +110,7 @@ class Recorder:
 
     def write_frame(self, frame: Frame) -> None:
         """Record a frame of the source. Never raises."""
-        self._hand_over()  # before take-off no tick does
+        self._hand_over()  # before take-off, no tick does this
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
         # A repeated frame contains its image, too.
@@ -141,7 +141,7 @@ class Recorder:
     def _remember(self, sentence: str) -> None:
         self.problem = self.problem or sentence
 
-    # The thread that writes, or lockstep.
+    # --- Run by the writer thread, or in lockstep ---
 
     def _attempt(self, *jobs: Job) -> None:
         if self._over:
@@ -155,7 +155,7 @@ class Recorder:
                 why = error.strerror or str(error)
             self._end(why)
             with suppress(OSError):
-                self._stream.close()  # without an index, where its last whole record ends
+                self._stream.close()  # close it without an index, after its last complete record
 
     def _write_frame(self, frame: Frame) -> None:
         number = frame.index & 0xFFFFFFFF

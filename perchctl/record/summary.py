@@ -1,4 +1,4 @@
-"""A flight in a few lines of text."""
+"""The summary of a flight: a few lines of text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class RecordingEnd(NamedTuple):
 
 
 NAME_COLUMNS = 11
-"""Width of the column of names in a summary."""
+"""Width of the name column in a summary."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,16 @@ class FlightSummary:
     Attributes:
         outcome: ``perched``, ``landed``, ``aborted``, or ``unknown`` for a log
             that ends without its summary.
-        cause: what decided it, such as ``target not found``.
+        cause: the reason for the outcome, such as ``target not found``.
         miss_m: true distance from gear to target centre; None if unknown.
         contact: estimated error of the contact; None unless the vehicle hangs.
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
         hover: time and position errors of a hover; None in a mission that perches.
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
         recording: its summary; None without a recording, and in a log that is read back.
-        simulated: the vehicle was; then nothing here is advice for the profile of a real one.
-        is_profile_suspect: a row decided that claims the profile may be wrong.
+        simulated: True if the vehicle was simulated; then nothing here is advice for the profile of
+            a real vehicle.
+        is_profile_suspect: True if the deciding row says that the profile may be wrong.
     """
 
     outcome: str
@@ -84,8 +85,8 @@ class FlightSummary:
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the flight or, if only its log is incomplete, that of the log. For a
-        summary by `LogWatcher.close`: one that is read back may lack its cause."""
+        """The exit code of the flight or, if only its log is incomplete, that of the log. Only for
+        a summary from `LogWatcher.close`, because one that was read back may lack its cause."""
         code = Outcome(self.cause).exit_code
         return LogIncomplete.exit_code if code == 0 and self.log_problem is not None else code
 
@@ -101,7 +102,9 @@ class FlightSummary:
         battery_min_v = float(np.min(known_v)) if known_v.size else None
         simulated = is_simulated(log.header)
         findings = _part_in(end, CameraFindings, _FINDINGS)
-        if simulated and findings is not None:  # logs written by 0.3.0 contain advice anyway
+        if (
+            simulated and findings is not None
+        ):  # logs written by 0.3.0 contain advice in this case, too
             findings = replace(findings, advice=())
         return cls(
             outcome=str(end.get("outcome", "unknown")),

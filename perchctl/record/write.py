@@ -1,8 +1,8 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
-Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one rounded,
-for people and plots, the other exact and whole), `event` and `sent` records between them, and one
-`summary` at the end. An error of the log never disturbs the flight.
+Line 1 is the header. Each turn of the loop adds a `tick` record (rounded, for people and plots) and
+a `turn` record (exact and complete), with `event` and `sent` records between them. The last line is
+the `summary`. An error of the log never disturbs the flight.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 FSYNC_PERIOD_S = 1.0
 LOG_CLOSE_TIMEOUT_S = 3.0
 MOST_WAITING = 3000
-"""Number of records that may wait for the disk, half a minute of a flight at 50 Hz; more are
-dropped."""
+"""Number of records that may wait for the disk: half a minute of a flight at 50 Hz. Further records
+are dropped."""
 NO_ANSWER = "the disk does not respond: the end of the flight log is missing"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
@@ -55,7 +55,7 @@ class LogWatcher:
         problem: None, or one sentence about the first failure of the disk, or about the error for
             which the flight detached its log.
         unencodable: None, or one sentence about the first record that could not be encoded. Only
-            that record is lost, and the flight goes on.
+            that record is lost, and the flight continues.
         truth: returns the true state at a tick; set by a simulation.
         simulated: the header is that of a simulated vehicle.
         recorder: records the frames of the watched source; None without a recording.
@@ -79,7 +79,7 @@ class LogWatcher:
         self._writer = BackgroundWriter(MOST_WAITING, "perchctl-log", live)
         self._closed = False
         self._unfinished = self._unmade = 0
-        # Below: of the thread that writes.
+        # Used by the writer thread:
         self._failed = 0
         self._synced_s = math.inf
 
@@ -90,7 +90,8 @@ class LogWatcher:
 
     @property
     def loss_reason(self) -> str | None:
-        """One sentence why the log is incomplete, a disk failure first; None if complete."""
+        """The reason why the log is incomplete, in one sentence; a disk failure has priority. None
+        if the log is complete."""
         return self.problem or self.unencodable
 
     @classmethod
@@ -120,7 +121,8 @@ class LogWatcher:
     def open_lockstep(
         cls, path: Path, profile: Profile, seed: int, record: bool = False
     ) -> LogWatcher:
-        """Open a simulated flight's log; the seed fixes its bytes. Errors: InvalidValue."""
+        """Open the log of a simulated flight. The same seed gives the same bytes. Errors:
+        InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
         return cls._opened(path, header, profile, record, live=False)
 
@@ -134,7 +136,7 @@ class LogWatcher:
         seed: int | None = None,
         record: bool = False,
     ) -> LogWatcher:
-        """Open a new log in `directory`, which a thread of its own writes. Errors: InvalidValue."""
+        """Open a new log in `directory`, written by a separate thread. Errors: InvalidValue."""
         started, t0_s = datetime.now(UTC), time.monotonic()
         header = make_header(profile, uri=uri, source=source, seed=seed, started=started, t0_s=t0_s)
         path = log_path(directory, profile.name, started)
@@ -162,7 +164,7 @@ class LogWatcher:
             self.recorder.write_frame(frame)
 
     def remarks(self) -> list[str]:
-        """The recording's problem, one sentence, once; else an empty list."""
+        """The recording's problem in one sentence, returned once; otherwise an empty list."""
         problem = None if self.recorder is None else self.recorder.problem
         if problem is None or self._has_remarked:
             return []
@@ -279,7 +281,7 @@ class LogWatcher:
         if not self._closed and not self._writer.put(partial(self._record, line, t_s)):
             self._remember(NO_ROOM)
 
-    # The thread that writes, or lockstep.
+    # --- Run by the writer thread, or in lockstep ---
 
     def _record(self, line: Callable[[], bytes], t_s: float) -> None:
         self._store(line)
@@ -300,7 +302,7 @@ class LogWatcher:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # The record that was waited for in vain is in the file by now.
+            # The record for which the wait timed out is in the file by now.
             problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
@@ -343,11 +345,11 @@ def _explain(error: OSError) -> str:
     return f"the flight log cannot be written: {error.strerror or error}"
 
 
-# --- where a flight's files lie: the log, and what is beside it by its name ---
+# --- Paths of a flight's files: the log, and the files next to it with the same name ---
 
 
 def path_beside(log: Path | str, suffix: str) -> Path:
-    """The path of a log, packed or not, with another ending, such as ``.png``."""
+    """Return the path of a log, compressed or not, with another suffix, such as ``.png``."""
     path = Path(log)
     whole = path.with_suffix("") if path.suffix == ".gz" else path
     return whole.with_name(whole.stem + suffix)

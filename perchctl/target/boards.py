@@ -3,11 +3,11 @@
 ``chessboard:9x6:25mm``
     inner corners (columns x rows) and the side of a square; 10x7 squares are printed.
 ``charuco:10x7:25mm:18mm:DICT_5X5_100``
-    squares (columns x rows), side of a square, side of a marker, dictionary; ``:legacy`` behind it
-    is the layout of OpenCV before 4.6, which many shops still sell.
+    squares (columns x rows), side of a square, side of a marker, dictionary; the suffix ``:legacy``
+    selects the layout of OpenCV before 4.6, which many shops still sell.
 
-Both count as OpenCV's own calls do. Behind each ``:measured=249.3x174.6mm`` may say what the
-print's black area measures.
+Columns and rows are counted as in OpenCV's own functions. A suffix such as
+``:measured=249.3x174.6mm`` gives the measured size of the print's black area.
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ class Board:
         return np.stack([xs.ravel(), ys.ravel(), np.zeros(xs.size)], axis=1)
 
     def notation(self) -> str:
-        """The text from which `parse` makes an equal board, such as ``chessboard:9x6:25mm``."""
+        """The text that `parse` converts back to the same board, such as
+        ``chessboard:9x6:25mm``."""
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
@@ -116,7 +117,7 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """The board of a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
+        """Return the board for a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
 
         Raises InvalidValue, which names the wrong part.
         """
@@ -168,7 +169,7 @@ class Board:
 
 
 def _check_markers(board: Board, text: str) -> None:
-    """Raises InvalidValue for ChArUco markers too large, or too many for their dictionary."""
+    """Raise InvalidValue if ChArUco markers are too large, or too many for their dictionary."""
     largest_m = 0.95 * board.square_m
     needed = board.columns * board.rows // 2
     if board.marker_m is not None and board.marker_m > largest_m:
@@ -185,7 +186,7 @@ def _wrong(text: str, why: str) -> InvalidValue:
     return InvalidValue(f"board {text!r}: {why} (for example {EXAMPLES})")
 
 
-# --- What of a board is black ---
+# --- The black area of a board ---
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:

@@ -1,4 +1,4 @@
-"""The nested target as geometry: which squares are black, at any resolution.
+"""The geometry of the nested target: which squares are black, at any resolution.
 
 Drawing axes: origin in the target's centre, x right and y up *as printed and
 read from the printed side*, metres. They are OpenCV's marker axes. The sheet
@@ -66,14 +66,15 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """The share of black, 0..1, in each pixel's window, (size_px, size_px), with the
-        parameters of `pixel_overlap`."""
+        """Return the fraction of black, 0..1, in each pixel's window, (size_px, size_px).
+        Parameters as in `pixel_overlap`."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights are valid for the rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """The sheet's share, 0..1, of each pixel's window; as `ink_coverage`."""
+        """Return the fraction, 0..1, of each pixel's window that the sheet covers. Parameters as in
+        `pixel_overlap`."""
         half = self.sheet_side_m / 2.0
         w = pixel_overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
@@ -85,7 +86,7 @@ class TargetDrawing:
         return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 
     def rectangles(self) -> list[Rectangle]:
-        """The black area as few, large, non-overlapping rectangles (for a PDF)."""
+        """The black area as a small number of large, non-overlapping rectangles (for a PDF)."""
         return merge_black_cells(self.black, self.edges_m, -self.edges_m)
 
 
@@ -106,10 +107,10 @@ def marker_corners_m(side_m: float) -> Array:
 def draw_target(target: TargetConfig) -> TargetDrawing:
     """The drawing of both markers; sizes are taken from the configuration.
 
-    The white ring is one cell of the small marker wide, or as wide as the large
-    marker's black cells under it allow. Where the large marker's own centre is
-    white already (id 997 of DICT_4X4_1000) the ring changes nothing. With a 4x4
-    dictionary any two ids stay readable up to a small side of 0.18 of the large.
+    The white ring is one cell of the small marker wide, or as wide as the large marker's black
+    cells under it allow. If the centre of the large marker is already white (id 997 of
+    DICT_4X4_1000), the ring changes nothing. With a 4x4 dictionary, any two ids stay readable if
+    the small side is at most 0.18 of the large one.
     """
     large = marker_cells(target.large)
     small = marker_cells(target.small)
@@ -154,14 +155,15 @@ def _white_in_black_cells(
 
 
 def _merged(edges_m: Array) -> Array:
-    """Return sorted edges without the doubles that differ by rounding only."""
+    """Return sorted edges without duplicates that only differ by rounding."""
     edges = np.sort(edges_m)
     keep = np.concatenate([[True], np.diff(edges) > 1e-9])
     return np.asarray(edges[keep])
 
 
 def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> NDArray[np.bool_]:
-    """True if points lie in a black cell of a marker in the centre, shape of xs and ys."""
+    """Return for each point (shape of xs and ys) whether it is in a black cell of a marker in the
+    centre."""
     n = len(cells)
     col = np.floor((xs / side_m + 0.5) * n).astype(int)
     row = np.floor((0.5 - ys / side_m) * n).astype(int)
@@ -170,7 +172,7 @@ def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> ND
 
 
 def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-    """The share of each pixel's window that lies in each interval of `edges_m`, (size_px,
+    """Return the fraction of each pixel's window that lies in each interval of `edges_m`, (size_px,
     n).
 
     Pixel i is centred at ``(i - (size_px - 1) / 2) / px_per_m``; its window is
@@ -185,8 +187,8 @@ def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: floa
 def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
     """The black cells of a grid as few, large, non-overlapping rectangles.
 
-    `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
-    large, because viewers draw hair lines between rectangles that touch.
+    `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. The rectangles are few
+    and large because viewers draw hairlines between adjacent rectangles.
     """
     left = black.copy()
     rows, cols = left.shape
@@ -213,12 +215,13 @@ def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
     return found
 
 
-# --- Lengths as people write them: with their unit ---
+# --- Lengths with a unit, as people write them ---
 
 
 MAX_SCALE_ERROR = 0.1
 NOTABLE_SCALE_ERROR = 0.01
-"""Printers err by some 0.3 %; from here on a viewer has scaled the page."""
+"""Relative size error from which a viewer must have scaled the page; printers themselves err by
+about 0.3 %."""
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*")
 
@@ -226,8 +229,8 @@ _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*
 def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float:
     """The metres of ``150mm``, ``15cm`` or ``0.15m``.
 
-    `what` names the value in the error; a number without a unit is taken in `bare_unit`,
-    and refused where that is None. Raises InvalidValue.
+    `what` names the value in the error; a number without a unit is in `bare_unit`, or is refused if
+    that is None. Raises InvalidValue.
     """
     match = _LENGTH.fullmatch(text)
     if match is None:
@@ -242,7 +245,7 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
     value = float(number) * UNITS_M[unit]
     if not (math.isfinite(value) and value > 0.0):
         raise InvalidValue(f"{what}: {text!r} must be greater than zero")
-    # What a person writes has no more than 12 digits: 0.1 cm is 0.001 m, not 0.0010000000000000002.
+    # People write no more than 12 digits: 0.1 cm is 0.001 m, not 0.0010000000000000002.
     return float(f"{value:.12g}")
 
 
@@ -252,7 +255,8 @@ def print_scale(
     """A print's measured over its nominal length, and notes for the user, in which `name`
     and `option` name the length, and `source` its nominal value's origin.
 
-    Raises InvalidValue for a scale that no printer makes, as by a length in the wrong unit.
+    Raises InvalidValue for a scale that no printer produces, for example because the length is in
+    the wrong unit.
     """
     scale = measured_m / spec_m
     off = scale - 1.0

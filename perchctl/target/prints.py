@@ -1,8 +1,8 @@
 """The printed target: the sizes measured on paper, and the ratio of the small marker's size to the
 large one's.
 
-Seen together, both markers lie in one plane at one distance: the ratio of their apparent
-sizes is the ratio of their prints, whatever the distance and the focal length.
+Both markers lie in one plane at the same distance, so the ratio of their apparent sizes is the
+ratio of the printed sizes, regardless of distance and focal length.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ MEASURED_SIGMA = 0.001
 def measured_target(
     nominal: TargetConfig, sides_m: Mapping[str, float]
 ) -> tuple[TargetConfig, list[str]]:
-    """The target with the measured sides of ``large`` and ``small``, and notes for the
-    user. With both sides given, `size_sigma` falls to `MEASURED_SIGMA`.
+    """The target with the measured sides of ``large`` and ``small``, and notes for the user. If
+    both sides are given, `size_sigma` is reduced to `MEASURED_SIGMA`.
 
-    Raises InvalidValue for a side that no printer makes of the nominal one.
+    Raises InvalidValue for a side that differs more from the nominal one than any printer's error.
     """
     notes, scales = [], {}
     target = nominal
@@ -50,14 +50,14 @@ def measured_target(
     return target, notes
 
 
-# --- The proportion of the two prints, as a camera sees it ---
+# --- The size ratio of the two printed markers, measured by the camera ---
 
 
 CORNER_BIAS_PX = 0.02
 """Error of a refined corner inwards or outwards that all frames share, px; averaging over frames
 does not reduce it."""
 MIN_ERROR = 0.003
-"""Smallest relative error that is reported: a printer's dot on a 25 mm marker."""
+"""Smallest relative error that is reported: one printer dot on a 25 mm marker."""
 SIGMAS = 3.0
 MIN_FRAMES = 5
 _MEDIAN_TO_SIGMA = 1.2533  # ratio of the standard error of a median to that of a mean
@@ -121,7 +121,7 @@ class PrintCheck:
             self.add_corners(large.corners_px, small.corners_px)
 
     def add_corners(self, large_px: Array, small_px: Array) -> None:
-        """Add an image's ratio by its markers' corners, (4, 2) px each."""
+        """Add the ratio for one image from its markers' corners, (4, 2) px each."""
         ratio = size_ratio(large_px, small_px, self.camera, self.target)
         if ratio is not None:
             self._ratios.append(ratio)
@@ -132,8 +132,8 @@ class PrintCheck:
         return len(self._ratios) >= MIN_FRAMES
 
     def verdict(self) -> PrintVerdict:
-        """Judge the median ratio: wrong if the error is beyond noise and bias; not wrong for too
-        few frames."""
+        """Check the median ratio. The print is wrong if the error exceeds noise and bias; with too
+        few frames, it is not reported as wrong."""
         if not self.has_enough_frames:
             return PrintVerdict(
                 f"print not judged: both markers were seen in only {len(self._ratios)} frames "

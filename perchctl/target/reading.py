@@ -46,7 +46,7 @@ def _single_marker_dictionary(marker: MarkerConfig) -> Any:
     )
 
 
-# --- The smallest side that is read through blur and noise ---
+# --- The smallest marker side that can be read despite blur and noise ---
 
 
 FOUND_RATE = 0.9
@@ -88,11 +88,11 @@ def smallest_side_px(
         return hits / TRIALS
 
     def found(i: int) -> bool:
-        # Three neighbours together: between 0.8 and 1 the rate rises slowly.
+        # Three adjacent sizes are averaged, because the rate rises slowly between 0.8 and 1.
         return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
 
-    # Trying the largest sides first would be slow: large images. Upwards by doubling,
-    # then bisection.
+    # Starting with the largest sides would be slow because the images are large, so the side is
+    # doubled first and then bisected.
     low, high, stride = -1, 0, 4
     while not found(high):
         low = high
@@ -177,7 +177,8 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
 
 
 def _cells_apart(a: MarkerConfig, b: MarkerConfig, turns: Sequence[int] = (0, 1, 2, 3)) -> int:
-    """The fewest cells that differ over the quarter turns; all, if sizes differ."""
+    """Return the smallest number of differing cells over all quarter turns; the number of all cells
+    if the sizes differ."""
     first = marker_cells(a)
     second = marker_cells(b)
     if first.shape != second.shape:

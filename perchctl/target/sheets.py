@@ -1,4 +1,4 @@
-"""The printed pages, true to size: the target's front and back, a board.
+"""The pages to print, true to size: the target's front and back, or a board.
 
 The target's centre is the page's centre, so the cross on the back lies over the front's centre
 whichever way the sheet is turned over. Page axes: origin at the top left corner of the paper, x
@@ -29,11 +29,11 @@ PAGES_MM: dict[str, tuple[float, float]] = {
     "letter": (215.9, 279.4),
     "a3": (297.0, 420.0),
 }
-"""Named pages, portrait, in the order in which one that fits is proposed."""
+"""Named page sizes, portrait, in the order in which a fitting one is proposed."""
 MOST_PAGE = 5000.0
 """Largest side of a page, mm: a PDF's pages end at 5.08 m."""
 UNPRINTABLE = 5.0
-"""Width of the paper's edges that many printers leave white, mm."""
+"""Width of the unprintable margin of many printers, mm."""
 MIN_QUIET_CELLS = 0.5
 """Least white margin around the large marker, in its cells. One cell is printed if the page has
 room for it. Down to half a cell, the range stays the same (the marker is found from 32 px on; with
@@ -45,7 +45,7 @@ _GAP = 1.5  # between the sheet's edge and a ruler
 _TICK, _HALF_TICK, _FINE_TICK = 3.5, 2.4, 1.4
 _LABEL = 2.5
 _RULER_DEPTH = _GAP + _TICK + 0.6 + _LABEL
-_RULER_REACH = RULER / 2 + 7.0  # with the label at its end
+_RULER_REACH = RULER / 2 + 7.0  # including the label at its end
 _MARK_GAP, _MARK = 1.0, 5.0
 _TEXT, _LINE = 2.8, 4.0
 _ARROW = ((0.0, 10.0), (2.5, 5.5), (0.6, 5.5), (0.6, 0.0), (-0.6, 0.0), (-0.6, 5.5), (-2.5, 5.5))
@@ -67,8 +67,8 @@ def target_pdf(
         magnet_m: diameter of the magnet, whose place is on the back.
         origin: where the sizes come from, for the caption.
 
-    Raises InvalidValue for a target that cannot be read, and where the page is too small, with the
-    page that fits.
+    Raises InvalidValue if the target cannot be read, or if the page is too small; the message then
+    names a page that fits.
     """
     check_target(target, magnet_m)
     size = parse_page(page)
@@ -235,9 +235,9 @@ class _Paper(FPDF):
         self.set_margin(0.0)
         self.set_title(title)
         self.set_producer("perchctl")
-        day = date or datetime.date(2000, 1, 1)  # never the clock's
+        day = date or datetime.date(2000, 1, 1)  # never the current time
         self.set_creation_date(datetime.datetime.combine(day, datetime.time(), datetime.UTC))
-        # Portrait pages turn about their long edge, which is the upright one.
+        # Portrait pages are turned about their long edge, which is the vertical one.
         duplex = "DuplexFlipLongEdge" if height >= width else "DuplexFlipShortEdge"
         self.viewer_preferences = ViewerPreferences(
             print_scaling="None", duplex=duplex if pages == 2 else None

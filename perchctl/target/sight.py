@@ -21,7 +21,7 @@ from perchctl.vision import (
 )
 
 ARUCO_MARGIN_PX = 3.0
-"""cv2.aruco drops markers nearer than this to the image's edge."""
+"""cv2.aruco drops markers that are closer than this to the image border."""
 NEAREST_M, FARTHEST_M = 1e-3, 50.0
 _EDGE_POINTS = 200
 
@@ -86,16 +86,16 @@ def outline_points_3d(outline_m: Array, z_m: float) -> Array:
     return np.column_stack([outline_m, np.full(len(outline_m), z_m)])
 
 
-# --- From the ground: where the target is the vehicle's positioning system, it has to be seen ---
+# --- From the ground: a target that is the positioning system must be in view ---
 
 
 SURE_PX = 18.0
 """Side of a marker that the search finds reliably, px: it finds 15 px in all rendered images, and
 a fifth is added."""
 BLURRED = 1.15
-"""Factor on the least side that a plain search reads through a measured blur."""
+"""Factor on the smallest side that a plain search can read despite a measured blur."""
 STRAIGHT_DEG = 2.0
-"""Lean below which it is too small to be reported, deg."""
+"""Tilt below which it is not reported, deg."""
 LEAST_UP = 0.2
 """Least vertical component of the view's direction: a camera that looks farther to the side cannot
 see a target above it."""
@@ -195,7 +195,7 @@ def view_from(
         field.contains((square_corners(side_m) @ turn.T + centre) @ R)
         for side_m in (target.large.side_m, target.small.side_m)
     )
-    # The small marker is judged by its size alone.
+    # For the small marker, only the size is checked.
     readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * height_m
     view = R[:, 2]
     aside = centre - height_m / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
@@ -215,21 +215,21 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
     )
 
 
-# --- Near the target: the range below which a mounting cannot see it ---
-# With the gear under the target's centre, the vehicle level and its heading the target's, as in
-# an ascent: so the outline of the markers is upright in body axes.
+# --- Near the target: the range below which the camera cannot see it ---
+# Assumes an ascent: the gear is under the target's centre, the vehicle is level, and its heading is
+# that of the target, so the outline of the markers is aligned with the body axes.
 
 
 FROM_M = 0.10
-"""Distance from gear to target below which the view is judged, m."""
+"""Distance from gear to target below which the view is checked, m."""
 _STEP_M = 0.0005
 
 
 @dataclass(frozen=True)
 class BlindRange:
     """Ranges from gear tip to target, m, below which the target is no longer measured: `whole_m` by
-    whole markers only, `left_m` by visible parts too. 0: measured down to contact; None: not at all
-    in the last 10 cm."""
+    whole markers only, `left_m` by visible parts too. 0 means that it is measured down to contact,
+    None that it is not measured at all in the last 10 cm."""
 
     whole_m: float | None
     left_m: float | None

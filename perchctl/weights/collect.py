@@ -4,8 +4,8 @@ session's file.
 A session is a CSV file (`perchctl.weights.data`) to which each position is appended in a single
 write. It can be stopped and continued at any time; a crash costs at most the last position.
 
-The actual pose of a position is given by a person or by motion capture. It is what the pipeline
-measures: the target relative to the gear's tip in the level frame, (x, y, z, yaw).
+The actual pose of each position comes from a person or from motion capture. Like the pipeline's
+poses, it is the target relative to the gear's tip in the level frame, (x, y, z, yaw).
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ is taken for an error of the camera."""
 MOST_MISMATCH_RAD = math.radians(10.0)
 """The same difference of the yaw, rad."""
 SAMPLES = 30
-"""Frames of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
+"""Number of motion-capture frames whose median is the actual pose. They must arrive within
+`WITHIN_S`."""
 WITHIN_S = 5.0
 _LEAST_FRAMES = 3
 
@@ -100,7 +101,7 @@ def _vector(pose: MarkerPose | None) -> Array | None:
 
 
 def position_fault(readings: list[MarkerReading]) -> str | None:
-    """Return why a position must be taken again, in one sentence; None if the position is good."""
+    """Return why a position must be measured again, in one sentence; None if it is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames arrived"
@@ -122,7 +123,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
-    """The CSV lines of place number `position`, with the actual pose (4,) in each."""
+    """Return the CSV lines of the place with number `position`, each with the actual pose (4,)."""
     return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
@@ -130,7 +131,7 @@ class SessionFile:
     """The CSV file of a session. Raises InvalidValue for any other file.
 
     Attributes:
-        note: a sentence if an unfinished end was taken off, else empty.
+        note: a sentence if an incomplete end was removed; otherwise empty.
         done: number of complete positions.
         next_position: number of the next position, above all numbers in the file.
     """
@@ -176,8 +177,8 @@ class SessionFile:
             raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
         rows = Counter(positions)
         if torn:
-            # The tail of the position that was being written is lost, so the whole position is
-            # taken again.
+            # A part of the position that was being written is lost, so the whole position must be
+            # measured again.
             if positions and rows[positions[-1]] < frames:
                 del lines[-rows.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
@@ -189,7 +190,7 @@ class SessionFile:
 
 
 ActualPose = tuple[Array, VehicleState | None]
-"""The actual pose (4,), and the attitude of the vehicle, None where it stands level."""
+"""The actual pose (4,), and the vehicle's attitude; None if the vehicle stands level."""
 
 
 class TypedPoses:
@@ -233,7 +234,7 @@ class MocapPoses:
 
     def actual_pose(self, ask: Ask) -> ActualPose:
         """The median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
-        self._capture.poll(self._now())  # an older frame does not count
+        self._capture.poll(self._now())  # older frames are ignored
         frames: list[CaptureFrame] = []
         until_s = self._now() + WITHIN_S
         while len(frames) < SAMPLES:
@@ -311,7 +312,8 @@ class Experiment:
                 self.say(f"position {number} was rejected, take it again: {fault}")
 
     def _try_position(self, number: int, frames: int) -> str | None:
-        """Take one position into the file; return a sentence if it must be taken again."""
+        """Measure one position and add it to the file. Return a sentence if it must be measured
+        again."""
         try:
             actual, attitude = self.truth.actual_pose(self._answer)
         except InvalidValue as error:
@@ -342,7 +344,7 @@ class Experiment:
 
     def _frames(self, count: int) -> Iterator[Frame]:
         if self.source.live:
-            self.source.poll(self.now())  # taken before Enter was pressed
+            self.source.poll(self.now())  # was captured before Enter was pressed
         got = 0
         for _, frame in poll_frames(self.source, self.now, self.wait):
             if frame is None or frame.repeated:

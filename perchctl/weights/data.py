@@ -1,4 +1,5 @@
-"""The data of a fit: a CSV with one row a frame, read and checked, its faults named by line.
+"""The data for a fit: a CSV with one row per frame. It is read and checked, and errors name the
+line.
 
 Columns, in this order where perchctl writes them, by name where it reads them: ``position`` (a
 whole number: the place where the row was taken), ``t_s``, then x, y, z in metres and yaw in
@@ -35,7 +36,7 @@ NEEDED = (
 HEADER = ",".join(NEEDED)
 
 MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
-"""Difference from the truth above which a marker's pose was probably written in other units, m."""
+"""Difference from the ground truth above which a marker's pose is probably in other units, m."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,14 @@
 """Fit the weights to the data for each axis, by the paper's LMS and by the closed-form least
 squares to which it converges, and test whether they help.
 
-With a = large - actual and b = small - actual the merged error of equation 8 is ``w a + (1 - w)
+With a = large - actual and b = small - actual, the merged error of equation 8 is ``w a + (1 - w)
 b``. The constant part of a and b is the markers' bias. No weight can correct it, so it is reported
 separately, and the weights are fitted to the rest. Differences of yaw are wrapped about their mean
 direction.
 
-Frames of one position share its errors, so whole positions are held out in turn to test
-the weights, bias included, as it acts in a flight. Intervals are Student's t over positions
-(for a root mean square by the delta method), 95 %.
+Frames of one position share its errors, so the weights are tested by cross-validation over whole
+positions. The test errors include the bias, as they do in a flight. Intervals are Student's t over
+positions (for a root mean square by the delta method), 95 %.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
         part = error[start:end]
         away = np.abs(part - np.median(part, axis=0))
         spread = _MAD_TO_SIGMA * np.median(away, axis=0)
-        # Where most values are alike (a coarse scale), the mean deviation is still of use.
+        # If most values are equal (coarse resolution), the mean deviation is still useful.
         spread = np.where(spread > 0.0, spread, away.mean(axis=0))
         use[start:end] = away <= OUTLIER_SIGMAS * spread + 1e-12
     return use
@@ -128,9 +128,9 @@ def closed_form_weights(sums: Array) -> Array:
     return np.where(fits, (var_b - cov) / np.where(fits, below, 1.0), np.nan)
 
 
-# --- Widrow and Hoff's LMS, the paper's way ---
-# ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b,
-# ``w <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
+# --- Widrow and Hoff's LMS, as in the paper ---
+# ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b, ``w
+# <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
 # falls as 1 / rows, so that LMS ends at the least-squares weight instead of wandering about it.
 
 
@@ -171,8 +171,8 @@ def _run(start: float, shrink: Array, shift: Array) -> Array:
 
     `shrink`, `shift`: (n, 4). By one sum, because the recursion is linear.
     """
-    product = np.cumprod(shrink[::-1], axis=0)  # of the last 1, 2, ... n factors
-    later = np.vstack([product[-2::-1], np.ones(4)])  # of the factors behind each row
+    product = np.cumprod(shrink[::-1], axis=0)  # product of the last 1, 2, ... n factors
+    later = np.vstack([product[-2::-1], np.ones(4)])  # product of the factors after each row
     return np.asarray(product[-1] * start + (shift * later).sum(axis=0))
 
 
@@ -188,7 +188,7 @@ def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
     return d * d / mean, b * d / mean
 
 
-# --- Both methods, and their errors on positions left out of the fit ---
+# --- Both methods, and their errors on held-out positions ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,8 +259,8 @@ class Evidence:
         return rms, _half_width(influence)
 
     def rms_gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """Return by how much the RMS error of the weights `name` is below that of the mean squares
-        `other` (g, 4), and the half width of the gain's 95 % interval, (4,) each."""
+        """Return how much lower the RMS error of the weights `name` is than that of the mean
+        squares `other` (g, 4), and half the width of its 95 % interval, (4,) each."""
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 

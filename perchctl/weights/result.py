@@ -1,5 +1,5 @@
-"""The fit from a data file: all that it found out, as one value, as a report for a terminal, as one
-JSON record, and as the weights file that a profile names (`merge.weights_file`)."""
+"""The result of a fit from a data file, as a value, a report for a terminal, a JSON record, and the
+weights file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
 

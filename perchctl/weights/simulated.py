@@ -1,4 +1,4 @@
-"""The paper's experiment in the simulator: a camera that stands still at seeded places.
+"""The paper's experiment in the simulator: a stationary camera at seeded positions.
 
 Places lie between z3 and z2 under the target, where both markers are seen whole; heading
 and offset are drawn.
@@ -36,7 +36,7 @@ class CameraPlace:
 
 
 class SimulatedStand:
-    """The simulated camera on its stand. Same seed, same places, same images."""
+    """The simulated camera on a stand. The same seed gives the same positions and images."""
 
     def __init__(self, profile: Profile, camera: CameraModel, positions: int, seed: int) -> None:
         self._profile, self._camera, self._seed = profile, camera, seed
@@ -70,8 +70,8 @@ class SimulatedStand:
             session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
-        """The camera place of a position, counted from 1. Each position has its own part of
-        the range z3 to z2, so even few cover the range. Raises InvalidValue."""
+        """The camera place of a position, counted from 1. Each position has its own section of the
+        range z3 to z2, so that even a few positions cover it. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _SESSION_STREAM, position])
         share = (position - 1) % self._positions
