@@ -1,4 +1,4 @@
-"""perchctl: hang a Crazyflie onto a ceiling by the sight of a printed target.
+"""perchctl: hang a Crazyflie from a ceiling, guided by a camera and a printed target.
 
 The names of `__init__.pyi` are the public ones, for notebooks and scripts; `docs/python.md` shows
 them at work. They are loaded when they are first used, so that the command line starts at once.
@@ -9,7 +9,7 @@ import sys
 from perchctl.startup import NO_WINDOWS, exit_at_ctrl_c, is_command_line
 
 if is_command_line():
-    exit_at_ctrl_c()  # before lazy_loader, which takes a while to load
+    exit_at_ctrl_c()  # before lazy_loader, which takes some time to load
 
 import lazy_loader
 

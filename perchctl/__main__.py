@@ -6,10 +6,10 @@ from perchctl.startup import refuse_windows
 
 
 def main() -> int | str | None:
-    """Run the command line; returns the exit code, or leaves with it."""
+    """Run the command line. Returns the exit code, or exits with it."""
     if sys.platform == "win32":
         return refuse_windows()
-    from perchctl.commands import main as run  # takes a while
+    from perchctl.commands import main as run  # takes some time to load
 
     code: int | str | None = run()
     return code

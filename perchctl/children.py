@@ -1,7 +1,7 @@
-"""Child processes beside the one that flies, and the connection to each.
+"""Child processes of the flying process, and the connection to each.
 
 A pair of sockets carries pickled messages: only the child inherits the other end, so neither side
-unpickles foreign bytes.
+unpickles data from other programs.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
-# -P and the path at the end: an installed package is found as usual, a checkout too,
-# and nothing in the working directory can shadow a module.
+# With -P and the path appended at the end, an installed package and a checkout are both found, and
+# files in the working directory cannot shadow a module.
 _PREFACE = "import sys; sys.path.append(sys.argv[1]); "
 
 
 class SharedTime(ctypes.Structure):
-    """How far simulated time has come (`reached_s`, by the simulator) and may go (`limit_s`, by the
-    flight; infinity lets it run freely), where both processes see it."""
+    """Simulated time in memory shared by both processes: how far it has advanced (`reached_s`, set
+    by the simulator) and how far it may advance (`limit_s`, set by the flight; infinity means no
+    limit)."""
 
     MARGIN_S: ClassVar = 0.02
-    """Simulated time may run so far past the moment that the flight loop waits for."""
+    """How far simulated time may advance beyond the time for which the flight loop waits, s."""
 
     reached_s: float
     limit_s: float
@@ -41,18 +42,19 @@ class Channel(Connection):
     EOFError when the other end is gone."""
 
     def receive(self, timeout_s: float | None = None) -> Any:
-        """The next message. Raises TimeoutError after `timeout_s` without one, EOFError when
-        the other end is gone."""
+        """Return the next message. Raises TimeoutError if none arrives within `timeout_s`, and
+        EOFError if the other end is gone."""
         if not self.poll(timeout_s):
             raise TimeoutError("no message came")
         return self.recv()
 
 
 def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], Channel]:
-    """Run `code` in a new Python process that can import perchctl and is safe from the terminal's
-    Ctrl-C. `output` takes what it prints: a file, or subprocess.PIPE.
+    """Run `code` in a new Python process that can import perchctl and does not receive the
+    terminal's Ctrl-C. `output` receives what it prints: a file, or subprocess.PIPE.
 
-    Returns the process and the connection to it; its first message, None, says that it is up.
+    Returns the process and the connection to it. The first message, None, means that the process is
+    running.
     """
     root = str(Path(__file__).resolve().parents[1])
     own, its = socket.socketpair()
@@ -70,15 +72,16 @@ def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], 
 
 
 def connect_to_parent() -> Channel:
-    """Return a `spawn`ed child's connection to its parent, and tell the parent it is up."""
+    """Return the connection of a `spawn`ed child to its parent, and tell the parent that the child
+    is running."""
     channel = Channel(int(sys.argv[2]))
     channel.send(None)
     return channel
 
 
 def end_with_parent(on_exit: Callable[[], object] = lambda: None) -> None:
-    """End this process of `multiprocessing` as soon as its parent is gone, killed or not, since
-    nobody waits for its work; `on_exit` is called first."""
+    """End this `multiprocessing` process as soon as its parent has ended or was killed, because its
+    results are no longer needed. `on_exit` is called first."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -101,7 +104,8 @@ def wait_or_kill(child: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 
 def last_line(output: IO[bytes]) -> str:
-    """A child's last line of output, after a colon, for a message; empty without output."""
+    """Return a child's last line of output for a message, with a colon in front; empty if there was
+    no output."""
     if output.closed:
         return ""
     output.seek(0)

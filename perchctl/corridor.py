@@ -1,8 +1,8 @@
 """The corridor of one vehicle, and exact distances between corridors.
 
 A vehicle flies in three parts: a column over the place where it takes off, a column under its
-target, and the way between them. Seen from above they are one shape, all points within a radius of
-the straight line from home to target:
+target, and the way between them. Seen from above, they form one shape: all points within a radius
+of the straight line from home to target:
 
            .-----------------------------.
           /                               \\
@@ -10,8 +10,9 @@ the straight line from home to target:
           \\                               /
            '-----------------------------'
 
-Two vehicles must not share a place in this view, whatever their heights: the air below a hovering
-vehicle pushes another one down from 2 m above. So all distances here are level.
+The corridors of two vehicles must not overlap in this view, regardless of height, because the
+downwash of a hovering vehicle pushes down another one even 2 m below. All distances in this module
+are therefore horizontal.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ class Corridor:
     """The space that one flight may use.
 
     Attributes:
-        home_m: the place of take-off.
-        target_m: the place under the target.
-        radius_m: level distance from the line between them. Larger, and fewer vehicles fit into a
-            room; smaller, and a draught carries the vehicle out of it.
-        way_top_m: height above the ground up to which all of it may be used.
+        home_m: the take-off position.
+        target_m: the position below the target.
+        radius_m: horizontal distance from the line between them. Larger: fewer vehicles fit into a
+            room. Smaller: a draught may carry the vehicle out of the corridor.
+        way_top_m: height above the ground up to which the whole corridor may be used.
         target_top_m: height up to which the column under the target may be used.
     """
 
@@ -43,8 +44,9 @@ class Corridor:
     target_top_m: float
 
     def contains(self, x_m: float, y_m: float, z_m: float) -> bool:
-        """True for a place in the corridor, its surface included; `z_m`: above the ground. False if
-        one of the numbers is not a number. It has no floor, since a landing aims below it."""
+        """True for a point in the corridor or on its surface; `z_m` is the height above the ground.
+        False if a coordinate is NaN. The corridor has no lower limit, because a landing aims below
+        the floor."""
         place = x_m, y_m
         if not point_distance_m(place, self.home_m, self.target_m) <= self.radius_m:
             return False
@@ -52,12 +54,12 @@ class Corridor:
         return z_m <= (self.target_top_m if under_target else self.way_top_m)
 
     def distance_m(self, other: Corridor) -> float:
-        """Level distance between the edges of two corridors; negative where they overlap."""
+        """Horizontal distance between the edges of two corridors; negative if they overlap."""
         axes_m = segment_distance_m(self.home_m, self.target_m, other.home_m, other.target_m)
         return axes_m - (self.radius_m + other.radius_m)
 
     def distance_to_m(self, place_m: Point) -> float:
-        """Level distance of a place from the corridor's edge; negative inside."""
+        """Horizontal distance of a point from the edge of the corridor; negative inside."""
         return point_distance_m(place_m, self.home_m, self.target_m) - self.radius_m
 
 
@@ -67,7 +69,7 @@ def point_distance_m(point: Point, start: Point, end: Point) -> float:
     dx, dy = bx - ax, by - ay
     length2 = dx * dx + dy * dy
     share = ((px - ax) * dx + (py - ay) * dy) / length2 if length2 > 0.0 else 0.0
-    # The ends by themselves, as a + (b - a) is not always b.
+    # The end points are handled separately, because a + (b - a) is not always b.
     inside = math.hypot(px - ax - share * dx, py - ay - share * dy) if 0.0 < share < 1.0 else None
     ends = min(math.dist(point, start), math.dist(point, end))
     return ends if inside is None else min(inside, ends)

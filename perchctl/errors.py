@@ -1,8 +1,7 @@
-"""Every failure perchctl reports, as one exception tree.
+"""Every failure that perchctl reports, as one exception hierarchy.
 
-Each class carries the exit code of the process; `EXIT_CODES` is the table that
-`fly --help` and the README print. A message says what was found, what is
-allowed and what to do, in one sentence.
+Each class carries the exit code of the process; `EXIT_CODES` is the table that `fly --help` and the
+README print. Each message says in one sentence what was found, what is allowed and what to do.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ MOST_DECIMALS = 9
 
 
 def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]:
-    """Return `found` and `limit` as texts for a message: with `decimals`, or as many as the limit
-    has, and with more if both texts would be the same."""
+    """Return `found` and `limit` as texts for a message: with `decimals`, or as many decimals as
+    the limit has; with more if both texts would be the same."""
     own = -int(Decimal(f"{limit:g}").as_tuple().exponent)
     for count in range(min(max(decimals, own), MOST_DECIMALS), MOST_DECIMALS + 1):
         texts = f"{found:.{count}f}", f"{limit:.{count}f}"
@@ -61,17 +60,17 @@ def _install(extra: str) -> str:
 
 
 def no_simulator(missing: str | None = "mujoco") -> UsageError:
-    """The error for a missing extra ``sim``, of which `missing` is a part."""
+    """The error if the extra ``sim``, which contains `missing`, is not installed."""
     return UsageError(f"the simulator is not installed ({missing} is missing); {_install('sim')}")
 
 
 def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
-    """The error for a missing extra ``mocap``."""
+    """The error if the extra ``mocap`` is not installed."""
     return UsageError(f"{needed_by} needs the motioncapture library; {_install('mocap')}")
 
 
 def broken_motion_capture(why: str) -> UsageError:
-    """The error for an extra ``mocap`` that is installed, and cannot be loaded."""
+    """The error if the extra ``mocap`` is installed but cannot be loaded."""
     return UsageError(
         f"the motioncapture library cannot be loaded: {why}; reinstall it with: "
         f"{sys.executable} -m pip install --force-reinstall 'perchctl[mocap]'"
@@ -87,7 +86,7 @@ def unfit_cflib(part: str, version: str) -> UsageError:
 
 
 def no_cluster(why: str = "it is missing") -> UsageError:
-    """The error for an extra ``cluster`` that is missing, or cannot be loaded."""
+    """The error if the extra ``cluster`` is not installed or cannot be loaded."""
     return UsageError(f"--cluster needs the distributed library ({why}); {_install('cluster')}")
 
 
@@ -147,7 +146,7 @@ class Interrupted(PerchError):
 
 
 def require_type(name: str, value: object, *kinds: type) -> None:
-    """Raise InvalidValue, which names the argument, unless the value is of one of these types."""
+    """Raise InvalidValue, which names the argument, unless the value has one of these types."""
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         allowed = " or ".join(kind.__name__ for kind in kinds)
         raise InvalidValue(f"{name} must be {allowed}, found {type(value).__name__}: {value!r:.80}")
@@ -158,7 +157,7 @@ class Note(UserWarning):
 
 
 class ProfileNote(Note):
-    """Says that a profile was read, but one of its keys has another name by now, or is not used."""
+    """Says that a profile was read, but one of its keys has been renamed or is not used."""
 
 
 _ALL: list[type[PerchError]] = [PerchError, *PerchError.__subclasses__()]

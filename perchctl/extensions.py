@@ -1,4 +1,5 @@
-"""Your own code that a profile names, as ``my_module:MyCamera``: found, made and checked."""
+"""Your own code, named in a profile as ``my_module:MyCamera``: find it, create its object and check
+it."""
 
 from __future__ import annotations
 
@@ -22,13 +23,14 @@ _PACKAGE = Path(__file__).parent
 
 def has_extension_form(text: str, schemes: Collection[str]) -> bool:
     """True for ``my_module:MyCamera``, unless the word before the colon is one of perchctl's own
-    `schemes`, in either case: ``camera:HDMI`` is a camera, whatever ``camera.py`` lies about."""
+    `schemes` in upper or lower case: ``camera:HDMI`` is a camera even if a file ``camera.py``
+    exists."""
     word = text.partition(":")[0].lower()
     return word not in schemes and re.match(PATTERN, text) is not None
 
 
 def is_extension(text: str) -> bool:
-    """True for ``my_module:MyCamera`` whose module is there; nothing is loaded."""
+    """True for ``my_module:MyCamera`` if the module exists. Does not load it."""
     if re.match(PATTERN, text) is None:
         return False
     package = re.split("[.:]", text)[0]
@@ -37,8 +39,8 @@ def is_extension(text: str) -> bool:
 
 
 def load_extension(text: str, key: str) -> Any:
-    """The class, function or value that ``my_module:name`` of a profile's `key` names. Modules are
-    searched among the installed ones, then in the current folder.
+    """Return the class, function or value named ``my_module:name`` by a profile's `key`. Modules
+    are searched for among the installed ones, then in the current folder.
 
     Raises:
         NotFound: no such module, or no such name in it. InvalidValue: its import raised.
@@ -65,7 +67,7 @@ def load_extension(text: str, key: str) -> Any:
 def make_extension(
     text: str, key: str, protocol: type, clock: Callable[[], float], config: object
 ) -> Any:
-    """A new object of the class that ``my_module:MyCamera`` names.
+    """Return a new object of the class named ``my_module:MyCamera``.
 
     Raises:
         NotFound: as `load_extension`. InvalidValue: as `load_extension`; the class raised; or the
@@ -87,7 +89,8 @@ def make_extension(
 
 
 def error_at(error: BaseException) -> str:
-    """Class and text of an error, and the last line outside perchctl that it passed."""
+    """Return the class and text of an error, and the last line of the traceback outside
+    perchctl."""
     frames = traceback.extract_tb(error.__traceback__)
     yours = [frame for frame in frames if _PACKAGE not in Path(frame.filename).parents]
     place = f" ({Path(yours[-1].filename).name}, line {yours[-1].lineno})" if yours else ""
@@ -95,7 +98,7 @@ def error_at(error: BaseException) -> str:
 
 
 def _search_here() -> None:
-    """Search the current folder for modules, too, but last, so that no library is replaced."""
+    """Also search for modules in the current folder, but last, so that no library is shadowed."""
     here = str(Path.cwd())
     if here not in sys.path and "" not in sys.path:
         sys.path.append(here)

@@ -1,10 +1,10 @@
-"""Writes whole files, and recognises a file by its content.
+"""Write files atomically, and recognise files by their content.
 
-A file is written under a temporary name beside its place, brought to the disk, and renamed:
-a reader finds the old file or the new one, never a part of one.
+A file is written under a temporary name next to its destination, synced to disk and renamed, so
+that a reader finds either the old file or the new one, never a part of it.
 
-One rule for what a command writes: an existing file is replaced with ``--force`` only, which is
-asked before any long work; folders that are missing are made.
+One rule applies to all output of commands: an existing file is only replaced with ``--force``,
+which is checked before any long work, and missing folders are created.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def check_output(
     makes_folder: bool = False,
 ) -> None:
     """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or if
-    `check_writable` does. `content` is what the message calls such a file, as in: a plot."""
+    `check_writable` does. `content` is the name of such a file in the message, for example "a
+    plot"."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(
             f"the name of {content} must end in {' or '.join(suffixes)}, found {path}"
@@ -86,14 +87,14 @@ def check_writable(path: Path, force: bool, *, makes_folder: bool = True) -> Non
 
     Args:
         force: an existing file may be replaced.
-        makes_folder: the folder of the file may be made; False for a path that a person typed, in
-            which a new folder is more often a typing error.
+        makes_folder: the folder of the file may be made; False for a path typed by a person, in
+            which a missing folder is usually a typing error.
 
     Raises:
         InvalidValue: the path is a folder, a file that must not be replaced, or a place where
         no file or folder can be made.
     """
-    # Of os.path, which takes a folder without rights for one that holds nothing.
+    # Uses os.path, which treats a folder without permissions as empty.
     if os.path.isdir(path):
         raise InvalidValue(f"{path} is a folder: name a file in it")
     if os.path.exists(path) and not force:
@@ -120,7 +121,8 @@ def same_file(path: Path, other: Path) -> bool:
 def write_error(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """The operating system's refusal as an error of one sentence, which ends with `more`."""
+    """Return the operating system's refusal as an error with one sentence, which ends with
+    `more`."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
 
@@ -128,12 +130,13 @@ def write_error(
 def atomic_write(path: Path, mode: int | None = None) -> Iterator[Path]:
     """Yield a temporary path for the block to write a file to.
 
-    As the block ends, the file is brought to the disk and gets its place; after an error nothing is
-    left.
+    When the block ends, the file is synced to disk and moved to its destination; after an error, no
+    file is left.
 
-    The temporary path has the suffix of `path`, by which some libraries choose the format; its
-    folder is made. A file that is replaced keeps its permissions; a new one gets `mode`, by
-    default the system's. Raises InvalidValue if the system refuses one of these steps.
+    The temporary path has the suffix of `path`, because some libraries choose the format by the
+    suffix. The folder is created if necessary. A file that is replaced keeps its permissions; a new
+    one gets `mode`, by default the system's. Raises InvalidValue if the system refuses one of these
+    steps.
     """
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     made = [folder for folder in path.parents if not folder.exists()]
@@ -146,12 +149,12 @@ def atomic_write(path: Path, mode: int | None = None) -> Iterator[Path]:
             with part.open("r+b") as stream:
                 os.fsync(stream.fileno())
             if mode is not None:
-                with suppress(OSError):  # some file systems have none to set
+                with suppress(OSError):  # some file systems have no permissions
                     part.chmod(mode)
             os.replace(part, path)
     except BaseException:
         part.unlink(missing_ok=True)
-        with suppress(OSError):  # something else was put into one
+        with suppress(OSError):  # another file was put into the folder meanwhile
             for folder in made:
                 folder.rmdir()
         raise
@@ -183,7 +186,7 @@ def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
         check_writable(path, force=True)
     with ExitStack() as stack:
         for path, data in files.items():
-            # Until it is whole, nobody else reads what may not be for them.
+            # While the file is incomplete, other users must not read it.
             at_first = 0o666 if mode is None and not path.exists() else 0o600
             part = stack.enter_context(atomic_write(path, mode))
             opener = partial(os.open, mode=at_first)

@@ -1,4 +1,4 @@
-"""Frames and rotations: the conventions that every other module cites.
+"""Frames and rotations: the conventions used in every other module.
 
 Conventions (`docs/conventions.md` has them all):
 
@@ -32,7 +32,8 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def is_finite(values: Array) -> bool:
-    """True if all values are finite (and none so great that their squares' sum is not)."""
+    """True if all values are finite and small enough that the sum of their squares is finite,
+    too."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))
 
@@ -92,8 +93,8 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
     """The unit quaternion (w, x, y, z) with w >= 0: the inverse of
     `rotation_from_quaternion`.
 
-    Each row of the products is the quaternion times four times one of its parts; the longest is
-    the most exact.
+    Each row of the products is the quaternion multiplied by four times one of its components. The
+    longest row is the most accurate one.
     """
     d0, d1, d2 = R[0, 0], R[1, 1], R[2, 2]
     a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -155,8 +156,8 @@ def invert_T(T_a_b: Array) -> Array:
 def circular_mean(weights: Array, angles_rad: Array) -> float:
     """The weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
 
-    Linear in the difference from the first angle, so that it equals the plain
-    weighted sum wherever no wrap is crossed (the paper's equation 8).
+    Linear in the difference from the first angle, so that it equals the plain weighted sum if no
+    angle wraps around (equation 8 of the paper).
     """
     ref = float(angles_rad[0])
     deltas = [wrap_rad(float(a) - ref) for a in angles_rad]

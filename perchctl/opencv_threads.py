@@ -1,4 +1,4 @@
-"""How many threads OpenCV works with."""
+"""The number of threads that OpenCV uses."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import cv2
 
 _LOCK = threading.Lock()
-_users = 0  # of `one_thread` at this moment
-_threads = 0  # that OpenCV had before the first of them
+_users = 0  # number of current users of `one_thread`
+_threads = 0  # number of OpenCV's threads before the first of them
 
 
 @contextlib.contextmanager

@@ -34,7 +34,7 @@ def file_names(kind: str) -> list[str]:
 
 
 def is_shipped_example(path: Path) -> bool:
-    """True if a calibration has the content of a shipped example, also under another name."""
+    """True if a calibration has the same content as a shipped example, even under another name."""
     try:
         text = path.read_bytes()
         return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
@@ -43,9 +43,10 @@ def is_shipped_example(path: Path) -> bool:
 
 
 def user_folder(kind: Literal["config", "cache", "state", "runtime"]) -> Path:
-    """The user's folder by the XDG rules, which is not made: `config` for profiles and
-    calibrations, `cache` for what can be made anew, `state` for results, `runtime` for locks."""
+    """Return a user folder according to the XDG specification, without creating it: `config` for
+    profiles and calibrations, `cache` for data that can be recreated, `state` for results,
+    `runtime` for locks."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where the system names none, another is taken
+        warnings.simplefilter("ignore")  # if the system defines none, another folder is used
         find = getattr(platformdirs, f"user_{kind}_dir")
         return Path(find("perchctl", appauthor=False))

@@ -1,5 +1,5 @@
-"""YAML as perchctl reads it: plain values, and a key given twice is refused (PyYAML would keep the
-last one silently)."""
+"""Read YAML as plain values. Duplicate keys are refused (PyYAML would silently keep the last
+one)."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that the text holds; None for an empty text.
+    """Return the value in the text; None for an empty text.
 
-    Raises ValueError, with a sentence, for what is not YAML or holds a key twice.
+    Raises ValueError with a sentence if the text is not YAML or contains a duplicate key.
     """
     with _errors_in_one_sentence():
         return yaml.load(text, _Loader)
 
 
 def parse_documents(text: str) -> list[Any]:
-    """The values of all documents in the text, which lines of ``---`` separate; empty ones are left
-    out. Raises ValueError as `parse_yaml` does."""
+    """Return the values of all documents in the text, which are separated by ``---``. Empty
+    documents are left out. Raises ValueError as `parse_yaml` does."""
     with _errors_in_one_sentence():
         return [value for value in yaml.load_all(text, _Loader) if value is not None]
 
@@ -80,7 +80,7 @@ def _errors_in_one_sentence() -> Iterator[None]:
 
 
 def split_values(text: str) -> list[str]:
-    """The texts of the values between commas, as in a list; a value may itself be a list.
+    """Split a comma-separated list into the texts of its values. A value may itself be a list.
     Raises ValueError as `parse_yaml` does."""
     row = f"[{text}]"
     parse_yaml(row)
@@ -90,5 +90,5 @@ def split_values(text: str) -> list[str]:
 
 
 def clip_text(text: str, max_length: int = _MOST_SHOWN) -> str:
-    """The text, cut to `max_length` characters, then ending in ``...``."""
+    """Return the text, truncated to `max_length` characters and then ending in ``...``."""
     return text if len(text) <= max_length else f"{text[: max_length - 3]}..."

@@ -1,6 +1,6 @@
-"""What all of perchctl's plots share: palette, resolution, figure and file.
+"""Common parts of all plots: palette, resolution, figure and file.
 
-Figures are drawn without pyplot, so nothing is kept open and no display is asked for.
+Figures are drawn without pyplot, so that no figure stays open and no display is needed.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from matplotlib.figure import Figure
 
 from perchctl.files import check_output, write_files
 
-# Okabe and Ito's palette: told apart with any colour vision.
+# Okabe and Ito's palette, which can be distinguished with any colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 GRID = "#D8D8D8"
 DPI = 110
-_METADATA: dict[str, dict[str, None]] = {  # without what changes from run to run
+_METADATA: dict[str, dict[str, None]] = {  # without metadata that changes from run to run
     ".png": {"Software": None},
     ".pdf": {"CreationDate": None},
     ".svg": {"Date": None},
 }
 FORMATS = tuple(_METADATA)
-"""What a plot's name may end in."""
+"""Permitted suffixes of a plot's file name."""
 
 
 def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
@@ -36,8 +36,8 @@ def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write the figure in the format that the name ends in (`FORMATS`), the same bytes for the
-    same figure; the file is there whole or not at all. Raises InvalidValue."""
+    """Write the figure atomically in the format given by the file name's suffix (`FORMATS`). The
+    same figure gives the same bytes. Raises InvalidValue."""
     check_output(path, FORMATS, force=True, content="a plot", makes_folder=True)
     write_files({path: figure_bytes(figure, path.suffix.lower())})
 
@@ -46,7 +46,7 @@ def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
     """The figure in one of `FORMATS`, the same bytes for the same figure."""
     content = BytesIO()
     with rc_context({"svg.hashsalt": "perchctl"}):
-        # The layout's solver differs in its last bits from one call to the next.
+        # The layout solver's last bits differ from call to call.
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         for ax in figure.axes:

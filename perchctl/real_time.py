@@ -1,4 +1,4 @@
-"""One flight in real time from Python, with the command's safety."""
+"""Fly in real time from Python, with the same safety as the command."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from perchctl.record import LogWatcher
 
 @dataclass(frozen=True)
 class Flight:
-    """A finished flight in real time: how it ended, its log for `read_log`, and of a simulated
-    vehicle that perched the gear's distance from the target's centre, m."""
+    """A finished flight in real time: how it ended, its log for `read_log` and, if a simulated
+    vehicle perched, the distance of the gear from the target's centre, m."""
 
     report: FlightReport
     log: Path
@@ -59,11 +59,12 @@ def fly(
         uri, source: vehicle and camera, instead of the profile's. A script that flies ``sim://``
             needs ``if __name__ == "__main__":``, for the simulator's process.
         on_tick: called 50 times a second with a `Tick`: telemetry, target, planner's state and
-            command; it must return within milliseconds. If it raises, it is not called any more,
-            the flight goes on, and a warning follows.
-        on_event: called with each new phase and each note. An error in it is treated alike.
+            command; it must return within milliseconds. If it raises, it is not called again, the
+            flight continues, and a warning is issued.
+        on_event: called with each new phase and each note. An error in it is treated in the same
+            way.
         should_stop: called in each tick; once it returns True or raises, the vehicle lands.
-        rows: your own transitions, besides those of the profile; a replay does not know them.
+        rows: your own transitions, in addition to those of the profile. A replay does not use them.
         seed: of the simulated scenario.
         log_dir: folder of the log, instead of the profile's.
         record: keep the images beside the log; by default only of real vehicles.
@@ -136,9 +137,9 @@ class _OnEvent(Watcher):
 
 
 class _Stopper:
-    """Asks whether to stop, and orders the landing: in the loop's own thread, since the watchdog's
-    must not hang in it. What raises instead of answering is not asked again: it may have meant
-    yes."""
+    """Calls `should_stop` and commands the landing. Runs in the loop's own thread, because the
+    watchdog's thread must not hang in user code. If the function raises, it is not called again,
+    because it may have meant yes."""
 
     def __init__(self, should_stop: Callable[[], bool], switch: OperatorSwitch) -> None:
         self._should_stop, self._switch = should_stop, switch

@@ -1,4 +1,4 @@
-"""What all of perchctl's reports share: one HTML file that runs no script and loads nothing."""
+"""Common parts of all reports: a single HTML file that runs no scripts and loads nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from markupsafe import Markup
 import perchctl
 
 POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
-"""No script, nothing from elsewhere: the browser holds the page to it."""
+"""Content security policy, enforced by the browser: no scripts, and nothing from other servers."""
 
 
 def render_template(package: str, name: str, **values: Any) -> Markup:

@@ -1,4 +1,4 @@
-"""The target's pose in each image of any source, without a vehicle."""
+"""Measure the target's pose in each image of any source, without a vehicle."""
 
 from __future__ import annotations
 
@@ -47,15 +47,16 @@ from perchctl.vision import (
 )
 
 TRACK_POLL_S = 0.002
-"""Time between two looks for a new frame. Larger: each frame is read so much later."""
+"""Polling period for new frames, s. Larger: frames are read later."""
 FRAME_TIMEOUT_S = 2.0
-"""A live source without a frame for longer is lost. Smaller: a short pause ends the tracking."""
+"""Time without a frame after which a live source counts as lost, s. Smaller: a short pause ends the
+tracking."""
 INTERLACED = "interlaced: each field of a frame is measured separately"
 _NO_POSE = "no pose fits the marker's corners"
 _DISAGREE = "the two markers contradict each other: check the printed sizes and the calibration"
 AttitudeAt = Callable[[float], VehicleState | None]
 Named = tuple[Frame, str | None]
-"""A frame, and its file's name if it has one."""
+"""A frame, and its file name if it has one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +227,7 @@ class Tracker:
 
     def process(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput | None, list[str]]]:
         """Yield the frame, or both fields of an interlaced one, with the pipeline's output and
-        notes. A live image that stands still or is noise has no output, a repeated one is left
-        out."""
+        notes. A live image that is frozen or noise has no output. A repeated image is left out."""
         kind = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and kind == "repeated":
             return

@@ -1,13 +1,13 @@
 """Answers Ctrl-C during loading with one sentence and an exit code, without a traceback.
 
-A KeyboardInterrupt would come up in the middle of some library's import, which prints it as
-ignored, or makes another error of it. Nothing is open yet: the process ends where it is. This
-module itself loads as little as can be: until then Ctrl-C is Python's.
+A KeyboardInterrupt would occur in the middle of a library's import, which prints it as ignored or
+turns it into another error. Nothing is open yet, so the process simply exits. This module imports
+as little as possible, because Python's own Ctrl-C handling applies until it is loaded.
 """
 
 from __future__ import annotations
 
-# The half of `signal` that is in the interpreter already; its other half are enumerations.
+# The part of `signal` that is built into the interpreter; the other part only adds enumerations.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
@@ -18,7 +18,7 @@ NO_WINDOWS = (
     "Windows is not supported: install perchctl in WSL2 (wsl --install), and attach the radio and "
     "the camera to it with usbipd-win"
 )
-"""perchctl needs the terminals, signals and locks of POSIX, and cameras by Linux."""
+"""perchctl needs POSIX terminals, signals and locks, and Linux for cameras."""
 
 
 def is_command_line() -> bool:

@@ -1,4 +1,4 @@
-"""Types that planner, link, simulator and log share: telemetry and commands."""
+"""Types shared by planner, link, simulator and log: telemetry and commands."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ HL_ACTIVE, HL_FINISHED, HL_DISABLED, DECK_FAULT = (1 << i for i in range(8, 12))
 LOW_POWER = 3  # pm.state
 FULL_THRUST = 65535
 NO_BATTERY_READING_V = 1.0
-"""Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
+"""Voltage below which a reading means that nothing was measured: the battery is unknown, not empty
+(fault 7)."""
 MOST_CELL_V = 4.4
-"""No single cell has more: a full one of the high-voltage kind rests at 4.35 V, and readings err by
-1 %. With more there is no take-off, and in flight it is no reading."""
+"""Largest possible voltage of a single cell: a full high-voltage cell rests at 4.35 V, and readings
+have an error of 1 %. A higher reading prevents take-off, and is ignored in flight."""
 
 MOST_DUTY = 65535
 """Full duty cycle of a motor: the firmware counts in steps of 1 / 65535."""
@@ -27,7 +28,7 @@ DISARM_IT = (
     "keep away from its propellers, end the program that armed it, or wait 30 s until it disarms "
     "itself"
 )
-"""What to do about a vehicle that somebody else has armed."""
+"""Advice for a vehicle that another program has armed."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,17 @@ class Telemetry:
     `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
     `behind_s`: by how much position and velocity, which come by a packet of their own, are older
     than `t_s`; `battery_behind_s` and `variance_behind_s` say the same of battery and variances,
-    and are infinite before their first packet. `start`: how often the vehicle has started anew
-    since it was first heard.
+    and are infinite before their first packet. `start`: how often the vehicle has restarted since
+    it was first heard.
 
-    The variances are those that the vehicle's estimator itself claims; None if it reports none.
-    With a deck that only measures the speed over ground, as a Flow deck does, nothing measures the
+    The variances are those reported by the vehicle's estimator; None if it reports none. With a
+    deck that only measures the speed over ground, as a Flow deck does, nothing measures the
     horizontal position, and `position_variance_m2` stays at 100 m^2 (docs/firmware.md,
-    "Variances"): of the position only `height_variance_m2` says anything there.
+    "Variances"); only `height_variance_m2` is meaningful then.
 
     `motor_duty` is the duty cycle of M1 (front right), M2 (back right), M3 (back left) and M4
     (front left), 0..65535, as old as the battery; None if the vehicle does not report it. No
-    decision of a flight uses it.
+    decision in a flight depends on it.
     """
 
     t_s: float
@@ -83,7 +84,7 @@ class Telemetry:
 
 
 FRESH_S = 0.3
-"""Telemetry that is older says nothing of the motors."""
+"""Age above which telemetry no longer shows whether the motors run, s."""
 
 
 def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
@@ -92,7 +93,8 @@ def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def has_fresh_position(newest: Telemetry | None, now_s: float) -> bool:
-    """True if telemetry is fresh with position and velocity, which come by their own packet."""
+    """True if telemetry is fresh, including position and velocity, which arrive in a separate
+    packet."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False
     return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
@@ -105,14 +107,14 @@ def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def is_disarmed(newest: Telemetry) -> bool:
-    """True if the vehicle waits for an arming request: it does not arm itself, its motors stand
-    still, and nothing else keeps it from flying (docs/firmware.md, "Arming")."""
+    """True if the vehicle waits for an arming request: it does not arm itself, its motors are off,
+    and nothing else prevents flight (docs/firmware.md, "Arming")."""
     return newest.has_bit(CAN_ARM) and not newest.has_bit(ARMED | AUTO_ARM)
 
 
 def is_armed_by_request(supervisor: int) -> bool:
-    """True if by the supervisor's bits a vehicle that does not arm itself is armed: its propellers
-    turn, on the ground, too."""
+    """True if a vehicle that does not arm itself is armed according to the supervisor's bits. Its
+    propellers then turn even on the ground."""
     return bool(supervisor & ARMED) and not supervisor & AUTO_ARM
 
 
@@ -127,8 +129,8 @@ def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
 class ExternalPosition:
     """The vehicle's position as measured from outside, for its estimator; not a command.
 
-    `position_m` is in the world of the state estimate. `quaternion` (w, x, y, z) turns body axes
-    to world axes; None where only the position is known.
+    `position_m` is in the world of the state estimate. `quaternion` (w, x, y, z) rotates body axes
+    to world axes; None if only the position is known.
     """
 
     position_m: tuple[float, float, float]
@@ -136,12 +138,13 @@ class ExternalPosition:
 
 
 SendPosition = Callable[[ExternalPosition], object]
-"""Sends one to the vehicle's estimator; returns False where it did not go out."""
+"""Sends an external position to the vehicle's estimator; returns False if it was not sent."""
 
 FLOW_DECKS = ("bcFlow2", "bcFlow")
-"""Those that measure the speed over ground and the height, by the firmware's `deck` parameters."""
+"""Decks that measure the speed over ground and the height, by the names of the firmware's `deck`
+parameters."""
 ABSOLUTE_DECKS = ("bcLighthouse4", "bcLoco", "bcDWM1000")
-"""Those that measure the position."""
+"""Decks that measure the position."""
 POSITION_DECKS = (*FLOW_DECKS, *ABSOLUTE_DECKS)
 
 
@@ -187,7 +190,8 @@ class Land:
 
 @dataclass(frozen=True)
 class EmergencyStop:
-    """Cut the motors now and lock: the operator's order, or a useless attitude."""
+    """Cut the motors now and lock the vehicle: on the operator's command, or if the attitude is
+    unusable."""
 
 
 @dataclass(frozen=True)

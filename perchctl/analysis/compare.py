@@ -35,7 +35,7 @@ class FlightComparison:
 
     @cached_property
     def changed_keys(self) -> dict[str, tuple[Any, Any]]:
-        """Dotted profile keys that differ, each with the values of A and B."""
+        """Dotted profile keys that differ, each with its values in A and B."""
         a, b = (flight.log.header.get("profile") for flight in self.flights)
         return profile_differences(a, b)
 

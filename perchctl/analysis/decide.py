@@ -22,7 +22,7 @@ from perchctl.record import FlightLog, log_names, to_exact_json
 from perchctl.vehicle import Command
 
 FieldDifference = tuple[str, Any, Any]
-"""The whole name of a field, and its recorded and replayed value in their exact form."""
+"""The full name of a field, and its recorded and replayed values in exact form."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class ReplayedDecision:
 
     Attributes:
         tick: number of flown turns before this turn.
-        difference: first field that differs from the log, or None.
+        difference: first field that differs from the log; None if there is none.
         error: class name of the exception that the planner raised, or None.
     """
 
@@ -77,7 +77,7 @@ def replay_decisions(
 
     `observation_of` returns a turn's observation (default: as recorded), or None to skip the turn.
     Only flown turns advance the planner's state. The replay ends with the first turn on which the
-    planner raises, as a flight does. `comparison` is to the bit by default.
+    planner raises, as a flight does. By default, `comparison` is bit for bit.
     """
     comparison = comparison or Comparison()
     state: PlannerState | None = None
@@ -129,13 +129,13 @@ def _difference(
 
 @dataclass(frozen=True)
 class Comparison:
-    """How recorded and replayed values are compared: by default to the bit, where 0.0 is not -0.0
-    and NaN is NaN.
+    """How recorded and replayed values are compared: by default bit for bit, so that 0.0 differs
+    from -0.0, and NaN equals NaN.
 
     Attributes:
         unknown: fields that are not compared, each as the names of its dataclass and of itself.
-        tolerances: by the name of a field, by how much its numbers may differ, in the field's own
-            unit; the empty name stands for all other fields.
+        tolerances: permitted difference of a field's numbers, in the field's unit, by the field's
+            name; the empty name stands for all other fields.
 
     All names are those in the log.
     """
@@ -179,7 +179,7 @@ class Comparison:
 
     def _tolerance(self, name: str) -> float:
         last = name.rpartition(".")[2].partition("[")[0]
-        to_the_bit = -1.0  # not even 0.0 and -0.0 are near
+        to_the_bit = -1.0  # 0.0 and -0.0 are not considered close either
         return self.tolerances.get(last, self.tolerances.get("", to_the_bit))
 
 

@@ -27,7 +27,8 @@ ARM_M = 0.046
 BESIDE_M, ABOVE_M = 0.25, 0.12
 """Margins of the side view beside and above the flight, m."""
 LEAST_ASIDE_M = 0.05
-"""Horizontal distance from the target below which the start gives the view no direction, m."""
+"""Horizontal distance of the start from the target below which it does not define the direction of
+the view, m."""
 LAST_PICTURE_S = 2.0
 """Time for which the last image stays, s."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
@@ -104,7 +105,7 @@ class ShownPicture:
         return self._coming is not None
 
     def advance(self, index: int) -> None:
-        """Go to the tick with this index, which never becomes smaller."""
+        """Advance to the tick with this index, which must not decrease."""
         record = self._flight.log.records[index]
         if record.get("frame") is not None:
             self.record = record
@@ -113,7 +114,7 @@ class ShownPicture:
 
 
 class CameraView:
-    """An image with the markers' outlines, in axes of its own; `add` takes each moving artist."""
+    """Axes with an image and the markers' outlines. `add` registers each moving artist."""
 
     def __init__(self, ax: Axes, flight: FlightAnalysis, add: Callable[[Any], Any]) -> None:
         ax.set_axis_off()
@@ -138,8 +139,8 @@ class CameraView:
 
 
 class _Stage:
-    """The figure: what stays is drawn once, what moves is drawn for each image. Without recorded
-    images, the side view takes their place."""
+    """The figure. Static parts are drawn once, moving parts for each image. Without recorded
+    images, the side view is drawn in their place."""
 
     def __init__(self, flight: FlightAnalysis, width_px: int, *, has_pictures: bool) -> None:
         self._flight = flight
@@ -236,7 +237,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     if not seen_m.size:
         return place_m, None
     target_z_m = float(target_m[2] - start_m[2])
-    # Nothing is above the sheet: the estimate of a vehicle that hangs drifts.
+    # The vehicle cannot be above the sheet; the estimate of a hanging vehicle drifts.
     highest_m = target_z_m - log.flown_profile.vehicle.gear_body_m[2]
     place_m[:, 1] = np.minimum(place_m[:, 1], highest_m)
     return place_m, target_z_m
@@ -256,14 +257,14 @@ def film_figure(width_px: int) -> Figure:
 
 
 def draw_still(figure: Figure) -> Any:
-    """Draw what does not move, for `draw_moving`."""
+    """Draw the static parts, as a background for `draw_moving`."""
     canvas = cast(Any, figure.canvas)
     canvas.draw()
     return canvas.copy_from_bbox(figure.bbox)
 
 
 def draw_moving(figure: Figure, still: Any, moving: Sequence[Any]) -> Rgb:
-    """Draw these artists over what does not move; return the image, (height, width, 3)."""
+    """Draw these artists over the static background, and return the image, (height, width, 3)."""
     canvas = cast(Any, figure.canvas)
     canvas.restore_region(still)
     for artist in moving:
@@ -297,7 +298,7 @@ def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
 
 
 def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
-    """Write a GIF in one palette, so that what stands still costs nothing."""
+    """Write a GIF with a single palette, so that static parts need no space."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

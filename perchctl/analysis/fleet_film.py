@@ -1,7 +1,7 @@
 """A film of a fleet: the room from above, all heights, and each vehicle's camera image.
 
-Each vehicle's log has a clock of its own. What puts them together is the fleet's clock, on which
-each flight has its begin and its pace: simulated time may run slower than the clock on the wall.
+Each vehicle's log has its own clock. They are aligned by the fleet's clock, on which each flight
+has a start and a pace, because simulated time may run slower than the wall clock.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from perchctl.plot import BLACK, BLUE, GREEN, GRID, ORANGE, PURPLE, SKY, VERMILL
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 ROOM_MARGIN_M = 0.2
-"""Around all corridors, in the view from above."""
+"""Margin around all corridors in the view from above, m."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,7 +74,7 @@ class FilmedVehicle:
         return self.flight.log.tick_index_at((t_s - self.begin_s) * self.pace)
 
     def path_m(self) -> Array:
-        """Its place in each tick in the room's axes, (n, 2)."""
+        """Its position in each tick, in room axes, (n, 2)."""
         log = self.flight.log
         place_m = np.column_stack([log.column("x_m"), log.column("y_m")])
         if self.in_room:
@@ -83,7 +83,7 @@ class FilmedVehicle:
         return np.asarray(place_m @ np.array([[c, s], [-s, c]]) + np.asarray(self.home_m))
 
     def heights_m(self) -> Array:
-        """Its height above where it stood, in each tick."""
+        """Its height above its starting place in each tick."""
         z_m = self.flight.log.column("z_m")
         known_m = z_m[np.isfinite(z_m)]
         return np.asarray(z_m - known_m[0] if known_m.size else z_m)
@@ -122,7 +122,7 @@ def _fleet_pictures(
 
 
 class _FleetStage:
-    """The figure: what stays is drawn once, what moves is drawn for each image."""
+    """The figure. Static parts are drawn once, moving parts for each image."""
 
     def __init__(self, vehicles: Sequence[FilmedVehicle], times_s: Array, width_px: int) -> None:
         self._begin_s = float(times_s[0])
@@ -202,7 +202,8 @@ class _FleetStage:
 
 
 class _ShownVehicle:
-    """What moves of one vehicle: its camera's image, its words, and its place in the room."""
+    """The moving parts for one vehicle: its camera image, its texts, and its position in the
+    room."""
 
     def __init__(
         self, vehicle: FilmedVehicle, colour: str, camera: Axes, room: Axes, add: Any

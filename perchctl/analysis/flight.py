@@ -1,4 +1,4 @@
-"""One flight as a value on which `log show`, `compare`, `plot` and `report` are based."""
+"""The analysis of one flight, as used by `log show`, `compare`, `plot` and `report`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _NUMBER = re.compile(r"[0-9.]+")
 
 @dataclass(frozen=True)
 class Hold:
-    """A stretch in which the vehicle was held in place; times since the flight's first turn."""
+    """A period in which the vehicle held its position; times since the flight's first turn."""
 
     start_s: float
     end_s: float
@@ -111,8 +111,8 @@ class FlightAnalysis:
         self.column = log.column
 
     def to_pandas(self) -> Any:
-        """Return the ticks as a `pandas.DataFrame`: a column a field, and as index `t_s`, seconds
-        since the first tick. Raises UsageError without pandas."""
+        """Return the ticks as a `pandas.DataFrame` with one column per field and the index `t_s`,
+        seconds since the first tick. Raises UsageError without pandas."""
         try:
             import pandas
         except ImportError:
@@ -130,8 +130,8 @@ class FlightAnalysis:
 
     @cached_property
     def position_holds(self) -> tuple[Hold, ...]:
-        """Stretches of turns held in one phase for one reason: the last turn's, as the numbers in a
-        reason may change."""
+        """Periods in which the vehicle held its position in one phase for one reason. The numbers
+        in a reason may change; the text is that of the last turn."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -170,12 +170,12 @@ class FlightAnalysis:
 
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
-        """Series of commands that other senders than the flight loop sent."""
+        """Series of commands that were not sent by the flight loop."""
         return group_takeovers(self.log)
 
     @cached_property
     def trim(self) -> Trim | None:
-        """What was asked of the motors in level hover; None if the log does not show it."""
+        """The thrust demanded of each motor in level hover; None if the log does not contain it."""
         return estimate_trim(self.log, simulated=self.summary.simulated)
 
     @cached_property
@@ -253,7 +253,7 @@ def read_log(path: Path | str) -> FlightAnalysis:
 
 
 def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
-    """Of a flight's phases, the ascent that led to the last contact; None without a contact."""
+    """Return the ascent that led to the last contact; None if there was no contact."""
     ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
 
@@ -265,14 +265,14 @@ def _known(value: float) -> float | None:
 # --- what was sent in the loop's place ---
 
 APART_S = 2.0
-"""Time between two commands of one sender above which they belong to two series, s."""
+"""Time between two commands from one sender above which they belong to different series, s."""
 _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 """Two words of a class's name."""
 
 
 @dataclass(frozen=True)
 class Takeover:
-    """Series of commands that a sender (`by`) other than the flight loop sent. Times are since the
+    """A series of commands from a sender (`by`) other than the flight loop. Times are since the
     flight's first turn; `commands`: their number by kind, as in ``position setpoint``."""
 
     by: str
@@ -287,7 +287,7 @@ class Takeover:
 
 
 def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
-    """The series of commands that other senders than the flight loop sent, oldest first."""
+    """Return the series of commands that were not sent by the flight loop, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None

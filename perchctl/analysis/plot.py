@@ -1,4 +1,4 @@
-"""The image of a flight, beside its log and on its report's page."""
+"""The plot of a flight, which is written next to its log and shown on the report page."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from perchctl.record import FlightLog
 SHADES = ("#EEF3F8", "#FFFFFF")
 TITLE_COLUMNS = 110
 BEFORE_LAST_SIGHT_S = 5.0
-"""Time before the last frame with the target from which on the approach is drawn. Larger: its end
-is drawn smaller."""
+"""Time before the last frame with the target at which the close-up starts, s. Larger: the end of
+the approach is drawn smaller."""
 AFTER_LAST_SIGHT_S = 0.5
-"""Time after that frame up to which it is drawn."""
+"""Time after that frame at which the close-up ends, s."""
 LEAST_SPAN_MM = 5.0
 """Least range to each side of zero. Smaller: the noise of a still approach fills the plot."""
 Span = tuple[str, float, float]
-"""A phase's name, and from when to when on the axis."""
+"""A phase's name, and its start and end on the time axis."""
 NAME_GAP = 0.02
 """Share of the time axis between the names of two phases, so that they do not overlap."""
 LOST_SHARE = 0.05
-"""Of a panel's height, in which lost frames are marked."""
+"""Share of a panel's height in which lost frames are marked."""
 FULL_THRUST_PERCENT = 1 / 655.35
 RAW = (
     ("j", "s", GREEN, "both, raw"),
     ("l", "o", SKY, "large, raw"),
     ("s", "^", ORANGE, "small, raw"),
 )
-"""Of a raw pose: its letter in the log's keys, its marker, colour and label."""
+"""Letter in the log's keys, marker symbol, colour and label of each raw pose."""
 TRACKS = (
     ("x_m", 100.0, "x [cm]"),
     ("y_m", 100.0, "y [cm]"),
@@ -72,7 +72,7 @@ def plot_flight(log: FlightLog | FlightAnalysis, path: Path | str) -> None:
 
 
 def flight_png(flight: FlightAnalysis) -> bytes:
-    """The image of a flight as a PNG; the log has at least one tick."""
+    """The plot of a flight as a PNG. The log must have at least one tick."""
     return figure_bytes(flight_figure(flight))
 
 
@@ -124,7 +124,8 @@ def figure_title(flight: FlightAnalysis) -> str:
 def _draw_raw_and_filtered(
     ax: Axes, flight: FlightAnalysis, key: str, scale: float, label: str
 ) -> None:
-    # A frame is some 100 ms old when it is measured; the estimate is carried to the present.
+    # A frame is about 100 ms old when it is measured, while the estimate is extrapolated to the
+    # present.
     log = flight.log
     frame_s = log.to_flight_s(log.column("frame_t_s"))
     for source, marker, colour, text in RAW:
@@ -177,7 +178,8 @@ def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
 
 
 def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
-    """Draw the approach in mm up to the last frame with the target; return from when to when."""
+    """Draw the approach in mm up to the last frame with the target. Return start and end of the
+    period."""
     log, frames = flight.log, flight.frames
     end_s = (
         float(frames.times_with_target_s[-1])
@@ -243,7 +245,8 @@ def _shade_spans(ax: Axes, spans: Sequence[Span]) -> None:
 
 
 def _name_spans(ax: Axes, spans: Sequence[Span], shown_s: tuple[float, float]) -> None:
-    """Names above a panel, slanted; where phases crowd, some go unnamed."""
+    """Draw the phase names slanted above a panel. If phases are too close together, some names are
+    left out."""
     gap_s = NAME_GAP * (shown_s[1] - shown_s[0])
     named_s = -math.inf
     for name, start_s, end_s in spans:

@@ -118,14 +118,15 @@ class Replay:
 
     @property
     def uncompared(self) -> list[str]:
-        """Dotted names of the fields that the log does not hold, so that they are not compared."""
+        """Dotted names of the fields that the log does not contain and that are therefore not
+        compared."""
         names = (field.path.removeprefix("observation.") for field in self.log.unknown_fields)
-        # A sample of telemetry has the same fields in all its places.
+        # A telemetry sample has the same fields wherever it occurs.
         return [name for name in names if not name.startswith("taken.")]
 
     @property
     def notes(self) -> list[str]:
-        """What limits the replay, a sentence each."""
+        """The limitations of the replay, one sentence each."""
         made_by, elsewhere = self.log.header.get("perchctl"), self.log.computer_differences
         found = []
         if made_by != perchctl.__version__:
@@ -159,7 +160,7 @@ class Replay:
 
         `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
         None without images; `changed` is empty for the flown profile; `not_compared` names the
-        fields that the log does not hold.
+        fields that the log does not contain.
         """
         seen = self.seen
         pictures = seen and {
@@ -216,9 +217,9 @@ def replay(
 
     The planner gets the recorded observations; with another profile and `pictures`, those of the
     replayed perception. Perception is compared separately. `pipeline`: by default the profile's,
-    with the flown calibration and mask. `tolerances`: by how much numbers of a field, named without
-    its owner, may differ, "" for all other fields; by default every bit counts. Errors:
-    InvalidValue, NotFound.
+    with the flown calibration and mask. `tolerances`: permitted difference of the numbers in a
+    field, by the field's name without its owner; "" stands for all other fields. By default, every
+    bit is compared. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile
     turns, gap = turns_and_gap_text(log)
@@ -226,12 +227,12 @@ def replay(
     comparison = Comparison(unknown, tolerances or {})
     used = profile or flown
     changed = changed_keys(flown, used)
-    if not log.has_position_variance:  # what is unknown was not asked for then
+    if not log.has_position_variance:  # fields that are unknown did not exist at that time
         used = used.with_({"link.unreported": ["variance", *used.link.unreported]})
     seen = None
     if pictures is not None:
         pipeline = pipeline or replay_pipeline(log, used, changed)
-        # A source takes the latency off the time at which an image came.
+        # A source subtracts the latency from an image's arrival time.
         delay_s = flown.camera.start_latency_s - used.camera.start_latency_s
         replayed, missing = _replayed(turns, used, pipeline, pictures, delay_s)
         differing = list(_differing(log, turns, replayed, comparison))
@@ -273,7 +274,7 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
 
-# --- What the images show ---
+# --- Replay of the perception ---
 
 
 def _replayed(

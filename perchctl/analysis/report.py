@@ -1,4 +1,4 @@
-"""A page that reports one flight, or a session of several, and needs no other file."""
+"""A self-contained page that reports one flight, or several flights of a session."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class ReportedFlight:
 
     @cached_property
     def story(self) -> tuple[Sentence, ...]:
-        """The flight's events as sentences, in order of time."""
+        """The flight's events as sentences, in chronological order."""
         return tell_story(self.flight)
 
     @property
@@ -139,7 +139,7 @@ class ReportedFlight:
 
     @property
     def log_defects(self) -> list[str]:
-        """What the log lacks, a sentence each."""
+        """What is missing in the log, one sentence each."""
         end, log = self.flight.summary, self.flight.log
         found = []
         if not log.records:
@@ -232,11 +232,11 @@ def film_url_and_problem(
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
-    """The error's text without folders, as a page is sent on."""
+    """The error's text without folder names, because the page may be passed on."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 
-# --- What the camera saw when the mission decided: out of the recording beside the log ---
+# --- What the camera saw at each decision of the mission, from the recording next to the log ---
 
 DECIDED = {
     "ESTIMATE": "found",
@@ -248,7 +248,7 @@ DECIDED = {
 WIDEST_PX = 480
 """Width to which a wider image is reduced. Larger: a larger file."""
 REPORT_JPEG_QUALITY = 80
-"""Of 100. Larger: a larger file. Smaller: coarser images."""
+"""JPEG quality, 0 to 100. Larger: a larger file. Smaller: coarser images."""
 LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 
@@ -256,7 +256,7 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 class DecisionPicture:
     """Last camera image before a phase change, as a JPEG with the detected markers drawn.
 
-    The caption has the image's time, as the last centimetres are flown without images.
+    The caption gives the image's time, because the last centimetres are flown without images.
     """
 
     caption: str
@@ -310,7 +310,7 @@ def _jpeg(record: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
     drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     for key, colour in (("large_px", LARGE_BGR), ("small_px", SMALL_BGR)):
         if np.size(record.get(key) or ()) == 8:
-            # A pixel's centre is a whole number; shrunk, too.
+            # Pixel centres have integer coordinates, also in the reduced image.
             points = (np.array(record[key], dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
             fixed = np.round(points * 16).astype(np.int32)
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)

@@ -22,7 +22,7 @@ from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
-"""Of a frame: its number, the source's time, and the searched image."""
+"""A frame's number, its time from the source, and the image that was searched."""
 
 
 class PictureMissing(Exception):
@@ -47,7 +47,7 @@ class ReplayedInputs:
 
 
 class _Given:
-    """The recorded edges of one turn after another, as the inputs ask for them."""
+    """Stand-in for link and source, which returns the recorded data turn by turn."""
 
     def __init__(
         self, pictures: Iterable[Picture], size_px: tuple[int, int], delay_s: float
@@ -55,7 +55,7 @@ class _Given:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = delay_s
         self._pictures = _readable(pictures)
-        self._name: str | None = None  # of the flown source, once it has ended
+        self._name: str | None = None  # name of the flown source, once it has ended
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = TickInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
@@ -66,12 +66,12 @@ class _Given:
         if self._name is None and obs is not None and taken.has_camera_source_ended:
             self._name = _ended_name(taken, obs)
 
-    # As a link.
+    # --- The interface of a link ---
 
     def telemetry(self) -> list[Telemetry]:
         return list(self._samples.pop(0))
 
-    # As a source of frames.
+    # --- The interface of a frame source ---
 
     @property
     def live(self) -> bool:
@@ -124,7 +124,7 @@ class _Given:
                 return image
             if index > seen.index:
                 break
-            # Otherwise of a frame that no turn took.
+            # Otherwise the image belongs to a frame that no turn has used.
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 
@@ -138,8 +138,8 @@ def replay_inputs(
     """Replay perception turn by turn, from the first turn before take-off. `delay_s` is added to
     the exposure times of a live source.
 
-    Raises PictureMissing at the first image that is missing, differs or cannot be read: from
-    there the pipeline's state would differ from the flight's.
+    Raises PictureMissing at the first image that is missing, differs or cannot be read, because the
+    pipeline's state would differ from the flight's from then on.
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
     inputs = FlightInputs(given, given, pipeline, profile, is_logged=True)
@@ -159,8 +159,9 @@ def replay_inputs(
 
 
 def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
-    """Return the flown source's name from the camera's problem after its end, which alone has it.
-    None if the problem is another one, so that the replay's differs from it."""
+    """Return the name of the flown source, taken from the camera problem that was reported when the
+    recording ended; the log does not contain it elsewhere. None if the problem is a different one,
+    so that the replay will differ from it."""
     told = obs.camera_problem
     if told is None or taken.frame is not None or taken.camera_problem is not None:
         return None
@@ -169,7 +170,8 @@ def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
-    """Yield the images; an unreadable one ends them, not the planner's replay."""
+    """Yield the images. An unreadable image ends the sequence, but not the replay of the
+    planner."""
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:

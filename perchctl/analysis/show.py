@@ -1,4 +1,4 @@
-"""A flight as `perchctl log show` prints it: lines of at most `COLUMNS` columns, or one
+"""The output of `perchctl log show` for a flight: lines of at most `COLUMNS` columns, or one
 record."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from perchctl.record import FlightLog, PhaseSpan
 
 COLUMNS = 79
 _HANG = 11
-"""Where the text of a line begins, behind its name."""
+"""Column at which the text of a line begins, after its name."""
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
@@ -101,8 +101,8 @@ def _origin(log: FlightLog) -> str:
 
 
 def _positions_text(log: FlightLog) -> str:
-    """What measured the position; a fault or an option may have flown with another than the
-    profile's."""
+    """Return what measured the position. A fault or an option may have replaced the profile's
+    method."""
     section = (log.header.get("profile") or {}).get("positioning") or {}
     return f"positions by {section['by']}" if "by" in section else ""
 
@@ -138,7 +138,7 @@ _MEASURES = (
         "at most {telemetry_age_p99_s} ms old",
     ),
 )
-"""Of a line: its name, the figure without which it is left out, and the line."""
+"""Name of each line, the figure without which it is left out, and the line itself."""
 
 
 def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
@@ -161,7 +161,8 @@ def _trim_lines(flight: FlightAnalysis) -> Iterator[str]:
 
 
 def printable_text(text: str) -> str:
-    """The text with ``?`` for each control character, which a terminal would execute."""
+    """Return the text with control characters, which a terminal would execute, replaced by
+    ``?``."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
@@ -182,7 +183,7 @@ def with_hanging_indent(prefix: str, text: str) -> list[str]:
     return lines or [prefix.rstrip()]
 
 
-# --- Which logs a folder holds, the newest first, and how each ended ---
+# --- The logs in a folder, newest first, and how each flight ended ---
 
 
 def newest_logs(folder: Path, limit: int | None = None) -> list[Path]:

@@ -66,7 +66,7 @@ def read_frames(log: FlightLog) -> Frames:
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
     age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
     if records:
-        # The flight's end, as old as frames are when they are measured, may end a gap, too.
+        # A gap may also end with the flight, at its end minus the usual age of a frame.
         gaps_s = _gaps(log, np.append(times_s, max(log.end_s - age_s, times_s[-1])))
     between_s = np.diff(np.sort(times_s))
     return Frames(
@@ -97,7 +97,7 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
 # --- losses ---
 
 LEAST_LOSS_S = 0.3
-"""Duration below which a loss is coasted through and changes nothing, s."""
+"""Duration below which the filter bridges a loss, so that it has no effect, s."""
 NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER", "HOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
@@ -142,14 +142,14 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     """When the loss ended; None without a loss."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
-    at_s = start_s + LEAST_LOSS_S / 2  # the last sight may be just before the phase
+    at_s = start_s + LEAST_LOSS_S / 2  # the target may last have been seen just before the phase
     phase = next((s.phase for s in reversed(stays) if s.start_s <= at_s), "")
     left = next(
         (s for s in stays if s.start_s > start_s and s.phase not in NEEDED_IN | {"SEARCH"}), None
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":
-            return None  # so near that no marker fits into the image, as it should be
+            return None  # so close that no marker fits into the image, as intended
         end_s = left.start_s
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None

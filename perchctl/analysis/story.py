@@ -1,4 +1,4 @@
-"""A flight in sentences, each at its time, made of the log's events and ticks."""
+"""Tell a flight in sentences with times, from the log's events and ticks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ACTIONS = {
 }
 FINAL_PHASE_TEXTS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
 SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "HOVER"})
-"""Phases whose sentence tells where the target was as they began."""
+"""Phases whose sentence says where the target was when they began."""
 MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
 
 
@@ -147,7 +147,7 @@ def _upper(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
 
 
-# --- Figures as people read them ---
+# --- Numbers in readable form ---
 
 
 def length_text(metres: float) -> str:

@@ -1,9 +1,9 @@
 """Estimate the balance of a vehicle and its motors from a level hover.
 
-The thrust f_i that the firmware asks of each motor follows from its duty cycle and the battery's
-voltage by the thrust curve; what a weak motor gives is less. The shares a_i = 4 f_i / (f_1 + f_2 +
-f_3 + f_4) have the mean 1 and, on an X frame whose motors are `MOTOR_OFFSET_M` to the front and to
-the side, three patterns:
+The thrust f_i that the firmware demands from each motor follows from the motor's duty cycle, the
+battery voltage and the thrust curve. A weak motor delivers less. The shares a_i = 4 f_i / (f_1 +
+f_2 + f_3 + f_4) have the mean 1 and, on an X frame whose motors are `MOTOR_OFFSET_M` to the front
+and to the side, three patterns:
 
     M4 front left    M1 front right      pitch = (a_1 + a_4 - a_2 - a_3) / 4
                \\    /                    roll  = (a_3 + a_4 - a_1 - a_2) / 4
@@ -11,14 +11,14 @@ the side, three patterns:
     M3 back left     M2 back right
 
 - A centre of mass x forward and y left of the middle gives pitch = x / `MOTOR_OFFSET_M` and roll =
-  y / `MOTOR_OFFSET_M`. Weaker motors at the front, or on the left, give the same. Both moments are
-  proportional to the thrust in all free flight, so no flight tells them apart.
-- In still air the centre of mass has no part in the yaw pattern: motors or propellers are unequal,
-  or a motor leans.
+  y / `MOTOR_OFFSET_M`. Weaker motors at the front, or on the left, give the same. In free flight,
+  both moments are always proportional to the thrust, so no flight can distinguish them.
+- In still air, the centre of mass does not affect the yaw pattern, which shows unequal motors or
+propellers, or a tilted motor.
 - A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the
   wind. Its push beside the centre of mass (`DRAG_LEVER_M`) adds one to yaw, where the motors have
-  only `YAW_TORQUE_M`. The vehicle leans against a draught; but the estimated lean has a bias of
-  that size, too. So the lean widens the intervals, and corrects nothing.
+  only `YAW_TORQUE_M`. The vehicle leans into a draught, but the estimated lean has a bias of the
+  same size. The lean is therefore only used to widen the intervals, not to correct the estimate.
 """
 
 from __future__ import annotations
@@ -37,20 +37,22 @@ from perchctl.sim import thrust_n
 from perchctl.vehicle import MOST_CELL_V, MOST_DUTY
 
 MOTOR_OFFSET_M = 0.0325
-"""From the middle to a motor, forward and sideways, m: arms of 46 mm at 45 degrees."""
+"""Distance from the middle to a motor, forward and sideways, m: arms of 46 mm at 45 degrees."""
 WIND_ARM_M = 0.047
-"""Moment over force of a level draught, m: 0.75e-3 N.m and 0.016 N for each m/s, from 104 recorded
-flights of a Crazyflie 2.1."""
+"""Ratio of moment to force in a horizontal draught, m: 0.75e-3 N.m and 0.016 N per m/s, from 104
+recorded flights of a Crazyflie 2.1."""
 DRAG_LEVER_M = 0.002
-"""How far beside the centre of mass a draught may push, m, one standard deviation: a guess from how
-far it lies off the middle. Larger: wider intervals of yaw. Smaller: too narrow ones in a wind."""
+"""Distance from the centre of mass at which the force of a draught may act, m, one standard
+deviation: an estimate from the usual offset of the centre of mass. Larger: wider intervals of yaw.
+Smaller: intervals that are too narrow in a draught."""
 YAW_TORQUE_M = 0.006
-"""A motor's reaction for its thrust, N.m for each N."""
+"""Reaction torque of a motor per thrust, N.m per N."""
 UNSEEN_LEAN_RAD = math.radians(0.3)
 """Lean against a draught that a bias of the estimated lean may hide, rad, one standard deviation.
 Larger: wider intervals. Smaller: a draught passes for an imbalance."""
 HOVER_CLEARANCE_M = 0.3
-"""Least distance from the floor and from the target, m. Smaller: the air at a surface lifts."""
+"""Smallest distance from the floor and from the target, m. Smaller: ground or ceiling effect
+disturbs the estimate."""
 HOVER_SPEED_MPS = 0.15
 """Largest level speed of a hover, m/s. Larger: more samples, but the airspeed adds a moment."""
 HOVER_CLIMB_MPS = 0.3
@@ -63,8 +65,8 @@ LEAST_SAMPLES = 20
 """Least number of samples for an estimate: 2 s of hover. Smaller: more flights have an estimate,
 but with wide intervals."""
 CORRELATED_SAMPLES = 10
-"""Number of samples after which they are independent: 1 s, a few oscillations of the attitude.
-Larger: the intervals themselves are less certain. Smaller: they are too narrow."""
+"""Number of samples after which two samples are independent: 1 s, a few oscillations of the
+attitude. Larger: the intervals are less certain. Smaller: they are too narrow."""
 HARMLESS_SHIFT_M = 0.0025
 """Shift of the centre of mass up to which no advice is given, m: recorded vehicles flew with up to
 2.4 mm."""
@@ -80,16 +82,16 @@ _WAYS = (("forward", "backward"), ("to the left", "to the right"))
 
 @dataclass(frozen=True)
 class Trim:
-    """What was asked of the motors in level hover. A margin is half of a 95 % interval.
+    """The thrust demanded of the motors in level hover. A margin is half of a 95 % interval.
 
     Attributes:
         hover_s: time in hover that was used.
-        shares: thrust asked of M1..M4, over the mean of the four.
+        shares: thrust demanded of M1..M4, relative to the mean of the four.
         shift_m: forward and left, where the centre of mass would lie if the motors were equal.
-        yaw_imbalance: how much more than the mean is asked of the motors front left and back right,
-            as a share; of the other two it is as much less.
-        advice: sentences; none for a simulated vehicle, or if no interval excludes its harmless
-            range.
+        yaw_imbalance: by which fraction the thrust demanded of the front-left and back-right motors
+            exceeds the mean; for the other two motors, it is lower by the same fraction.
+        advice: sentences with advice; none for a simulated vehicle, or if no interval excludes its
+            harmless range.
     """
 
     hover_s: float
@@ -103,7 +105,7 @@ class Trim:
 
     @property
     def motors_text(self) -> str:
-        """The shares in words, and what they rest on."""
+        """The shares in words, and the data on which they are based."""
         each = ", ".join(
             f"{motor} {_percent(share - 1.0, margin)}"
             for motor, share, margin in zip(
@@ -114,7 +116,7 @@ class Trim:
 
     @property
     def balance_text(self) -> str:
-        """The shift in words, and what a flight cannot know of its cause."""
+        """The shift in words, and which causes a flight cannot distinguish."""
         parts = zip(self.shift_m, self.shift_margin_m, _WAYS, strict=True)
         return (
             f"centre of mass {' and '.join(_shift(*part) for part in parts)}, if the motors are "
@@ -147,7 +149,7 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
     duties = np.stack([log.column(f"duty_m{motor}") for motor in (1, 2, 3, 4)], axis=1)
     volts = log.column("battery_v")
     is_known = np.all(duties <= MOST_DUTY, axis=1) & (volts <= MOST_CELL_V)
-    # The same numbers are the same packet: a tick holds the newest one.
+    # Identical numbers come from the same packet, because a tick contains the newest one.
     is_new = np.any(np.diff(duties, axis=0, prepend=np.nan) != 0.0, axis=1)
     packets = np.flatnonzero(is_known & is_new)
     motor_v = duties[packets] / MOST_DUTY * volts[packets, np.newaxis]
@@ -159,7 +161,9 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
         return None
     shares = asked_n / np.mean(asked_n, axis=1, keepdims=True)
     lean_rad = [np.mean(log.column(key)[packets][in_hover]) for key in ("pitch_rad", "roll_rad")]
-    push = np.hypot(lean_rad, UNSEEN_LEAN_RAD)  # of the draught, forward and left, over the weight
+    push = np.hypot(
+        lean_rad, UNSEEN_LEAN_RAD
+    )  # force of the draught, forward and left, relative to the weight
     draught = [*push * WIND_ARM_M / MOTOR_OFFSET_M, math.hypot(*push) * DRAG_LEVER_M / YAW_TORQUE_M]
 
     def estimate(series: Array, draught: float) -> tuple[float, float]:
@@ -205,7 +209,7 @@ def mean_and_margin(series: Array, chosen: NDArray[np.bool_]) -> tuple[float, fl
 
 
 def _is_hovering(log: FlightLog) -> NDArray[np.bool_]:
-    """Of each tick, True if the vehicle hovers level in free air."""
+    """Return for each tick whether the vehicle hovers level in free air."""
     z_m, target_z_m = log.column("z_m"), log.column("tz_m")
     seen_m = target_z_m[np.isfinite(target_z_m)]
     top_m = np.median(seen_m) - HOVER_CLEARANCE_M if seen_m.size else math.inf
@@ -243,7 +247,7 @@ def _advice(trim: Trim) -> Iterator[str]:
 
 
 def _yaw_pair(imbalance: float) -> tuple[str, float]:
-    """The two motors of which more is asked, and how much more."""
+    """Return the pair of motors with the higher demanded thrust, and by how much it is higher."""
     pairs = ("front left and back right", "front right and back left")
     return pairs[imbalance < 0.0], abs(imbalance)
 
