@@ -4,10 +4,10 @@ frame.
 HOST is 192.168.4.1 if the deck is its own access point. The deck's GAP8 must run Bitcraze's example
 `wifi-img-streamer`, which sends raw or JPEG images of 324x244.
 
-The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
-one byte of routing, one of function, and the data. An image is a packet with its header,
-``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
-bytes have come. (cflib's own reader blocks for ever when the deck goes away.)
+The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then one
+byte of routing, one of function, and the data. An image is a packet with its header, ``<BHHBBI``:
+magic 0xBC, width, height, depth, format, size; then packets of chunks until `size` bytes have come.
+(cflib's own reader blocks forever if the deck disappears.)
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ PORT = 5000
 STALLED_S = 2.0
 """Time from an image's first to its last byte after which the image is dropped, s."""
 MAX_PACKET_BYTES = 1022
-"""Largest length of a packet: the deck's buffers hold no more (its MTU)."""
+"""Largest packet length, bytes: the size of the deck's buffers (its MTU)."""
 MOST_SIDE_PX = 1024
 
-# Small, because data that waits while the reader stalls is later dated by the time at which it is
+# A small buffer, because data that waits while the reader stalls gets a late time stamp when it is
 # read.
 _RECEIVE_BYTES = 131072
 _PACKET = struct.Struct("<HBB")
@@ -44,9 +44,9 @@ _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 
 @dataclass
 class _Picture:
-    """An image that is arriving: the content of its header, and the `data` so far.
+    """A partly received image: the content of its header, and the `data` so far.
 
-    `began_s` is the time at which its first byte arrived.
+    `began_s` is the arrival time of its first byte.
     """
 
     began_s: float
@@ -57,8 +57,8 @@ class _Picture:
     data: bytearray
 
     def decode(self) -> tuple[NDArray[np.uint8], bytes | None] | str:
-        """Return the grey image (h, w), and its JPEG if it came as one; or why it cannot be used.
-        Bytes after the end of a JPEG are padding."""
+        """Return the grey image (h, w), and its JPEG if it was sent as one; or the reason why it
+        cannot be used. Bytes after the end of a JPEG are padding."""
         shape, data = (self.height, self.width), bytes(self.data)
         if not self.is_jpeg:
             if len(data) != self.size:
@@ -154,13 +154,13 @@ class AiDeckSource(LiveSource):
             return
         image, encoded = decoded
         grey = self._grey(image)
-        if grey is not image:  # a colour mosaic was removed from it
+        if grey is not image:  # a colour mosaic was removed from the image
             encoded = None
         self._put(grey, began_s=picture.began_s, encoded=encoded)
 
 
 def _header_of(data: bytes, came_s: float) -> _Picture | None:
-    """Return the image whose header that packet is; None if it is no header."""
+    """Return the image that starts with this packet; None if the packet is not a header."""
     if len(data) != _HEADER.size:
         return None
     magic, width, height, depth, kind, size = _HEADER.unpack(data)

@@ -53,7 +53,7 @@ def open_video_capture(
 def configure_capture(
     capture: Any, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> None:
-    """Set format, size and rate in this order, as each limits the next."""
+    """Set format, size and rate in this order, because each limits the next one."""
     if config is not None and config.format is not None:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.format.ljust(4)))
     if size_px is not None:
@@ -67,8 +67,9 @@ def configure_capture(
 class DeviceSource(LiveSource):
     """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
-    A bad image is dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is
-    released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
+    Bad images are dropped. After `LOST_AFTER_FAILURES` bad images in succession, the camera counts
+    as lost: it is released, and reopened once it is available again. `opener` returns a
+    cv2.VideoCapture.
     """
 
     silent_advice = (
@@ -122,8 +123,8 @@ NAMES = Path("/sys/class/video4linux")
 class ConnectedCamera:
     """A camera of this computer.
 
-    `stable_path`: a link, the same at every port, or empty; `problem`: why the camera cannot be
-    opened, or empty.
+    `stable_path`: a link that does not depend on the USB port, or empty; `problem`: why the camera
+    cannot be opened, or empty.
     """
 
     number: int

@@ -73,12 +73,13 @@ class RecordedSource:
 
 
 class VideoSource(RecordedSource):
-    """A video file; times are the container's if they increase, else from the frame rate."""
+    """A video file. Times are those in the container if they increase; otherwise they follow from
+    the frame rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
             raise NotFound(f"video file {without_password(str(path))} was not found")
-        # one sentence is enough, so OpenCV prints nothing
+        # perchctl reports the error in one sentence, so OpenCV must not print anything
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         # keeps the sensor's grid, as with images
@@ -139,12 +140,11 @@ class ImagesSource(RecordedSource):
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """The grey image of a file's bytes, on the sensor's grid whatever orientation they note.
+    """Decode a file's bytes to a grey image on the sensor's grid, ignoring the orientation tag.
 
-    Raises ValueError for an image that is cut off, or that OpenCV does not read.
+    Raises ValueError if the image is truncated or if OpenCV cannot read it.
     """
-    # OpenCV's decoders would fill in the rest with grey, and print a warning without the file's
-    # name.
+    # OpenCV's decoders would fill the rest with grey and print a warning without the file name.
     png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data
     jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_end_and_size(data) is not None
     if not (png_ends and jpeg_ends):
@@ -156,7 +156,8 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
-    """The files of a folder, glob or list, each once, naturally sorted. Raises NotFound."""
+    """Return the files in a folder, glob or list, without duplicates, in natural order. Raises
+    NotFound."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)
     folder = Path(where)

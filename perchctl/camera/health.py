@@ -1,4 +1,4 @@
-"""Decides whether a frame can be used as a measurement, or is frozen, snow, uniform, dark or
+"""Decide whether a frame can be used as a measurement, or is frozen, snow, uniform, dark or
 repeated."""
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ along lines."""
 
 
 class FrameHealth:
-    """Judges the frames of one source in order; it remembers the last image."""
+    """Assesses the frames from one source in order, remembering the last image."""
 
     def __init__(self) -> None:
         self._picture: NDArray[np.uint8] | None = None
@@ -85,7 +85,7 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 # --- Images that a receiver repeats because no new one has arrived ---
 # In a stream of 60 images a second, a receiver of 25 images a second repeats each two or three
-# times. The repetition is not another measurement, and its time is that of the first copy.
+# times. A repetition is not a new measurement, and its time is that of the first copy.
 
 
 Grey = NDArray[np.uint8]

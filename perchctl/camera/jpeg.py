@@ -1,8 +1,9 @@
 """The structure of a JPEG: its end, its declared size and its pixels; and the pixels of any
 image. Pure.
 
-Data from a radio may be damaged anywhere. Two wrong bytes that declare a size of 32000x32000 cost a
-decoder gigabytes and minutes, so the size is checked before an image of a stream is decoded.
+Data from a radio may be damaged anywhere. Two wrong bytes that declare a size of 32000x32000 would
+cost a decoder gigabytes and minutes, so the size is checked before an image from a stream is
+decoded.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PICTURE_BYTES = 8_000_000
-"""Size of an image in a stream after which it is dropped if it has not ended, bytes."""
+"""Largest size of an image in a stream, bytes. An image that has not ended by then is dropped."""
 MOST_STREAM_PX = 4096 * 4096
 """Largest number of pixels of an image in a stream: more than any flying camera has, and decoded
 within 0.2 s."""
@@ -78,7 +79,7 @@ class JpegSplitter:
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
             self._bound()
-            return pictures  # no image ends in the new bytes
+            return pictures  # the new bytes do not contain the end of an image
         while (start := self._buffer.find(_START)) >= 0:
             del self._buffer[:start]
             extent = jpeg_end_and_size(self._buffer)
@@ -95,7 +96,7 @@ class JpegSplitter:
         return pictures
 
     def _bound(self) -> None:
-        """Drop an image that never ends."""
+        """Drop an image that exceeds the size limit without ending."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
 
@@ -106,8 +107,8 @@ viewers says how the camera was held; applying it would give each image another 
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
-    """The grey image of any bytes, on the sensor's grid whatever orientation they note; None if
-    OpenCV cannot decode them; raises nothing."""
+    """Decode any bytes to a grey image on the sensor's grid, ignoring the orientation tag. Returns
+    None if OpenCV cannot decode them; raises nothing."""
     if not data:
         return None  # OpenCV raises an error for an empty array
     try:

@@ -35,7 +35,7 @@ from perchctl.errors import NotFound
 READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _NOT_MENDED = (401, 403, 404, 410)
-"""Answers that the server would give to another attempt, too."""
+"""Status codes that another attempt would not change."""
 _NAME_AND_PASSWORD = "add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
 _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 
@@ -131,15 +131,15 @@ class MjpegSource(LiveSource):
                 self._drop("the JPEG cannot be decoded")
 
 
-# --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
-# FFmpeg says neither.
+# --- RTSP, decoded by PyAV ---
+# Its open and read have timeouts and report why they failed, unlike those of OpenCV's FFmpeg.
 
 
 MAX_DAMAGED = 100
 """Number of successive packets that cannot be decoded before the source reconnects."""
 DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""Rate by which a camera's clock may run slow before its images seem to become older."""
+"""Relative rate by which a camera's clock may run slow before its images seem to become older."""
 
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",  # a lost packet costs every image up to the next whole one
@@ -163,7 +163,9 @@ class TransferDelay:
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
-        self._ways: deque[tuple[float, float]] = deque()  # arrival times with their `way_s`
+        self._ways: deque[tuple[float, float]] = (
+            deque()
+        )  # arrival times with their transfer times `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
         """The transfer time beyond the fastest image's, s; 0 without `camera_s`, the camera's
@@ -175,7 +177,7 @@ class TransferDelay:
         self._camera_s = camera_s
         way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
-            self._ways.pop()  # minimum of a window: none of these can become it any more
+            self._ways.pop()  # minimum over a window: none of these can become the minimum any more
         self._ways.append((arrival_s, way_s))
         while self._ways[0][0] < arrival_s - DELAY_WINDOW_S:
             self._ways.popleft()
@@ -261,5 +263,5 @@ _REASONS = {
     "ExitError": "no answer in time, or no video in the stream",
     "InvalidDataError": "no answer in time, or not an RTSP answer",
 }
-"""Texts that replace FFmpeg's own, which say less."""
+"""Texts that replace FFmpeg's less informative ones."""
 _ADVICE = {"HTTPUnauthorizedError": "write them as in rtsp://NAME:PASSWORD@HOST/PATH"}

@@ -1,4 +1,4 @@
-"""Open a frame source from the text with which a profile or a command names it."""
+"""Open a frame source from its name in a profile or on the command line."""
 
 from __future__ import annotations
 
@@ -144,15 +144,16 @@ def open_camera(
             to the simulated vehicle, whose stream's address the caller gives instead. Of
             ``my_module:MyCamera`` the class is called with `clock` and `config`.
         clock: of the frames' times, s.
-        config: the profile's camera. Its latency is taken off live frames' times, its format
-            and rate are asked of ``camera:``, and mirrored images are turned right.
+        config: the profile's camera. Its latency is subtracted from the times of live frames, its
+            format and rate are requested from ``camera:``, and mirrored images are flipped back.
         size_px: wanted width and height (requested of ``camera:`` only).
         latency_s: from exposure to arrival, instead of the profile's (0 without one).
         pictures_hz: images count as taken at this rate (``images:`` only; 30 by default).
-        timeout_s: how long the first frame of a live source may take, instead of the profile's.
+        timeout_s: timeout for the first frame of a live source, instead of the profile's.
 
     Raises:
-        NotFound: no such camera, file or stream, or none that can be reached. InvalidValue: unknown
+        NotFound: there is no such camera, file or stream, or it cannot be reached. InvalidValue:
+            unknown
         scheme, unreadable content. TimedOut: no first frame in time.
     """
     if latency_s is None:
@@ -199,7 +200,8 @@ def _live(
 
 
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:
-    """Wait for the first frame. Raises the source's failure, or TimedOut, with it closed."""
+    """Wait for the first frame. If the source fails, closes it and raises its error, or
+    TimedOut."""
     source.begin()
     if source.wait_first_frame(timeout_s):
         return source

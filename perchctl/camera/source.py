@@ -23,9 +23,9 @@ from perchctl.vision import CameraModel, Frame, to_grey
 class NewestSlot:
     """Keeps the newest image, with the time of its first arrival.
 
-    An image that the receiver repeats does not replace the original until the original is taken,
-    so the arrival time stays. Afterwards the repeat is given with the same index and
-    `Frame.repeated`: a sign of life, not a measurement.
+    An image that the receiver repeats does not replace the original until the original has been
+    taken, so that the arrival time is kept. After that, the repetition is returned with the same
+    index and `Frame.repeated`: it shows that the source works, but is not a measurement.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class NewestSlot:
             self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
 
     def take(self) -> Frame | None:
-        """The newest frame; None if it was returned already."""
+        """Return the newest frame; None if it has already been returned."""
         frame, self._frame = self._frame, None
         return frame
 
@@ -75,20 +75,20 @@ class FrameSource(Protocol):
 
     @property
     def finished(self) -> bool:
-        """True if no frame will come any more; a live source never finishes."""
+        """True if no more frames will come. A live source never finishes."""
 
     @property
     def size_px(self) -> tuple[int, int] | None:
-        """Width and height of the frames, once the first has come."""
+        """Width and height of the frames, known once the first one has arrived."""
 
     def poll(self, now_s: float) -> Frame | None:
-        """The newest frame (recorded: the next); None if none came since the last call. The flight
-        loop calls it about 50 times a second, so it must not wait: a camera that blocks needs a
-        thread."""
+        """Return the newest frame (for a recording, the next one); None if no frame has arrived
+        since the last call. The flight loop calls this method about 50 times a second, so it must
+        not block: a camera that blocks needs its own thread."""
 
     def problem(self, now_s: float) -> str | None:
-        """A sentence if the source is broken at `now_s`, else None; at -inf, only for a permanent
-        failure. perchctl itself notices that no frames come."""
+        """Return a sentence if the source does not work at `now_s`; otherwise None. For -inf, only
+        report a permanent failure. perchctl itself detects missing frames."""
 
     def describe(self) -> str:
         """Name and size in a sentence: ``camera:0 (640x480 px)``."""
@@ -97,7 +97,7 @@ class FrameSource(Protocol):
 
 
 def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str) -> None:
-    """Raises InvalidValue, which names `source`, if frames and calibration differ in size.
+    """Raise InvalidValue, which names `source`, if frames and calibration differ in size.
 
     Frames are not scaled to fit: cropped and scaled modes of a camera may have the same aspect
     ratio, but need different calibrations.
@@ -126,8 +126,9 @@ def describe_error(error: Exception) -> str:
 class LiveSource:
     """A live source: a thread reads the camera, and the loop polls the newest frame.
 
-    A subclass defines `_connection`, which opens and reads the camera. A connection that ended is
-    made again after `reconnect_wait_s`, until `max_failures` in a row brought no image.
+    A subclass defines `_connection`, which opens and reads the camera. A connection that has ended
+    is reopened after `reconnect_wait_s`, until `max_failures` connections in succession have
+    brought no image.
 
     The message of a source that gives no image names only causes that the source has observed:
     whether it connected (`_connected`), whether anything came (`_note`), and whether images came
@@ -157,7 +158,7 @@ class LiveSource:
         self._last_arrival_s = clock()
         self._arrived = 0  # number of images, including a receiver's repetitions
         self._why_silent = ""
-        # finding of the newest connection, and advice, until an image arrives
+        # problem of the newest connection, and advice, until an image arrives
         self._found = ("", "")
         self._is_connected = False
         self._dropped = 0  # number of images that arrived since the last good one
@@ -189,7 +190,7 @@ class LiveSource:
         return TimedOut(found, advice, separator=": ")
 
     def _finding_and_advice(self) -> tuple[str, str]:
-        """Return what was observed since the last image, and what to do about it."""
+        """Return the problem observed since the last image, and advice."""
         if self._dropped:
             count = f"{self._dropped} so far"
             return f"pictures arrive but are dropped ({count}): {self._why_dropped}", ""
@@ -213,8 +214,8 @@ class LiveSource:
         self._thread.join(CLOSE_WITHIN_S)
 
     def _connection(self) -> str:
-        """Open the camera, read it until it ends, and return why it ended. It calls `_put` for
-        each image, looks at `_stop`, and may raise any Exception."""
+        """Open the camera, read it until it ends, and return why it ended. It calls `_put` for each
+        image, checks `_stop`, and may raise any Exception."""
         raise NotImplementedError
 
     def _run(self) -> None:
@@ -252,16 +253,16 @@ class LiveSource:
             self._stop.wait(self.reconnect_wait_s)
 
     def _connected(self) -> None:
-        """Note that the camera answers, for the case that nothing else arrives."""
+        """Record that the camera answers, in case nothing else arrives."""
         self._is_connected = True
         self._note(_SILENT, self.silent_advice)
 
     def _note(self, finding: str, advice: str = "") -> None:
-        """Note what this connection has delivered instead of an image, and what to do about it."""
+        """Record what this connection has delivered instead of an image, and advice."""
         self._found = (finding, advice)
 
     def _drop(self, why: str) -> None:
-        """Note that an image arrived but cannot be used."""
+        """Record that an image arrived but cannot be used."""
         self._why_dropped, self._dropped = why, self._dropped + 1
 
     def _put(
@@ -274,8 +275,8 @@ class LiveSource:
     ) -> None:
         """Keep an image that has arrived now.
 
-        `waited_s`: by how much its transfer took longer than usual. `began_s`: start of its
-        arrival; the latency counts from there. `encoded`: as in `Frame`.
+        `waited_s`: by how much its transfer was slower than usual. `began_s`: start of its arrival;
+        the latency counts from there. `encoded`: as in `Frame`.
         """
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
@@ -294,8 +295,8 @@ class LiveSource:
 
 
 class WrappedSource:
-    """Wrapper of a source. Each frame of the inner source is passed to `change`, which must not
-    raise and may return a frame to give instead; all else is the inner source's."""
+    """Wrapper of a source. Each frame from the inner source is passed to `change`, which must not
+    raise and may return another frame instead. Everything else comes from the inner source."""
 
     def __init__(
         self, source: FrameSource, change: Callable[[Frame], Frame | None] = lambda frame: None
@@ -334,7 +335,7 @@ class WrappedSource:
 
 class GuardedSource:
     """Checks your own camera. An error that it raises, or an invalid frame, counts as a lost
-    camera; a live frame that is not newer than the last one is left out."""
+    camera; a live frame that is not newer than the last one is dropped."""
 
     def __init__(self, source: FrameSource, name: str, clock: Clock) -> None:
         self._source, self._name, self._clock = source, name, clock
@@ -345,8 +346,8 @@ class GuardedSource:
         self.live, self.size_px = bool(source.live), source.size_px
 
     def wait_first_frame(self, timeout_s: float) -> None:
-        """Wait for the first frame of a camera. Raises ConnectionFailed, TimedOut, with it
-        closed."""
+        """Wait for the first frame from a camera. Raises ConnectionFailed or TimedOut after closing
+        it."""
         end_s = time.monotonic() + timeout_s
         while self.live and (frame := self.poll(self._clock())) is None:
             if self._failure is None and time.monotonic() <= end_s:
@@ -434,8 +435,8 @@ _SECRET = re.compile(
 
 
 def without_password(text: str) -> str:
-    """The text without user names and passwords in URLs, and without the values of
-    ``password=`` and similar keys. In doubt too much is removed."""
+    """Return the text without user names and passwords in URLs, and without the values of
+    ``password=`` and similar keys. If in doubt, too much is removed."""
     if start := _URL.match(text):  # treat all of it as one URL, including spaces in the password
         text = start.group() + _without_name(text[start.end() :])
     else:
@@ -452,8 +453,8 @@ def _without_name(rest: str) -> str:
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """All keys of the profile for JSON, with passwords removed: a profile read back from it
-    cannot open a camera that needs one."""
+    """Return all keys of the profile for JSON, with passwords removed. A profile read back from it
+    cannot open a camera that needs a password."""
     record = profile.model_dump(mode="json")
     record["camera"]["source"] = without_password(profile.camera.source)
     return record | {"description": without_password(profile.description)}

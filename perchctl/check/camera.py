@@ -34,8 +34,8 @@ from perchctl.target import overhead_text
 from perchctl.vision import CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
-"""Image rates below which the check warns and fails, Hz. An AI-deck's program gives 8 as it is
-delivered, and a simulated vehicle perches with 7."""
+"""Image rates below which the check warns and fails, Hz. An AI-deck with its standard program sends
+8 images per second, and a simulated vehicle can perch with 7."""
 GAP_WARN = 0.4
 """Longest gap between images before the check warns, as a share of `safety.camera_hold_s`."""
 SEEN_WARN = 0.5
@@ -57,7 +57,7 @@ _RESTART, _NETWORK = (
     "switch the camera off and on again",
     "check the network between this computer and the camera",
 )
-"""Advice for sources of any other kind."""
+"""Advice for all other kinds of sources."""
 _LIGHT = "add light, lengthen the exposure, or take off the lens cap"
 _ADVICE = {
     "frozen": _RESTART,
@@ -86,7 +86,7 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """The rows of `picture_row_names` for a rehearsal; the first failed if no image came."""
+    """The rows of `picture_row_names` for a rehearsal. The first one fails if no image arrived."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture arrived during the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -113,7 +113,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge the longest gap between successive images."""
+    """Check the longest gap between successive images."""
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
@@ -207,8 +207,8 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """Judge the view from where the vehicle stands and on its way up. The row fails if `fly` would
-    refuse the flight."""
+    """Check whether the target is in view from where the vehicle stands and during the climb. The
+    row fails if `fly` would refuse the flight."""
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
@@ -243,7 +243,7 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by its processing time per image and by late ticks; None: skipped."""
+    """Check the loop's processing time per image and its late ticks; skipped for None."""
     if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

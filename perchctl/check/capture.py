@@ -1,5 +1,5 @@
-"""Rows on the motion capture that gives a vehicle its position: answer, body, rate, noise and axes.
-Pure.
+"""Rows on the motion capture that measures a vehicle's position: answer, body, rate, noise and
+axes. Pure.
 
 Let R_own be the vehicle's attitude by its own estimate, and R_seen by the capture. Let A be the
 rotation of the capture's world, and B that of the rigid body's axes; both should be the identity:
@@ -50,14 +50,14 @@ from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
 CAPTURE_S = 3.0
-"""Time for which the capture is watched, s. In less time, a body that drifts at 0.05 m/s does not
-show."""
+"""Time for which the capture is observed, s. Shorter: a body that drifts at 0.05 m/s is not
+detected."""
 CAPTURE_POLL_S = 0.005
 NOISE_FAIL = 4.0
 """Noise above which the row fails, in units of the `positioning.position_sigma_m` that the vehicle
 assumes."""
 WILD_M = 0.1
-"""Spread above which positions are taken for millimetres, m: no capture is that noisy."""
+"""Spread above which positions must be in millimetres, m, because no capture is that noisy."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ BODY_ROWS = ("body", "body place")
 
 
 def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Row]:
-    """The rows of a motion capture that cannot be opened or sends nothing."""
+    """The rows for a motion capture that cannot be opened or sends nothing."""
     advice = error.advice or (
         "check that it streams, that positioning.host is right, and that no firewall blocks it"
     )
@@ -124,7 +124,7 @@ def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Ro
 
 
 def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
-    """Judge the samples of a motion capture taken while the vehicle stood still."""
+    """Check samples from a motion capture that were taken while the vehicle stood still."""
     config = profile.positioning
     if not samples.frames:
         error = samples.error or PerchError(f"{config.label} sends no frames")
@@ -179,7 +179,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
 
 
 def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
-    """Judge the position by the criteria of `fly`."""
+    """Check the position by the criteria of `fly`."""
     newest = samples.telemetry[-1] if samples.telemetry else None
     place = places[-1].to_external(attitude=True)
     if newest is None:
@@ -224,9 +224,10 @@ BODY_FAIL_DEG = 15.0
 """Angle above which the row fails, deg. Larger: a body whose axes are rotated passes with a
 warning."""
 LEAST_RISE_M = 0.12
-"""Least displacement of a lift that shows the vertical, m. Larger: a short lift is of no use."""
+"""Least displacement of a lift that shows the vertical direction, m. Larger: a short lift is not
+sufficient."""
 HAND_REACH_M = 5.0
-"""Highest lift by hand, m: a body that moved farther is reported in another unit."""
+"""Largest possible lift by hand, m. If a body moved further, its positions are in another unit."""
 STRANGER = 0.4
 """Mean share of a rotation that A and B leave unexplained, above which the capture sees another
 body."""
@@ -340,7 +341,7 @@ def _turned_rad(attitudes: Rotation) -> Array:
 
 
 def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Judge whether vehicle and capture agree on the motion; skipped for None."""
+    """Check whether vehicle and capture agree on the motion; skipped for None."""
     if motion is None:
         return skipped(
             "there is no time at which both the vehicle and the capture reported", HOW_TO_TURN
@@ -383,8 +384,8 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
-    """Return what is wrong with the capture's world: it is tilted, mirrored, or has its axes
-    swapped. Its positions may have other axes than its attitudes."""
+    """Return what is wrong with the capture's world: it is tilted or mirrored, or its axes are
+    swapped. Its positions may use different axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
         found, axis = (

@@ -1,5 +1,5 @@
-"""Check that vehicle, motion-capture body and camera belong to the same home: rows on one of
-several vehicles on the floor.
+"""Check that vehicle, motion-capture body and camera belong to the same home. The rows are for one
+of several vehicles on the floor.
 
 ```
 vehicle  its LEDs blink, and somebody sees them blink at this home
@@ -8,8 +8,8 @@ target   its camera sees its target where it must be from this home
 ```
 
 Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
-camera would show the same, or if the target is not in view, perchctl asks somebody to cover the
-lens: an image that goes blind identifies the camera. Nothing is armed, and no motor turns.
+camera would show the same, or if the target is not in view, perchctl asks the user to cover the
+lens. The camera is identified by its image going dark. Nothing is armed, and no motor turns.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from perchctl.vehicle import DISARM_IT, FLYING, Telemetry
 from perchctl.vision import CameraModel, make_pipeline
 
 BODY_AT_HOME_M = 0.25
-"""Distance from a home within which a body stands there, m: half the least distance between a home
-and another vehicle's corridor. Larger: neighbours that have swapped places may pass. Smaller: homes
-measured by tape fail."""
+"""Distance from a home within which a body counts as standing there, m: half the smallest distance
+between a home and another vehicle's corridor. Larger: neighbours that have swapped places may pass.
+Smaller: homes measured by tape fail."""
 DARK_SHARE = 0.5
 """Share of dark or blank images above which a camera counts as covered. Larger: a hand that does
 not cover the whole lens is not recognised. Smaller: a camera with a bad signal counts as
@@ -53,15 +53,16 @@ Ask = Callable[[str], bool]
 
 @dataclass(frozen=True, kw_only=True)
 class Stand:
-    """Where one vehicle of several stands on the floor. All places and the heading are in the axes
-    of its own state estimate.
+    """Where one vehicle of several stands on the floor. All positions and the heading are in the
+    axes of its own state estimate.
 
     Attributes:
-        home_text: its home for people, in the axes of the room.
+        home_text: its home in words, in room axes.
         homes: of the other vehicles.
         views: where the target of each other vehicle would appear to be if its camera were taken
             for this vehicle's.
-        lookalikes: vehicles whose cameras would show a target where this vehicle's own must be.
+        lookalikes: vehicles whose cameras would show a target at the position at which this
+            vehicle's own target must appear.
     """
 
     name: str
@@ -74,8 +75,9 @@ class Stand:
 
 
 def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask) -> Iterator[Row]:
-    """Yield a vehicle's rows as they are known: address, vehicle, body (with motion capture),
-    camera and target. A failed row proves nothing. Errors: those of `perchctl.check.check`.
+    """Yield a vehicle's rows as soon as they are known: address, vehicle, body (with motion
+    capture), camera and target. A failed row does not identify anything. Errors: those of
+    `perchctl.check.check`.
 
     A simulated vehicle has its own simulator and camera, so nobody is asked.
     """
@@ -196,8 +198,8 @@ class View:
         return rehearse(self._telemetry, self.source, pipeline, flown, WallClock(), seconds)
 
     def _telemetry(self) -> list[Telemetry]:
-        """Roll and pitch are the vehicle's own. Before a flight, its position and yaw need not be
-        right."""
+        """Roll and pitch come from the vehicle. Position and yaw do not, because they may still be
+        wrong before a flight."""
         place_m = (*self.stand.home_m, self.profile.safety.ground_z_m)
         return [
             replace(
@@ -211,7 +213,8 @@ class View:
 
 
 def _target_finding(view: View, ask: Ask | None) -> Finding:
-    """Judge where the target is; `ask`: None if the camera can be no other vehicle's."""
+    """Check the position of the target. `ask` is None if the camera cannot belong to another
+    vehicle."""
     view.scope.announce(f"looking for the target for {view.scope.rehearse_s:g} s")
     target, stand = view.profile.target, view.stand
     expected_m = target.expected_xy_m
@@ -242,8 +245,8 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
 
 
 def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:
-    """Judge whether the camera goes blind while somebody covers the lens of the vehicle at this
-    home."""
+    """Check whether the camera image goes dark while the user covers the lens of the vehicle at
+    this home."""
     name = view.stand.name
     if _is_dark(before) or not before.pictures:
         return failed(f"{why}, and its pictures are dark", "add light, or see perchctl check")

@@ -31,12 +31,12 @@ from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
 
 LOOKS_UP = math.cos(math.radians(45.0))
-"""Vertical component of the view's direction below which the camera does not look at the
+"""Vertical component of the viewing direction below which the camera does not look at the
 ceiling."""
 
 
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
-    """A row for each check of the profile, the most important first.
+    """Return a row for each check of the profile, the most important first.
 
     `source` replaces the profile's camera source. Opens no link and no camera; reads the
     calibration file. Raises nothing.
@@ -165,7 +165,7 @@ def _latency(plan: _Plan) -> Finding:
 
 
 def log_finding(folder: Path) -> Finding:
-    """Judge the free space of the folder's disk, and whether the folder is writable, without
+    """Check the free space on the folder's disk, and whether the folder is writable, without
     creating it."""
     whole = folder.absolute()
     try:

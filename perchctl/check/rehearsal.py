@@ -1,7 +1,7 @@
-"""Run the flight loop's perception on live images for a few seconds, to find out what it sees and
-how long it takes.
+"""Run the flight loop's perception on live images for a few seconds, to find out what it detects
+and how long it takes.
 
-A rehearsal cannot send anything to the vehicle: it has only the telemetry of its link.
+A rehearsal cannot send anything to the vehicle, because it only has access to the telemetry.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from perchctl.vision import (
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
-"""Number of first frames that are not timed, because libraries are loaded meanwhile."""
+"""Number of first frames that are not timed, because libraries are still being loaded."""
 KEPT_FRAMES = 12
 TRACK_SETTLES_S = 0.5
 
@@ -64,7 +64,7 @@ class Rehearsal:
             vehicle came to rest.
         prints: the comparison of both markers; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
-        scheme: the kind of source, as ``camera``, which the advice depends on.
+        scheme: the kind of source, such as ``camera``, on which the advice depends.
     """
 
     live: bool
@@ -104,7 +104,8 @@ class Rehearsal:
 
 @dataclass(frozen=True)
 class _TelemetryOnly:
-    """With `feet_m`, the vehicle stands there: without positions, its own estimate runs away."""
+    """Stand-in link. If `feet_m` is given, the vehicle is assumed to stand there, because its
+    estimate diverges without positions."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None
@@ -136,7 +137,7 @@ def rehearse(
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """
-    polled: list[Frame] = []  # in this turn; at most one
+    polled: list[Frame] = []  # frame of this turn, at most one
     telemetry = rehearsal_telemetry(take, profile)
     senses = FlightInputs(telemetry, source, pipeline, profile, on_frame=polled.append)
     done = Rehearsal(source.live)
@@ -153,7 +154,9 @@ def rehearse(
             _note(done, frame, senses, prints, work_s, began_s)
         due_s += period_s
         if due_s < clock.now():
-            due_s = clock.now()  # as in the loop, missed turns are not made up for in a burst
+            due_s = (
+                clock.now()
+            )  # as in the flight loop, missed turns are not made up for with a burst
         clock.wait_until(due_s)
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""

@@ -1,4 +1,4 @@
-"""A row of the check: one question, its verdict, what was found and what to do."""
+"""A row of the check: a question, its verdict, the finding and advice."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs
 def evaluate_rows(
     judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
 ) -> list[Row]:
-    """A row for each judge (a check function), in the mapping's order."""
+    """Return a row for each check function, in the order of the mapping."""
     return [evaluate_row(name, judge, *args, **kwargs) for name, judge in judges.items()]
 
 
@@ -102,13 +102,13 @@ def problem_finding(problem: Problem | None, found: str) -> Finding:
 def limits_finding(
     value: float, warn_above: float, fail_above: float, found: str, advice: str
 ) -> Finding:
-    """Judge a value for which smaller is better; NaN fails."""
+    """Check a value for which smaller is better; NaN fails."""
     if value <= warn_above:
         return passed(found)
     return (warned if value <= fail_above else failed)(found, advice)
 
 
 def worst_finding(*findings: Finding) -> Finding:
-    """The worst finding; of equally bad ones the first."""
+    """Return the worst finding; the first one if several are equally bad."""
     order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
     return max(findings, key=lambda finding: order.index(finding.verdict))

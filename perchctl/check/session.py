@@ -1,4 +1,5 @@
-"""The whole check, which yields each row as it is known: vehicle, camera, computer and profile."""
+"""The complete check of vehicle, camera, computer and profile. It yields each row as soon as it is
+known."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ from perchctl.vision import CameraModel, Pipeline, make_pipeline
 class CheckScope:
     """Extent of a check: whether the vehicle is lifted by hand, and the duration of each part.
 
-    `announce` is called with a sentence on each step; `open_capture` opens a motion capture.
+    `announce` is called with a sentence about each step; `open_capture` opens a motion capture.
     """
 
     with_lift: bool = False
@@ -40,15 +41,15 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """Return the rows of `--scan`: the vehicles that answer at the default address and at `uri`
-    (None: only at the default one). Errors: InvalidValue."""
+    """Return the rows of `--scan`: the vehicles that answer at the default address and at `uri` (if
+    not None). Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.radio_scan_rows(*find_uris_and_problem(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
-    """Run all checks, and yield each row as it is known. Errors, before anything is opened:
+    """Run all checks and yield each row as soon as it is known. Errors, before anything is opened:
     InvalidValue, NotFound (files of the profile), UsageError (a library that does not load)."""
     check_options(options)
     if options.has_own_link:
@@ -115,7 +116,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
     try:
         opened = scope.open_capture(config)
     except UsageError:
-        raise  # a library that cannot be loaded is a fault of the computer, as in `fly`
+        raise  # a library that cannot be loaded is an error on the computer, as in `fly`
     except PerchError as error:
         return error
     stack.callback(opened.close)

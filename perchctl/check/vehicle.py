@@ -1,5 +1,4 @@
-"""Rows on the vehicle at the other end of the link: what it answers, contains and reports at
-rest."""
+"""Rows on the connected vehicle: its answers, its firmware and decks, and its telemetry at rest."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ from perchctl.vehicle import (
 
 LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
-"""Motion of the estimate at rest above which the check warns, m: a flight's estimate drifts by a
-fifth of it."""
+"""Motion of the estimate at rest above which the check warns, m: five times the drift in a normal
+flight."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "fly sends the positions, and waits for the estimate to agree"
@@ -77,18 +76,19 @@ def unanswered_row(error: ConnectionFailed, uri: str) -> Row:
 BUSY_ADVICE = "close other programs, or use a faster computer"
 WAKE_PERIOD_S = 0.005
 BUSY_SHARE = 0.5
-"""Share of a packet's delay by which this computer must be late to be a possible cause of it."""
+"""Share of a packet's delay that this computer's own lateness must explain to be a possible cause
+of it."""
 
 
 @dataclass(frozen=True)
 class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
-    `device_type`: the kind of vehicle, as its firmware names it; None without an answer.
+    `device_type`: the vehicle type reported by the firmware; None if it does not answer.
     `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
     infinite if lost, and meanwhile `wake_delays_s` of a thread of this computer; `telemetry`:
-    newest sample, `age_s` old; `displacement_m`: drift at rest; `samples`: all that came, oldest
-    first.
+    newest sample, `age_s` old; `displacement_m`: drift at rest; `samples`: all samples received,
+    oldest first.
     """
 
     uri: str
@@ -155,8 +155,8 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
 
 @contextlib.contextmanager
 def wake_delays() -> Iterator[list[float]]:
-    """Measure the delays, s, with which this computer wakes a sleeping thread, while the block
-    runs."""
+    """While the block runs, measure the delays, s, with which this computer wakes a sleeping
+    thread."""
     delays_s: list[float] = []
     ended = threading.Event()
 
@@ -175,12 +175,12 @@ def wake_delays() -> Iterator[list[float]]:
         sleeper.join()
 
 
-# --- Its rows ---
+# --- The rows ---
 
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    """Judge the echoes and, for a radio, its quality. If this computer itself was late, a slow
-    packet says nothing about the link."""
+    """Check the echo packets and, for a radio, the link quality. If this computer itself was late,
+    a slow packet says nothing about the link."""
     sent, quality = len(vehicle.round_trips_s), vehicle.link_quality
     back_s = sorted(filter(math.isfinite, vehicle.round_trips_s))
     advice = LINK_ADVICE.get(vehicle.link_scheme, BUSY_ADVICE)
@@ -199,7 +199,7 @@ def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     return worst_finding(
         limits_finding(lost, 0.01, 0.05, found, advice),
         limits_finding(p95_s, slow_s, limit_s, found, slow_advice),
-        # A radio repeats lost packets by itself, so losses show only in its quality.
+        # A radio repeats lost packets automatically, so losses only show in the link quality.
         limits_finding(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
     )
 
@@ -341,7 +341,7 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
     "level": _level,
     "battery": _battery,
 }
-"""The rows of a vehicle that answers, in their order."""
+"""The rows for a vehicle that answers, in order."""
 
 
 # --- Lifted by hand and put back, motors off ---
@@ -350,13 +350,13 @@ LIFTED = "lifted"
 LIFT_S = 20.0
 HOW_TO_LIFT = "lift it by 30 cm, hold it level, and put it back"
 LIFT_CHECK_M = 0.15
-"""Rise of the estimate above which a lift is judged, m. Larger: a short lift is skipped."""
+"""Rise of the estimate above which a lift is evaluated, m. Larger: a short lift is skipped."""
 FOLLOWED_M = 0.08
-"""Rise below which the estimate has not followed the lift, m. Larger: with a short lift, the
-positioning counts as blind. Smaller: an estimate that drifts counts as one that follows."""
+"""Rise below which the estimate has not followed the lift, m. Larger: after a short lift, the
+positioning seems not to work. Smaller: a drifting estimate seems to have followed the lift."""
 BACK_M = 0.10
-"""Difference between first and last height above which the position may drift, m. Larger: a drift
-passes."""
+"""Difference between first and last height above which the position may be drifting, m. Larger: a
+drift passes."""
 MOVED_G = 0.05
 """Deviation of the accelerometer from 1 g that shows a lift by hand; its noise at rest is a tenth
 of it."""
@@ -372,7 +372,7 @@ def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list
 
 
 def lift_finding(samples: Sequence[Telemetry]) -> Finding:
-    """Judge whether the estimated position followed the lift by hand."""
+    """Check whether the estimated position followed the lift by hand."""
     if not samples:
         return skipped("no telemetry")
     heights_m = [t.position_m[2] for t in samples]
@@ -391,11 +391,11 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
     return passed(found)
 
 
-# --- Which vehicles answer ---
+# --- Scan for vehicles ---
 
 
 def radio_scan_rows(uris: Sequence[str], radio_problem: Problem | None) -> list[Row]:
-    """A row for the radio, and one for each vehicle that answers, from the result of
+    """Return a row for the radio and one for each vehicle that answers, from the result of
     `find_uris_and_problem`."""
     radio = passed("scanned channels 0 to 125 at 250K, 1M and 2M")
     if radio_problem is not None:

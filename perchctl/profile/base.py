@@ -1,4 +1,4 @@
-"""The parts that all sections of a profile share."""
+"""Common parts of all sections of a profile."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Number = TypeVar("Number")
 Ordered = Annotated[
     tuple[Number, Number], AfterValidator(_ordered), Field(json_schema_extra={"ordered": True})
 ]
-"""Two numbers, the lower one first."""
+"""A pair of numbers, the lower one first."""
 Range = Ordered[float]
 
 
@@ -44,7 +44,8 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse YAML's yes, no, on and off, which pydantic would read as 1 and 0."""
+        """Refuse YAML's yes, no, on and off for numbers, because pydantic would read them as 1 and
+        0."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if _takes_numbers(kind) and _holds_switch(value):
             raise ValueError(

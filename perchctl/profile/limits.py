@@ -27,10 +27,10 @@ _KEY = re.compile(r"[a-z_]+(?:\.[a-z0-9_]+)+")
 
 @dataclass(frozen=True)
 class Limit:
-    """A relation between keys that a profile must hold.
+    """A relation between keys that a profile must fulfil.
 
     Attributes:
-        relation: in Python's own words, as in ``kalman.k1 + 0.1 < kalman.k2``.
+        relation: a Python expression, as in ``kalman.k1 + 0.1 < kalman.k2``.
         consequence: what happens if it is broken.
     """
 
@@ -44,7 +44,7 @@ class Limit:
 
     def holds(self, profile: Any) -> bool:
         """True if the profile's values fulfil the relation."""
-        # The relations are those of this module, and name keys and numbers only.
+        # The relations come from this module and only contain keys and numbers.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def violation_text(self, profile: Any) -> str:
@@ -147,8 +147,7 @@ _DOUBTFUL = {
         ),
     },
 }
-"""Relations by the name of their row in the check, and what a profile that breaks one can hardly
-do."""
+"""Relations by the name of their row in the check, and what hardly works if one is broken."""
 
 IMPOSSIBLE = tuple(Limit(*each) for each in _IMPOSSIBLE.items())
 """Relations whose violation makes every flight fail."""

@@ -1,7 +1,7 @@
 """Load a profile by name or path, check it, and return it as a frozen `Profile`.
 
-`load_profile(name)` reads the file, follows `extends`, and checks the result. Every fault is one
-`InvalidValue` sentence of the form ``file: key: what is wrong``.
+`load_profile(name)` reads the file, follows `extends`, and checks the result. Every error is an
+`InvalidValue` with one sentence of the form ``file: key: what is wrong``.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def is_profile_path(name: str) -> bool:
 
 
 def find_profile(name: str) -> Path:
-    """The file of a profile given by path or name. Errors: NotFound, which names the choices;
-    InvalidValue for another kind of file."""
+    """Return the file of a profile, given its path or name. Errors: NotFound, which lists the
+    available names; InvalidValue for another kind of file."""
     if is_profile_path(name):
         path = Path(name).expanduser()
         if path.is_file():
@@ -117,7 +117,7 @@ def target_keys(path: Path) -> dict[str, Any]:
 def check_profile(path: Path, text: str) -> None:
     """Raise NotFound or InvalidValue if the profile would not load with `text` as its content."""
     with warnings.catch_warnings():
-        # these notes were shown when the profile was loaded
+        # these notes were already shown when the profile was loaded
         warnings.simplefilter("ignore", ProfileNote)
         _checked(path, _values_of(text, path))
 
@@ -193,8 +193,8 @@ def find_mask(name: str) -> Path:
 
 
 def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return where the vehicle covers an image of that width and height: booleans (height, width),
-    true where the file is white. Errors: NotFound, InvalidValue."""
+    """Return the mask of the pixels that the vehicle covers, (height, width): True where the file
+    is white. Errors: NotFound, InvalidValue."""
     path = find_mask(name)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:

@@ -1,4 +1,4 @@
-"""The profile's keys of the mission: its seven phases, the two ways down, and safety."""
+"""The profile's keys for the mission: the seven phases, landing, and safety."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class CompleteConfig(Section):
 
 
 class RecoverConfig(Section):
-    """After a miss or a slip the vehicle descends, steadies and returns to phase 3."""
+    """After a miss or a slip, the vehicle descends, settles and returns to phase 3."""
 
     descend_m: ClassVar[float] = 0.10  # distance below the place where the attempt ended
     dwell_s: ClassVar[float] = 0.5

@@ -11,7 +11,7 @@ from perchctl.extensions import PATTERN, has_extension_form
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
-"""Tolerance of the rate, since frames do not arrive to the millisecond."""
+"""Tolerance of the rate, because frames do not arrive exactly on time."""
 MOST_CAPTURE_LATENCY_S = 0.04
 """Largest delay of a position, s, because the vehicle takes each one as its present position. With
 positions 40 ms late, it perches within 2 mm. At 50 ms, it may oscillate for a minute and then land
@@ -43,7 +43,7 @@ BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s":
 
 
 class PositionSource(Enum):
-    """The source of the position, and what follows from it for the code that relies on it."""
+    """The source of the position, with the properties on which other code depends."""
 
     DECK = "deck"
     MOCAP = "mocap"
@@ -57,8 +57,8 @@ class PositionSource(Enum):
 
     @property
     def is_mocap(self) -> bool:
-        """True if cameras in the room measure the position, in axes of their own, whatever the
-        vehicle itself sees."""
+        """True if cameras in the room measure the position, in their own axes and independently of
+        what the vehicle sees."""
         return self is PositionSource.MOCAP
 
     @property

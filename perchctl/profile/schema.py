@@ -1,6 +1,6 @@
 """The profile as a whole: every key, its unit, its default and its bounds.
 
-A profile is checked here and only here; `perchctl.profile.load` reads it from its file.
+Profiles are only checked here; `perchctl.profile.load` reads it from its file.
 `perchctl.profile.vision`, `perchctl.profile.mission` and `perchctl.profile.simulation` hold the
 larger sections.
 """
@@ -106,12 +106,12 @@ class Profile(Section):
     log: LogConfig = LogConfig()
 
     def with_(self, changes: Mapping[str, Any]) -> Profile:
-        """A copy with other values of some keys, checked as a profile's file is.
+        """Return a copy with new values for some keys, checked like a profile file.
 
-        `changes`: values by dotted key, as in ``{"camera.latency_s": 0.03}``. Another
-        `positioning.by` drops the keys of the method before. Raises InvalidValue
-        for an unknown key, a section instead of a key, or a value that is not allowed or does not
-        fit the other keys.
+        `changes`: values by dotted key, as in ``{"camera.latency_s": 0.03}``. A new
+        `positioning.by` drops the keys of the previous method. Raises InvalidValue for an unknown
+        key, a section instead of a key, or a value that is not allowed or does not fit the other
+        keys.
         """
         require_type("changes", changes, Mapping)
         values = self.model_dump(mode="json")
@@ -166,7 +166,7 @@ class Profile(Section):
         return self
 
 
-# --- What is wrong with a value ---
+# --- Errors in values ---
 
 
 _MOST_OF_A_FAULT = 1000
@@ -174,8 +174,8 @@ _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 
 def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, str]:
-    """The key of the first error, empty if it concerns several keys, and its reason. `model`: what
-    was validated."""
+    """Return the key of the first error (empty if it concerns several keys) and the reason.
+    `model`: what was validated."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -1,4 +1,4 @@
-"""The profile's keys of the simulation, from which a seed's flight is drawn."""
+"""The profile's keys for the simulation: the ranges from which a seed's flight is drawn."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class SimulationConfig(Section):
         None, "ids of the neighbours' large and small markers; none: the own target's"
     )
     camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
-    """Number of frames lost in one go."""
+    """Number of frames lost in succession."""
     first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
     """Share of the weight that a first contact carries if it does not hold."""
     ceiling_suction: Shares = key(

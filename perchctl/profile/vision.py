@@ -1,4 +1,4 @@
-"""The profile's keys of camera, target and pipeline."""
+"""The profile's keys for camera, target and pipeline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from perchctl.extensions import PATTERN
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
-# --- ArUco dictionaries by name, and the ids they hold ---
+# --- ArUco dictionaries by name, and the number of their ids ---
 
 
 @cache
@@ -35,7 +35,7 @@ def aruco_dictionary(name: str) -> Any:
 
 
 def dictionary_size(name: str) -> int:
-    """Return how many ids the dictionary holds (0 .. count - 1)."""
+    """Return the number of ids in the dictionary (0 .. count - 1)."""
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
@@ -80,7 +80,7 @@ class Mounting(Section):
     @field_validator("rpy_deg")
     @classmethod
     def _in_degrees(cls, rpy_deg: Vector3) -> Vector3:
-        """Refuse angles that are all multiples of an eighth of a turn written in radians."""
+        """Refuse angles that are all multiples of 45 deg written in radians."""
         turned = [(angle, _eighths(abs(angle))) for angle in rpy_deg if angle]
         if turned and all(eighths for _, eighths in turned):
             angle, eighths = turned[0]
@@ -111,8 +111,8 @@ START_LATENCY_S = 0.1
 """Latency at the start of a flight that measures it, s. It is the middle of the usable range, so
 until the flight knows more, images are at most 0.1 s newer or older than assumed."""
 USED_LATENCY_S = (0.02, 0.2)
-"""Latencies that such a flight uses, s. No camera is faster, and later images are of no use for
-steering."""
+"""Latencies that such a flight uses, s. No camera is faster, and later images are useless for
+control."""
 
 
 class CameraConfig(Section):
@@ -155,7 +155,7 @@ class CameraConfig(Section):
     @field_validator("latency_s", mode="before")
     @classmethod
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
-        """Refuse any value but a time or ``measured``, in one sentence."""
+        """Refuse any value other than a time or ``measured``, in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
@@ -275,7 +275,7 @@ class DetectorConfig(Section):
     )
     own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
     blurred: ClassVar[bool] = True  # only with lines: searched for where blur may hide the target
-    # number of images in a stream without the target before that search
+    # number of images without the target in a stream before that search
     blurred_every: ClassVar[int] = 4
     # only with lines: measured where the image's edge cuts both markers
     cut: ClassVar[bool] = True
