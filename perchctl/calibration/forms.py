@@ -1,19 +1,19 @@
 """Calibration files of other programs: recognise the form, and interpret each key.
 
-Confusing two lens models moves the target by centimetres at a standard deviation of millimetres,
-and nothing notices it later. Therefore the keys decide, according to one table for each form:
+Confusing two lens models moves the target by centimetres while its standard deviation is
+millimetres, and no later check detects this. Each form therefore has a table of its keys:
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must be neutral, as another value would change the projection (binning, xi, ...);
 - notes, which do not concern the projection of the camera's own images: those in the table, and
   keys that consist of words about boards, images, errors and dates.
 
-A key that is in no table might change the projection, so its file is refused, unless the value is 0
-or empty, with which no term of a lens model has any effect. Among the notes are
-`rectification_matrix` and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified
-images, while K and D belong to the camera's own.
+A key that is not in the table might change the projection, so the file is refused, unless the value
+is 0 or empty, which disables any term of a lens model. Among the notes are `rectification_matrix`
+and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified images, while K and D
+belong to the camera's own.
 
-Forms of programs that are known, but not read, are refused by their name.
+Known forms that are not supported are refused by name.
 """
 
 from __future__ import annotations
@@ -374,7 +374,7 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
 
 
 def _missing(key: str, values: Mapping[str, Any], unknown: list[str]) -> str:
-    """The sentence about a missing key, with the one that may have been meant."""
+    """Return the sentence about a missing key, with a similar key that may have been meant."""
     if close := difflib.get_close_matches(key, unknown, 1):
         return f"key {key} is missing: is {close[0]} a misspelling of it?"
     return (
@@ -400,7 +400,7 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
 
 
 def _check_region(found: _Found) -> None:
-    """Raise InvalidValue if the images are a section of those that were calibrated."""
+    """Raise InvalidValue if the images are a cropped part of the calibrated ones."""
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
             raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")
@@ -418,7 +418,7 @@ def _check_region(found: _Found) -> None:
 
 
 def _check_rms(found: _Found, width_px: int) -> None:
-    """Raise InvalidValue if the file itself says that it is of no use."""
+    """Raise InvalidValue if the file itself reports an error that makes it unusable."""
     for key, value in found.get("rms", []):
         rms_px = _numbers(key, value)
         if (rms_px > _MAX_RMS_SHARE * width_px).any():

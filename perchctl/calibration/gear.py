@@ -1,4 +1,4 @@
-"""Learn which part of the image the vehicle itself covers, from images taken while it moves.
+"""Find the part of the image that the vehicle itself covers, from images taken while it moves.
 
 While you turn the vehicle in your hand, only its own parts stay the same in the image. They are
 connected with the image's edge.
@@ -18,10 +18,10 @@ from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue
 
 LIVE_S = 20.0
-"""Time for which a live camera is watched, s."""
+"""Recording time with a live camera, s."""
 LEAST_PICTURES = 20
 MOST_GEAR_SHARE = 0.6
-_LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room pass by
+_LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the moving room
 _STILL_RATIO = 0.3  # share of that spread below which a pixel belongs to the gear
 _LEAST_BLOB_SHARE = 5e-4  # least share of the image for a part of the gear
 _CLOSED_PX = 7  # width of gaps that are filled; larger: pixels between two parts are covered, too

@@ -251,7 +251,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(200, "application/json", json.dumps({"ordered": name}).encode())
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing: requests are not worth a line on the terminal."""
+        """Print nothing, because requests should not clutter the terminal."""
 
     def _from_here(self) -> bool:
         origin = self.headers.get("Origin")

@@ -23,10 +23,10 @@ from perchctl.sim import Neighbour, Scenario
 P = Phase
 FAULT_STREAM = 510
 LONGEST_LOSS_S = 30.0
-"""Upper end of the duration of a temporary loss, s; the lower end is 0.1 s. Larger: fewer losses
-are short enough to be waited out."""
+"""Longest duration of a temporary loss, s; the shortest is 0.1 s. Larger: fewer losses end before
+the vehicle has to land."""
 EVER_SHARE = 0.25
-"""Share of the losses that are permanent. Larger: fewer end in flight."""
+"""Share of losses that are permanent. Larger: fewer losses end during the flight."""
 
 
 # --- Draws ---
@@ -75,7 +75,7 @@ def either(probability: float, first: Any, second: Any) -> Draw:
 
 
 def random_sign(size: Draw) -> Draw:
-    """Draw a number with `size`, and make it negative in half of the draws."""
+    """Draw a number with `size` and give it a random sign."""
     return lambda source: (1.0 if draw_bool(source, 0.5) else -1.0) * size(source)
 
 
@@ -136,7 +136,7 @@ def _drift(source: DrawInputs) -> e.Axes:
 
 
 def _blow(source: DrawInputs) -> e.Axes:
-    """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s."""
+    """Draw the force of a 40 ms blow that changes the speed by up to 1 m/s."""
     x, y = draw_direction(source)
     z = uniform(-0.5, 0.5)(source)
     force_n = source.scenario.mass_kg * uniform(0.2, 1.0)(source) / 0.04
@@ -397,7 +397,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "motor-weak", "one motor has 15 % less thrust", effect(e.thrust_changed, to=_one_weak_motor)
     ),
-    # What pushes.
+    # External forces.
     Fault("kick", "a blow of 0.2 to 1 m/s", KICK),
     Fault("gust", "a gust of 5 to 20 % of the weight, for 0.5 to 1 s", GUST),
     # The magnet.
@@ -476,7 +476,7 @@ FAULTS: tuple[Fault, ...] = (
         effect(e.slow, tick_s=uniform(0.1, 0.4), for_s=duration_s(0.5)),
     ),
     Fault("disk-full", "the log cannot be written", effect(e.disk_full, for_s=duration_s())),
-    # Readings that stand still.
+    # Frozen readings.
     Fault("position-frozen", "position and velocity are frozen", frozen_logs(*STATE)),
     Fault(
         "attitude-frozen",
@@ -490,7 +490,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("thrust-frozen", "the thrust is frozen", frozen_logs("stabilizer.thrust")),
     Fault("supervisor-frozen", "the supervisor's state is frozen", frozen_logs("supervisor.info")),
-    # What nothing announces.
+    # Undetectable faults.
     Fault(
         "thrust-changed",
         "hover thrust up to 8 % higher or lower",
@@ -523,7 +523,7 @@ FAULTS: tuple[Fault, ...] = (
         "the loop hangs, and 1 or 2 of the watchdog's packets are lost",
         _hung_and_packet_lost,
     ),
-    # What stays.
+    # Permanent faults.
     Fault(
         "latency-falls",
         "pictures arrive 100 to 200 ms sooner than before",
@@ -538,7 +538,7 @@ FAULTS: tuple[Fault, ...] = (
 )
 
 NO_FAULT = Fault("none", "no fault", (), ())
-"""The effects of a flight without a fault, in a campaign in which other flights have one."""
+"""The effects in a flight without a fault, in a campaign in which other flights have faults."""
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 

@@ -1,4 +1,4 @@
-"""Common causes: one fault that hits several vehicles of a fleet at the same moment."""
+"""Common causes: one fault that affects several vehicles of a fleet at the same time."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from perchctl.mission import Phase
 from perchctl.sim import Scenario
 
 STALL_S = 2.0
-"""Duration for which the computer stalls, s. Larger: the firmware cuts the motors, which no program
-can prevent."""
+"""Duration of the computer's stall, s. Larger: the firmware cuts the motors, which no program can
+prevent."""
 
 
 @dataclass(frozen=True)
 class CommonCause:
-    """A fault that hits several vehicles at once.
+    """A fault that affects several vehicles at once.
 
     Attributes:
         fault: name, description and effects, as for a fault of one vehicle.
@@ -40,7 +40,7 @@ class CommonCause:
         (`FaultyFlight.begin_fault`), in whatever phase a vehicle is."""
         effects = self.fault.draw
         assert callable(effects)
-        # No flight leaves its last phase, so these effects never begin on their own.
+        # No flight leaves its final phase, so these effects never begin on their own.
         return Case(self.fault, Phase.PERCHED, math.inf, (effects(DrawInputs(rng, scenario)),))
 
 

@@ -20,7 +20,7 @@ from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.sim import SimulatedVehicle
 from perchctl.vision import Frame
 
-# --- The radio: what arrives, what does not, and what comes late ---
+# --- The radio: lost and delayed packets ---
 
 
 def packet_kind(packet: Packet) -> str:
@@ -220,7 +220,7 @@ class FaultyClock:
 
     def now(self) -> float:
         if self.killed_s is not None:
-            raise ProgramKilled  # it can neither rescue nor report anything any more
+            raise ProgramKilled  # it can no longer rescue the vehicle or report anything
         return self._link.now_s
 
     def wait_until(self, t_s: float) -> None:
@@ -244,7 +244,7 @@ class FaultyClock:
             self._radio.cut = True
 
     def suspend(self, for_s: float) -> None:
-        """Let `for_s` pass while all of the program's threads stand still."""
+        """Let `for_s` pass while all threads of the program are suspended."""
         self._link.vehicle.advance_to(self._link.now_s + for_s)
 
     def hang(self, for_s: float) -> None:

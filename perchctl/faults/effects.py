@@ -65,7 +65,7 @@ def packet_twice(rig: FaultRig, t_s: float, order: str) -> None:
 
 def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
     """Reboot the vehicle after a voltage drop: its motors stop, it receives nothing for `boots_s`,
-    and its log blocks are gone until the link starts them again."""
+    and its log blocks are missing until the link restarts them."""
     rig.vehicle.firmware.reboot()
     rig.radio.lose(t_s + boots_s, uplink=True, block="all")
     rig.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), uplink=False, block="all")
@@ -132,7 +132,8 @@ def estimate_error(
 def log_reads(
     rig: FaultRig, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
 ) -> None:
-    """Let the log variables `names` report `value` for `for_s`; None: their present values."""
+    """Make the log variables `names` report `value` for `for_s`; None: freeze them at their current
+    values."""
     firmware = rig.vehicle.firmware
     for name in names:
         firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
@@ -230,7 +231,7 @@ def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
     rig.set_until(t_s + for_s, rig.disk, "problem", "No space left on device", None)
 
 
-# --- What holds from the start ---
+# --- Effects from the start of the flight ---
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
@@ -307,7 +308,7 @@ class Injector:
                 )
 
     def tick(self, tick: Tick) -> None:
-        """Note the phase and, from it, when the effects are due."""
+        """Record the phase, and determine when the effects are due."""
         if self.flown is None and self._shakes_mps2:
             self._edges.vehicle.firmware.estimator.add_accelerometer_bias(self._shakes_mps2)
         self.flown = tick.state.phase
@@ -330,7 +331,7 @@ class Injector:
 
 
 def _measure(rig: FaultRig, noise: random.Random, _now_s: float) -> None:
-    """Give a position from the deck to the estimator."""
+    """Pass a position from the deck to the estimator."""
     if rig.deck_silent:
         return
     world, firmware = rig.vehicle.world, rig.vehicle.firmware

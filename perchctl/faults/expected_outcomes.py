@@ -1,7 +1,7 @@
 """Outcomes that physics or the firmware make unavoidable.
 
-Their causes are read from what was true in the flight (`Facts`), not from the fault that was drawn
-and not from what the program reported.
+Their causes are taken from the ground truth of the flight (`Facts`), not from the drawn fault or
+the program's reports.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from perchctl.faults.truth import Facts
 # from a lower height, a slip ends on the floor (docs/firmware.md, "Catching a slip")
 CATCHABLE_M = 1.0
 NOTICED_S = 1.5
-"""Time until a low battery reading is believed, s. Larger: a landing that begins late is
+"""Time until the program must accept a low battery reading, s. Larger: a late landing is
 excused."""
 FASTEST_LANDING_MPS = 0.4
 """Highest speed of a landing, m/s. Smaller: a landing that takes long is excused."""
 PUSHED_OFF_S = 0.2
-"""Time after which a blow of 0.04 s has torn the vehicle off the magnet, if at all, s."""
+"""Longest time until a blow of 0.04 s tears the vehicle off the magnet, s."""
 
 
 FALL: tuple[Flag, ...] = ("fell", "slid")

@@ -76,7 +76,7 @@ class FaultyFlight:
 
     Args:
         on_sample: called with the vehicle's time every `e.SAMPLE_S` of the flight, after the judge
-            has seen it: where a fleet's flights wait for each other.
+            has seen it: the flights of a fleet wait for each other there.
         others: (name, position m) of the other rigid bodies of a motion capture; None: as drawn.
     """
 
@@ -174,7 +174,7 @@ class FaultyFlight:
         return self._end
 
     def land(self) -> None:
-        """Order a landing, as the operator would."""
+        """Command a landing, as the operator would."""
         self._switch.land()
 
     def begin_fault(self) -> None:
@@ -187,7 +187,7 @@ class FaultyFlight:
             injector.tick(tick)
 
     def event(self, event: Event) -> None:
-        """Give the claims of a rescue's event to the oracle."""
+        """Pass the claims of a rescue event to the oracle."""
         self._oracle.add_claims(rescue_claims(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:

@@ -1,4 +1,4 @@
-"""Judges by the simulator's ground truth alone whether a simulated flight went wrong.
+"""Judge only by the simulator's ground truth whether a simulated flight went wrong.
 
 The oracle raises flags (docs/campaigns.md, "Faults").
 """
@@ -30,7 +30,7 @@ FLAGS: dict[Flag, str] = {
     "lied": "perchctl reported a false state at the end",
     "locked_needlessly": "locked without a crash, tumble or excess tilt",
 }
-"""What can go wrong and what each flag means, the most serious first."""
+"""The flags and their meanings, the most serious first."""
 
 LEAST_FALL_HEIGHT_M = 0.1
 """Below this height nothing counts as a fall."""
@@ -57,14 +57,15 @@ ALONE_S = 5.0
 TILT_WITHIN_DEG = 10.0
 """A claim of excess tilt is accepted from this much below the limit."""
 CLAIM_S = 0.5
-"""A claim must become true within this time (motors are cut 25 ms after the order)."""
+"""Time within which a claim must become true, s. Motors are cut 25 ms after the command."""
 SAY_OFF: frozenset[Claim] = frozenset(
     {"held off the target", "hangs", "stands", "hangs or stands", "motors off"}
 )
 SEEN_S = 6.0
-"""A vehicle at rest whose telemetry arrived for this long must have been seen."""
+"""Time for which the telemetry of a vehicle at rest must arrive before the program must have
+noticed it, s."""
 STOP_S = 0.5
-"""The motors must be off this long after the order to cut them."""
+"""Time after the command to cut the motors at which they must be off, s."""
 SECOND_PRESS_S = 0.3
 """A second press counts from this long after the first (docs/safety.md)."""
 KEY_HELD_S = 1.0
@@ -112,7 +113,8 @@ def drop_limit_m(hold_ratio: float) -> float:
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
-    """The time at which these presses of Ctrl-C order an emergency stop; None if they never do.
+    """Return the time at which these presses of Ctrl-C command an emergency stop; None if they
+    never do.
 
     The presses come from a hand, or from a key that repeats faster than a hand can."""
     for number, press_s in enumerate(presses_s):
@@ -192,14 +194,15 @@ class Oracle:
         self._end_s = math.inf
 
     def add_claims(self, claims: Iterable[Claim], t_s: float) -> None:
-        """Note claims that the program made at `t_s`."""
+        """Record claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 
     def note_ctrl_c(self, t_s: float) -> None:
         self._presses_s.append(t_s)
 
     def note_program_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
-        """Note when the program ended; `crashed`: by an unplanted exception, `endless`: killed."""
+        """Record when the program ended. `crashed`: by an exception that was not injected;
+        `endless`: it was killed."""
         self._end_s = t_s
         if crashed:
             self._raise("crashed", t_s)
@@ -208,7 +211,7 @@ class Oracle:
 
     @property
     def stop_s(self) -> float | None:
-        """The time at which Ctrl-C orders the emergency stop, or None."""
+        """Time at which Ctrl-C commands the emergency stop, or None."""
         return emergency_stop_s(self._presses_s)
 
     def update(self, sample: Sample) -> None:
@@ -355,7 +358,7 @@ def _airborne(s: Sample) -> bool:
     return not s.on_floor and s.height_m > LEAST_FALL_HEIGHT_M
 
 
-# --- What the program says at its end, as claims about the vehicle that are true or false ---
+# --- The program's final messages, as claims about the vehicle that are true or false ---
 
 
 Claims = set[Claim]

@@ -1,5 +1,5 @@
-"""How flights with faults ended: one flight's result, and a campaign's figures for JSON and as a
-table."""
+"""Results of flights with faults: a single flight's result, and a campaign's figures for JSON and
+as a table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENDS = {
     "failed": "an exception ended the flight after the rescue",
     "gone": "the program ended before its flight",
 }
-"""How a flight can end, and what it means."""
+"""The ways in which a flight can end, and their meanings."""
 
 
 @dataclass(frozen=True)

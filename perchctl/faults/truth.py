@@ -155,14 +155,15 @@ class FactsRecorder(Facts):
         self._watch_s = complete.hang_s + complete.watch_s - WATCH_WITHIN_S
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
-        self._silent_s: float | None = None  # start of the present silence
+        self._silent_s: float | None = None  # start of the current silence
         self._heard_s = -math.inf  # end of the newest silence that was long enough for a cut
         self._landed_alone = self._begun = False
         self._hangs_s: float | None = None  # time since which the whole weight has hung
         self._before: Sample | None = None
 
     def update(self, sample: Sample) -> None:
-        """Note the next sample; the caller sets `begin_s` before, once the fault has begun."""
+        """Record the next sample. The caller must set `begin_s` before, once the fault has
+        begun."""
         before = self._before
         self._note_silence(sample)
         self._note_hanging(sample)
@@ -220,7 +221,7 @@ class FactsRecorder(Facts):
             self.battery_low_s, self.battery_low_m = s.t_s, s.height_m
 
 
-# --- What a flight is held to ---
+# --- Requirements on a flight ---
 
 
 Place = tuple[float, float]
@@ -238,7 +239,7 @@ seen."""
 NO_SIGHT = (*NO_PICTURE, "covered")
 NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
-"""A loss that ends this soon after its limit may have been waited out, s."""
+"""If a loss ends this soon after its limit, it is acceptable that the vehicle kept waiting, s."""
 REACTION_S = 1.0
 """Longest time from the profile's limit to the descent, s: one turn's delay, and the time for the
 thrust to decrease."""
@@ -357,8 +358,8 @@ class UndetectedDrift:
 
 
 class DescentBound:
-    """Decides when the vehicle must descend: at once on the operator's order or an exception,
-    otherwise once the fault has lasted longer than the profile waits."""
+    """Decides when the vehicle must descend: at once on the operator's command or an exception,
+    otherwise once the fault has lasted longer than the profile's waiting time."""
 
     def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
@@ -366,7 +367,8 @@ class DescentBound:
         self._from_m: float | None = None  # the vehicle's height when the descent was due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
-        """Note when the fault began, and the program's phase then; further calls do nothing."""
+        """Record when the fault began, and the program's phase at that time. Further calls do
+        nothing."""
         if self._due_s is None:
             phase = phase or Phase.APPROACH
             limits_s = [landing_due_s(effect, self._profile, phase) for effect in self._effects]
@@ -382,7 +384,7 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """True if the vehicle should have come down by now and has not.
+        """True if the vehicle should have descended by now but has not.
 
         A vehicle that has been `touching` the ceiling in time may hang there; without `uplink` the
         time to obey starts anew. `lands`: the onboard landing is active, which counts as coming

@@ -1,4 +1,5 @@
-"""The airframes of simulated vehicles: what their firmware announces, and their motors.
+"""The airframes of simulated vehicles: their firmware's device type and parameters, and their
+motors.
 
 Figures are the firmware's own platform defaults (release 2026.08), measured on a thrust stand; the
 firmware is built for one airframe.
@@ -16,7 +17,7 @@ class ThrustCurve:
     Attributes:
         coefficients: of the cubic in that voltage, N, N/V, N/V^2, N/V^3.
         most_n: thrust at the full command.
-        least_n: a command below this is no thrust at all.
+        least_n: a command below this gives no thrust.
     """
 
     coefficients: tuple[float, float, float, float]

@@ -1,5 +1,4 @@
-"""The simulated camera: when frames are exposed, which ones are lost, and when the others
-arrive."""
+"""The simulated camera: when frames are exposed, which are lost, and when the others arrive."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ class DeliveredFrame:
 
 
 class SimCamera:
-    """A camera that exposes at `camera_rate_hz` with a phase of its own. The same seed gives the
-    same bytes.
+    """A camera that exposes at `camera_rate_hz` with a random phase. The same seed gives the same
+    bytes.
 
     Each exposure draws the same random numbers whether or not it is lost, and a
     frame's noise depends on its index, so neither faults nor the steps of
@@ -69,7 +68,7 @@ class SimCamera:
         rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
-        self._newest: DeliveredFrame | None = None  # an image that the receiver gives out again
+        self._newest: DeliveredFrame | None = None  # an image that the receiver repeats
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -86,7 +85,8 @@ class SimCamera:
             self._index += 1
 
     def take(self) -> list[DeliveredFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, each
+        once."""
         arrived = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             arrived.append(self._under_way.popleft())
@@ -106,8 +106,8 @@ class SimCamera:
         return given_out
 
     def take_newest(self, count: int) -> list[DeliveredFrame]:
-        """Take the frames, but return only the newest `count` exposures. If a receiver repeats an
-        exposure, its first and its last copy are returned."""
+        """Remove the arrived frames, but return only the newest `count` exposures. If a receiver
+        repeats an exposure, its first and its last copy are returned."""
         frames = self.take()
         last = sorted({frame.index for frame in frames})[-count:]
         ends = [[frame for frame in frames if frame.index == index] for index in last]
@@ -146,8 +146,8 @@ class SimCamera:
 
 POSES_PER_EXPOSURE = 3
 READOUT_MOMENTS = 5
-"""Number of moments in a read-out between which the camera's motion is taken as straight; they are
-5 ms apart for a read-out of 20 ms."""
+"""Number of moments in a read-out between which the camera's motion is assumed to be linear; they
+are 5 ms apart for a read-out of 20 ms."""
 FLICKER_HZ = 100.0  # flicker of lamps on 50 Hz mains
 PUMPING_HZ = (0.4, 2.0)
 """Range of rates at which the automatic exposure may oscillate, Hz."""

@@ -42,7 +42,7 @@ class CaptureFault:
         occluded: the vehicle's body is hidden from the cameras.
         frozen: all bodies are reported where they were last seen, to the last digit.
         gone: no frame is sent.
-        swapped: the vehicle's body and another one have changed names: the one called
+        swapped: the vehicle's body has swapped names with another body: the one called
             `swapped_with`, or the first other one if that is None.
         scale: factor on all positions; 1000 is millimetres.
         mirrored: the sign of y is inverted, as by a program with left-handed axes.
@@ -66,9 +66,9 @@ class CaptureSettings:
     """A simulated motion-capture system and its faults; SI units.
 
     Attributes:
-        body: name of the vehicle's rigid body; `body_*`: its pose in the vehicle's axes.
-        others: (name, position m) of each other rigid body. It stands still, unless somebody
-            moves it (`SimCapture.others_m`).
+        body: name of the vehicle's rigid body; `body_*`: its pose in body axes.
+        others: (name, position m) of each other rigid body. It stands still unless it is moved
+            (`SimCapture.others_m`).
         rate_hz: frame rate of the system's cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
@@ -97,7 +97,8 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """The motion capture of the seed's flight; None if the profile uses no motion capture."""
+    """Return the motion capture for the seed's flight; None if the profile uses no motion
+    capture."""
     config, sim = profile.positioning, profile.simulation
     if not config.source.is_mocap:
         return None
@@ -132,7 +133,7 @@ class SimCapture:
         self.settings = settings
         self._rng = np.random.default_rng([settings.seed, _CAPTURE_STREAM])
         self._faults = list(settings.faults)
-        self.others_m = [position_m for _, position_m in settings.others]  # their present positions
+        self.others_m = [position_m for _, position_m in settings.others]  # their current positions
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._R_capture_world = rot_z(settings.heading_rad)
         self._due_s = float(self._rng.random()) / settings.rate_hz
@@ -142,14 +143,14 @@ class SimCapture:
         self._under_way: deque[CaptureFrame] = deque()
 
     def begin_fault(self, fault: CaptureFault, for_s: float = math.inf) -> None:
-        """Begin a fault now, for `for_s` of simulated time."""
+        """Start a fault now that lasts for `for_s` of simulated time."""
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def end_faults(self) -> None:
         self._faults.clear()
 
     def advance(self, world: World) -> None:
-        """Take a frame of `world` if an exposure is due; called each control period."""
+        """Capture a frame of `world` if an exposure is due. Called in each control period."""
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
             return
@@ -297,7 +298,8 @@ def _models(names: Sequence[str]) -> bytes:
 
 
 def frame_message(number: int, names: Sequence[str], frame: CaptureFrame) -> bytes:
-    """The NatNet message of a frame; each of `names` that it lacks is marked untracked."""
+    """Return the NatNet message for a frame. Bodies in `names` that are missing in the frame are
+    marked as untracked."""
     parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
     parts.append(struct.pack("<i", len(names)))
     for index, name in enumerate(names, 1):

@@ -1,4 +1,4 @@
-"""A Crazyflie's end of the link: packets in, firmware calls, packets out.
+"""The Crazyflie's side of the link: packets in, firmware calls, packets out.
 
 It uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything that an
 unmodified cflib sends is answered as described in docs/firmware.md ("Connect sequence"). "Link"
@@ -282,7 +282,7 @@ class CrtpServer:
         return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
     def due_packets(self) -> list[Packet]:
-        """Return the packets of log data that are due by now."""
+        """Return the log data packets that are due now."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():
@@ -292,7 +292,7 @@ class CrtpServer:
         return packets
 
     def reboot(self) -> None:
-        """Restart the firmware, which loses its log blocks."""
+        """Restart the firmware. Its log blocks are lost."""
         self._firmware.reboot()
         self._blocks.clear()
 
@@ -310,7 +310,7 @@ class CrtpServer:
                 return data
             case Port.LINK, 1:
                 return _LINK_SOURCE
-            case Port.LINK, 3:  # the probe of a scan, and the power commands of the radio chip
+            case Port.LINK, 3:  # the probe packet of a scan, and the radio chip's power commands
                 if data.startswith(_RESTARTS):
                     self.reboot()
                 return data
@@ -409,7 +409,7 @@ class CrtpServer:
         return data[:2] + bytes((OK,)) + self._value(name)
 
     def _write(self, data: bytes) -> bytes | None:
-        """Answer with the value that is kept; read-only parameters do not change."""
+        """Answer with the value after the write. Read-only parameters do not change."""
         name = self._param_toc.name(data[:2])
         if name is None:
             return data[:2] + bytes((ENOENT,))

@@ -1,4 +1,4 @@
-"""The air that one hovering vehicle blows onto another below it.
+"""The downwash of a hovering vehicle on another vehicle below it.
 
 A hovering quadrotor's four wakes merge into one round turbulent jet (Bauersfeld, Muller, Ziegler,
 Coletti and Scaramuzza, "Robotics meets fluid dynamics: a characterization of the induced airflow
@@ -10,10 +10,10 @@ axis:
     u = U 10.11 / d / (1 + 0.414 (r / h)^2)^2      its speed, straight down
     h = 0.0767 l d                                 its half-width
 
-As a wind that acts through perchctl's drag model, this jet pushes less than the recordings of
-Neural-Swarm2 show exactly below a vehicle, and as much as they show beside it (Shi, Hoenig, Shi,
-Yue and Chung, 2021). Therefore the wind on the axis is the jet times `AXIS_FACTOR`, and the factor
-falls to 1 within the width of a vehicle.
+If this jet acts as a wind through perchctl's drag model, its force matches the recordings of
+Neural-Swarm2 next to the axis, but is too small exactly below a vehicle (Shi, Hoenig, Shi, Yue and
+Chung, 2021). Therefore the wind on the axis is the jet times `AXIS_FACTOR`, and the factor falls to
+1 within the width of a vehicle.
 
 Three effects are not modelled: the flow after the jet has met the floor, the air between two
 vehicles close to the same ceiling, and jets that tilt with their vehicle.
@@ -38,15 +38,15 @@ WIDTH = 0.0767
 SHAPE = 0.414
 """Shape factor with which the speed falls to half at the half-width."""
 JET_BEGINS_M = 0.25
-"""Distance from which on the jet was measured, m; closer to the rotors, the speed at this distance
-is used. Smaller: air faster than anybody has measured."""
+"""Distance below the rotors at which the measurements of the jet begin, m. Closer to the rotors,
+the speed at this distance is used. Smaller: higher speeds than were ever measured."""
 AXIS_FACTOR = 1.5
 """Factor on the jet along its axis as a wind that acts on a drag of 0.009 N/(m/s). A vehicle of 42
-g then pushes with 6.3 g at 0.5 m, where the recorded vehicles of 34 g feel 5.9 g. Larger: a harder
-push exactly below."""
+g then pushes with 6.3 g at 0.5 m, where the recorded vehicles of 34 g feel 5.9 g. Larger: a
+stronger push exactly below the vehicle."""
 FACTOR_RADIUS_M = 0.05
-"""Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: a harder push
-beside the axis, although the recordings need no factor at 0.1 m."""
+"""Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: a stronger
+push next to the axis, although the recordings need no factor at 0.1 m."""
 LEAST_MPS = 0.01
 """Speed below which a jet is ignored, m/s, so that vehicles far apart fly exactly as if alone. It
 is the speed 2 m below and 1 m beside the source. Larger: the drag force at this speed is
@@ -55,7 +55,8 @@ missing."""
 
 def jet_mps(thrust_n: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed of the air, `below_m` below a vehicle and `aside_m` from its axis;
-    `thrust_n` is the total thrust of its rotors. 0 beside or above the vehicle. SI units."""
+    `thrust_n` is the total thrust of its rotors. 0 outside the jet or above the vehicle. SI
+    units."""
     if below_m <= 0.0 or thrust_n <= 0.0:
         return 0.0
     rotors_m2 = 8.0 * AIR_DENSITY_KGPM3 * math.pi * ROTOR_RADIUS_M**2

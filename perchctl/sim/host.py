@@ -1,5 +1,5 @@
-"""The host of the simulated vehicle, in a process of its own: its link, its video, and the room's
-motion capture."""
+"""The host of the simulated vehicle, which runs in a separate process: its link, its video, and the
+room's motion capture."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ class VehicleHost:
 
     @property
     def elapsed_s(self) -> float:
-        """Simulated time since the start; no reboot resets it."""
+        """Simulated time since the start. A reboot does not reset it."""
         return self._steps * CONTROL_PERIOD_S
 
     def serve(self) -> None:
-        """Answer the packets that have arrived, without letting time pass; log data waits for the
-        next step."""
+        """Answer the packets that have arrived without advancing time. Log data waits for the next
+        step."""
         while True:
             try:
                 datagram, address = self.socket.recvfrom(64)
@@ -135,7 +135,7 @@ class VehicleHost:
         return getattr(of, name)(*arguments, **named)
 
     def silence_link(self, duration_s: float) -> None:
-        """Let the link neither receive nor send for `duration_s` of simulated time."""
+        """Stop the link from receiving and sending for `duration_s` of simulated time."""
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def truth(self) -> dict[str, Any]:
@@ -158,7 +158,7 @@ class VehicleHost:
         }
 
     def replace_vehicle(self, scenario: Scenario) -> None:
-        """Replace the vehicle by a new vehicle; connection and log blocks stay."""
+        """Replace the vehicle with a new one. The connection and log blocks are kept."""
         self.vehicle = SimulatedVehicle(scenario, **self._parts)
         self.server.replace_firmware(self.vehicle.firmware)
 
@@ -171,7 +171,7 @@ class VehicleHost:
     def _send(self, packets: Iterable[Packet], address: Address) -> None:
         for packet in packets:
             if self._passes():
-                with contextlib.suppress(OSError):  # lost as over the air
+                with contextlib.suppress(OSError):  # lost, as over the air
                     self.socket.sendto(packet.encode(), address)
 
     def _passes(self) -> bool:
@@ -185,14 +185,14 @@ class VehicleHost:
 
 
 LOOP_PATIENCE_S = 2.0
-"""Time on the wall clock for which the simulator waits for a loop that shows no sign of life, s."""
+"""Wall-clock time for which the simulator waits for a flight loop that does not respond, s."""
 
 
 def serve_parent(
     channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
 ) -> None:
-    """Run the vehicle until the parent closes the channel or is gone. Send the parent the host's
-    addresses first and, if the vehicle fails, the error as text."""
+    """Run the vehicle until the parent closes the channel or ends. First send the parent the host's
+    addresses; if the vehicle fails, send the error as text."""
     os.setsid()  # detached from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # rendering must not slow down the physics
@@ -213,14 +213,14 @@ def serve_parent(
 
 
 MAX_LAG_S = 1.0
-"""Delay above which the simulator does not catch up but drops the time, s, as after a suspension of
-the computer."""
+"""Delay above which the simulator skips time instead of catching up, s, for example after the
+computer was suspended."""
 _IDLE_S = 0.25
 _CATCH_UP_STEPS = 50  # steps between two polls of the control connection while catching up
 
 
 class HostRunner:
-    """Runs one host until its parent is gone."""
+    """Runs one host until its parent has ended."""
 
     def __init__(
         self,
@@ -252,7 +252,7 @@ class HostRunner:
                     self._channel.send(self._answer(*self._channel.recv()))
 
     def catch_up(self) -> float:
-        """Step up to now, in limited batches; return the time to wait for the next step, s."""
+        """Step until now in limited batches. Return the time to wait for the next step, s."""
         now_s = self._clock() - self._origin_s
         max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else SharedTime.MARGIN_S
         if now_s - self._host.elapsed_s > max_lag_s:
@@ -276,7 +276,7 @@ class HostRunner:
             return False
         now_s, self._limit_s = self._clock(), limit_s
         if self._waiting_since_s is None or limit_s != before_s:
-            self._waiting_since_s = now_s  # the loop has shown a sign of life
+            self._waiting_since_s = now_s  # the loop has responded
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
@@ -333,7 +333,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         number = 0
-        with contextlib.suppress(OSError):  # error of a client that goes away
+        with contextlib.suppress(OSError):  # error from a client that disconnects
             self.send_response(200)
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
             self.end_headers()
@@ -346,4 +346,4 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing: requests are not worth a line on the terminal."""
+        """Print nothing, because requests should not clutter the terminal."""

@@ -24,7 +24,7 @@ FINE_PX, COARSE_PX = 2, 8
 """Distances between the nodes of the two ray grids, px."""
 
 FAR_AWAY_M = 1e4
-"""Coordinates assigned to rays that miss the plane."""
+"""Coordinate assigned to rays that miss the plane."""
 LEAST_RISE = 0.02
 """Least z of a ray (target axes, depth 1 in the view) that still meets the plane."""
 
@@ -115,7 +115,7 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
     return 2.0 * stride / math.sqrt(max(area, 1e-12))
 
 
-# --- How a lens maps its pixels, the same for all images and flights ---
+# --- The mapping of a lens, shared by all images and flights ---
 
 
 VIGNETTING_EXPONENT = 0.6

@@ -31,8 +31,8 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.airframe import CRAZYFLIE_21, ThrustCurve
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
-# --- One motor's thrust against its voltage: what the rotor gives, and what the firmware inverts
-# `perchctl.sim.airframe` has the curves. Below the voltage whose thrust is 0 the cubic is
+# --- One motor's thrust against its voltage, and the inverse that the firmware uses ---
+# The curves are in `perchctl.sim.airframe`. Below the voltage whose thrust is 0 the cubic is
 # negative: the motor stands still (docs/firmware.md, "Thrust to PWM").
 
 
@@ -83,12 +83,12 @@ STANDSTILL_V = motor_voltage(0.0)
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
-# - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
-#   state (source: power management) are a discharge curve of the Crazyflie's own cell.
-# - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
-#   by some more within `ION_DIFFUSION_S`: ions that have to come from farther away.
-# - An old cell holds less charge and has more resistance; `knee` says at which part of the
-#   charge its steep end begins.
+# - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's state
+# (source: power management) are a discharge curve of the Crazyflie's own cell. - The voltage falls
+# under load by the cell's resistance at once, and in an old or cold cell by some more within
+# `ION_DIFFUSION_S`: ions that have to diffuse over a longer distance. - An old cell holds less
+# charge and has more resistance; `knee` is the share of the charge at which the steep end of the
+# curve begins.
 
 
 CHARGE_C = 900.0
@@ -113,7 +113,7 @@ _CELL_CURVE: tuple[tuple[float, float], ...] = (
     (1.0, 4.2),
     (1.05, 4.3),
 )
-_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # of its straight parts
+_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # slopes of its linear parts
 _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 
 
@@ -148,7 +148,7 @@ class Cell:
         self.rest_v = rest_v
 
     def step(self, current_a: float) -> None:
-        """Let a current flow for one control period."""
+        """Discharge the cell with a current for one control period."""
         self._left -= current_a * self._per_step
         self._slow_v += self._slowly * (self._slow_ohm * current_a - self._slow_v)
         self.rest_v = _resting_v(self._left, self._knee) + self._offset_v
@@ -172,7 +172,7 @@ def _charge_at(rest_v: float, knee: float) -> float:
     return low
 
 
-# --- Four motors and the cell that feeds them: duty cycles in, newtons out ---
+# --- Four motors and the cell that feeds them: duty cycles in, thrusts out ---
 
 
 MOTOR_LAG_S = 0.05
@@ -182,7 +182,8 @@ FLUCTUATION_S = 0.02
 """Time constant of the fluctuation of a motor's thrust, s."""
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
-# The share of the way in one control period is sqrt(_STANDING + per_v * v).
+# In one control period, the speed covers the share sqrt(_STANDING + per_v * v) of its distance to
+# the goal.
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
 
 _FLUCTUATION_STREAM = 24
@@ -233,7 +234,7 @@ class Powertrain:
 
 
 class Fluctuation:
-    """Fluctuation of the thrust of four motors, as shares of it."""
+    """Fluctuations of the thrust of four motors, relative to their thrust."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._rng = np.random.default_rng([scenario.seed, _FLUCTUATION_STREAM])

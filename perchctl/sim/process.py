@@ -1,4 +1,4 @@
-"""The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
+"""The simulated vehicle as a separate process: a Crazyflie on UDP, its camera on HTTP.
 
 Ctrl-C on the terminal does not reach the child, which ends with its parent.
 """
@@ -19,7 +19,8 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.sim.scenario import Scenario
 
 ANSWER_TIMEOUT_S = 60.0
-"""Also for `advance`, which takes a second for half a minute."""
+"""Timeout for an answer, s. It must also suffice for `advance`, which takes one second per 30 s of
+simulated time."""
 _STOP_TIMEOUT_S = 5.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
@@ -41,7 +42,7 @@ class SimProcess:
         uri: address for cflib.
         stream_url: address of the video; "" without a camera.
         capture: the motion capture's kind and address for `motioncapture`, or None.
-        shared_time: how far simulated time has come in real time, and how far it may go.
+        shared_time: how far simulated time has advanced, and how far it may advance.
         pid: process number of the child.
     """
 
@@ -54,7 +55,7 @@ class SimProcess:
         self._channel, childs = _CONTEXT.Pipe()
         arguments = (childs, self.shared_time, pace, scenario, settings)
         self._child = _CONTEXT.Process(target=_serve_parent, args=arguments, daemon=True)
-        # The child inherits that Ctrl-C is blocked, until it has left the terminal.
+        # The child inherits the blocked Ctrl-C until it has detached from the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._child.start()
@@ -99,7 +100,7 @@ class SimProcess:
 
     def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
         with self._lock:
-            with contextlib.suppress(OSError):  # then no answer comes either
+            with contextlib.suppress(OSError):  # then there is no answer either
                 self._channel.send((name, arguments, named))
             good, result = self._receive()
         if not good:

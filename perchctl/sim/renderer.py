@@ -56,7 +56,7 @@ _PLAIN_PX = 1.5
 """Blur of the lens above which the whole image is blurred, px. A smaller blur does not show on
 the bare ceiling, which is drawn at half the size or less."""
 _COVERING_SIGMA = 4.0
-"""Noise, grey levels, which hides that the ceiling is drawn at a quarter of the size."""
+"""Noise, grey levels, which hides that the ceiling is drawn at a quarter of the resolution."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 
@@ -84,7 +84,7 @@ class Renderer:
             ``extra["analogue"]`` in 0..1 adds the faults of an analogue video link.
         camera: the true camera.
         target: dictionaries and ids; its sizes are replaced by the scenario's.
-        seed: of texture and noise; the scenario's own if None.
+        seed: seed of texture and noise; None: that of the scenario.
     """
 
     def __init__(
@@ -214,13 +214,13 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """Draw the bare ceiling, with several pixels drawn as one."""
+        """Draw the bare ceiling at reduced resolution."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
         step = self._ceiling_px
         texture, texels_per_m = self._ceiling.tile_and_texels_per_m(px_per_m / step)
-        # Shift by whole tiles, so that the view is in the middle of the texture.
+        # Shift by whole tiles to centre the view in the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
         texels = nodes * np.float32(texels_per_m)
         texels += (_CENTER_TEXEL - tile * texels_per_m).astype(np.float32)
@@ -282,7 +282,7 @@ class Renderer:
         return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
-# --- Sums, look-ups and shading of whole images ---
+# --- Sums, lookups and shading of whole images ---
 
 
 def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -304,7 +304,7 @@ def draw_sheet_over(below: Picture, view: SheetView, maps: Array, rays: RayGrid)
 
 
 def mean_picture(pictures: Sequence[Picture]) -> Picture:
-    """The mean of the images, rounded once."""
+    """Return the mean of the images, rounded once."""
     if len(pictures) == 1:
         return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
@@ -413,7 +413,7 @@ def motion_blur_kernel(motion_px: Array) -> NDArray[np.float32] | None:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines ---
+# --- Faults of an analogue video link: line jitter, hum bars, torn and lost lines ---
 
 
 LINE_JITTER_PX = 1.2
@@ -421,7 +421,7 @@ HUM_GREY = 18.0
 TEAR_PX = 30.0
 TEARS_PER_FRAME = 1.5
 SNOW_LINES_PER_FRAME = 12.0
-"""Means at full strength."""
+"""Mean numbers per frame at full strength."""
 
 
 def add_analogue_faults(
@@ -433,7 +433,7 @@ def add_analogue_faults(
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
     for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):
         start, length = int(rng.integers(height)), int(rng.integers(4, 40))
-        # A torn band moves back into place along its length, as a receiver's line lock makes it.
+        # A torn band drifts back into place along its length, as the receiver's line lock recovers.
         band = slice(start, min(start + length, height))
         fade = np.linspace(1.0, 0.0, length)[: band.stop - band.start]
         shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade

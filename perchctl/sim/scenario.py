@@ -35,13 +35,13 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that can differ between two simulated flights; SI, world frame.
+    """Everything that can differ between two simulated flights, in SI units and the world frame.
 
     The world's origin is the floor under the vehicle's start, its x axis the vehicle's heading
     there.
 
-    The values that are given here are those of the trials in docs/firmware.md, whose vehicle has
-    four equal motors and less drag than a real one. A field named as a key of
+    The defaults are those of the trials in docs/firmware.md, in which the vehicle had four equal
+    motors and less drag than a real one. A field named as a key of
     `perchctl.profile.SimulationConfig` is the value drawn from the key's range.
 
     Attributes:
@@ -52,7 +52,7 @@ class Scenario:
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
         first_contact_force_n: pull at the first contact; None: `magnet_force_n`.
-        camera_freeze_at_s: from then on the camera repeats its last image; None: never.
+        camera_freeze_at_s: time from which on the camera repeats its last image; None: never.
         parameters: firmware parameters that differ from the release's at boot.
         gyro_bias_radps, acc_bias_mps2: biases in body axes, of the gyroscope after and of the
             accelerometer before the firmware's calibration on the ground; only for a vehicle
@@ -71,8 +71,8 @@ class Scenario:
         centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles were flown
             as if it were up to 2.4 mm off.
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
-            divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz; `thrust_noise`
-            explains most of that, and how much is left is a guess.
+            divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz. `thrust_noise`
+            explains most of the reduction; the remainder is an assumption.
         drag_nspm: level drag, N for each m/s. In 104 recorded flights 0.38 (0.36 to 0.41) of the
             mass each second, which is 0.016 at 42 g.
         airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
@@ -83,9 +83,11 @@ class Scenario:
         thrust_noise: standard deviation of each motor's thrust, as a share, with a memory of 20 ms.
             With 0.02 the body turns as much above 20 Hz as in 49 recorded flights (0.43 deg/s of
             roll and pitch, 0.31 to 0.66), and a regression finds the same delay.
-        acc_vibration_g: what the turning motors add to each axis of the accelerometer before its
-            filter, 2.5 times what a log shows above 8 Hz: 0.003 and 0.010 to 0.028 g.
-        airframe: the kind of vehicle; current and resistance of its cell are a 2.1's for each N.
+        acc_vibration_g: vibration that the running motors add to each axis of the accelerometer
+            before its filter: 2.5 times the vibration above 8 Hz in a log, which was 0.003 and
+            0.010 to 0.028 g.
+        airframe: the kind of vehicle; current and resistance of its cell are those of a Crazyflie
+            2.1, scaled per N of thrust.
     """
 
     seed: int = 0
@@ -183,9 +185,10 @@ _AS_GIVEN = (
     "magnet_force_n",
     "no_target",
 )
-"""Keys of the profile that are the same for every seed."""
+"""Profile keys that have the same value for every seed."""
 _LEAST_STRENGTH = 0.8
-"""Least strength of a motor that still flies, as a share of the others' strength."""
+"""Smallest strength of a motor with which the vehicle still flies, as a share of the others'
+strength."""
 _LONGEST_S = 240.0
 """Upper limit for the duration of a simulated flight, s."""
 _LEAST_GAP_S = 1.0
@@ -205,7 +208,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     drawn: dict[str, Any] = {key: between(key) for key in _DRAWN}
     burst_s, frames = between("camera_burst_start_s"), sim.camera_burst_frames or (0, 0)
     if frames[0] == frames[1]:
-        # numpy draws nothing for a range of one number, but the draws after it must not change
+        # numpy draws nothing for a range with a single value, but later draws must not change
         rng.integers(2)
     burst = burst_s, int(rng.integers(frames[0], frames[1] + 1))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(sim, rng)
@@ -219,7 +222,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     weak_part = between("first_contact_share")
     extra = {"analogue": sim.camera_analogue} if sim.camera_analogue else {}
     if not profile.positioning.source.is_deck:
-        extra["external_position"] = 1.0  # and no deck
+        extra["external_position"] = 1.0  # and has no deck
     return Scenario(
         seed=seed,
         target_xy_m=(x_m, y_m),
@@ -338,7 +341,7 @@ def _capture_holes(
     return tuple(holes)
 
 
-# --- A radio that loses packets by bursts: nothing passes for a while, then everything does ---
+# --- A radio that loses packets in bursts: all packets are lost for a while, then none ---
 
 
 _BURSTS_STREAM = 14

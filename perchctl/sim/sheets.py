@@ -28,7 +28,7 @@ PAPER_GREY, INK_GREY, CEILING_GREY = 225.0, 30.0, 140.0
 SHEET_FINEST_PX_PER_M = 8000.0
 SHEET_LEVELS = 28  # by a factor of 2^(1/4) per level: 8000 .. 74 px/m
 TEXELS_PER_PIXEL = 2.0**0.875
-"""Least number of texels per image pixel: 1.83 to 2.18 between two levels."""
+"""Smallest number of texels per image pixel. Between two levels, there are 1.83 to 2.18."""
 PIXEL_WINDOW_TEXELS = 2.0
 """Width of the window over which each texel is the exact mean, in texels: one image pixel. With a
 smaller window, or one that is not a whole number of texels, edges would alias and be displaced by
@@ -79,8 +79,7 @@ class Sheet:
     def texture(self, image_px_per_m: float) -> SheetTexture:
         """The texture at the resolution for an image of `image_px_per_m` pixels per metre."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
-        # Level -1 is the finest resolution without averaging, for views from closer than it is
-        # meant for.
+        # Level -1 is the finest resolution without averaging, for views from closer than intended.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
         if level not in self._levels:
             px_per_m = SHEET_FINEST_PX_PER_M * 2.0 ** (-max(level, 0) / 4.0)
@@ -115,7 +114,7 @@ class CeilingTexture:
         tile = np.full((1, 1), CEILING_GREY, np.float32)
         for cells, sigma in CEILING_OCTAVES:
             tile = _finer(tile, cells // len(tile))
-            # As wide as a normal distribution, but ten times faster to draw.
+            # Same variance as a normal distribution, but ten times faster to draw.
             grey = rng.integers(0, 256, (cells, cells), np.uint8)
             tile += grey * np.float32(sigma / _BYTE_SIGMA) - np.float32(127.5 * sigma / _BYTE_SIGMA)
         self._tiles = [np.clip(tile, 0.0, 255.0)]
@@ -148,7 +147,7 @@ def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
     return np.asarray(big[2 * zoom : -2 * zoom], np.float32)
 
 
-# --- Sheets on the ceiling, and where each is seen in one exposure ---
+# --- Sheets on the ceiling, and their position in one exposure ---
 
 
 Box = tuple[slice, slice]
@@ -160,10 +159,10 @@ _LOOK_UP_TEXELS = 2.5
 
 
 class SheetView(NamedTuple):
-    """A sheet in one exposure: `box` is its part of the image, `to_texels` (3, 3) maps the plane
-    of the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows,
-    columns), `is_uniform` are those whose pixels all show one `value` and `alpha`. `covers_all`:
-    nothing else is in the image."""
+    """A sheet in one exposure: `box` is its part of the image, `to_texels` (3, 3) maps the plane of
+    the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows, columns),
+    `is_uniform` are those whose pixels all show one `value` and `alpha`. `covers_all` is True if
+    the sheet covers the whole image."""
 
     texture: SheetTexture
     box: Box
@@ -241,7 +240,8 @@ def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
 
 
 def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
-    """Return another vehicle's target; an id None stands for the own target's id."""
+    """Return the sheet of another vehicle's target. An id of None stands for the id in the
+    vehicle's own target."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
     target = TargetConfig(

@@ -1,5 +1,4 @@
-"""World, firmware, camera and motion capture as one simulated vehicle, advanced by simulated
-time."""
+"""One simulated vehicle: world, firmware, camera and motion capture, advanced in simulated time."""
 
 from __future__ import annotations
 
@@ -23,7 +22,8 @@ _PAST = 128  # control periods: longer than any exposure with its read-out
 class SimulatedVehicle:
     """One simulated Crazyflie.
 
-    Without a camera model it has no camera, without capture settings no motion capture.
+    It has a camera only if a camera model is given, and motion capture only if capture settings are
+    given.
     """
 
     def __init__(
@@ -41,12 +41,14 @@ class SimulatedVehicle:
             renderer = Renderer(scenario, camera, target or TargetConfig())
             self.camera = SimCamera(scenario, renderer)
         self.capture = None if capture is None else SimCapture(capture)
-        self.watched = True  # the camera's images are being used; otherwise none are rendered
+        self.watched = (
+            True  # True if the camera's images are used; otherwise no images are rendered
+        )
         self._past: deque[tuple[Vector, tuple[float, float, float, float]]] = deque(maxlen=_PAST)
 
     @property
     def t_s(self) -> float:
-        """Simulated time since the start; no reboot resets it."""
+        """Simulated time since the start. A reboot does not reset it."""
         return self.world.t_s
 
     def advance_to(self, t_s: float) -> None:
@@ -55,11 +57,11 @@ class SimulatedVehicle:
             self.step()
 
     def receive(self, packet: Packet) -> None:
-        """Receive a packet as it comes from the radio."""
+        """Receive a packet from the radio."""
         execute_packet(self.firmware, packet)
 
     def step(self) -> None:
-        """Advance by one control period, and take the exposures that fall into it."""
+        """Advance by one control period, and take the exposures within it."""
         self.firmware.step()
         world = self.world
         if self.capture is not None:

@@ -10,15 +10,15 @@ Assumptions of the model, each with its source:
 - Drag is linear in the airspeed, which R^2 = 0.98 confirms for 104 recorded flights; level it is
   `Scenario.drag_nspm`, vertically 0.008 N/(m/s) of four rotors that lift 42 g (identified by
   Foerster, ETH Zurich, 2015) and 0.001 of camera, board and gear.
-- Airspeed tilts the vehicle away from where it flies, nose up in forward flight, by
+- Airspeed pitches the vehicle away from its direction of flight, nose up in forward flight, by
   `Scenario.airspeed_moment_nmspm`.
 - Near the floor the rotors lift more, by `Scenario.ground_effect`.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
   standard deviations of the gusts (`Wind`).
-- Other vehicles of a fleet blow down on it by `downwash_mps` (`perchctl.sim.downwash`).
-- Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
-  thrust at the ceiling itself; with 0.1 as measured by benches with rotors of this size
-  (Hsiao and Chirarattananon, arXiv 1905.04632).
+- The downwash of other vehicles in a fleet is `downwash_mps` (`perchctl.sim.downwash`).
+- Near the ceiling, suction pulls the rotors towards it: `Scenario.ceiling_suction` of their thrust
+  at the ceiling itself; with 0.1 as measured by benches with rotors of this size (Hsiao and
+  Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place: dry friction, without a creep under a
   steady push (MuJoCo's `noslip`).
@@ -38,7 +38,7 @@ from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
-# Nothing is drawn with MuJoCo, whose window library would start a process at each import.
+# MuJoCo is not used for drawing; its window library would start a process at each import.
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 try:
@@ -188,7 +188,7 @@ class World:
     ) -> None:
         """Put the vehicle into a pose, not rotating; `hold` keeps it there until `let_go`.
 
-        The gyroscope does not measure the change of pose.
+        The gyroscope does not sense the change of pose.
         """
         self._hand = World._stay if hold else None
         self.set_state(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
@@ -241,7 +241,7 @@ class World:
         )
 
     def push_n_and_on_floor(self) -> tuple[float, bool]:
-        """The contact force at the ceiling, N, and True if the vehicle touches the floor."""
+        """Return the contact force at the ceiling, N, and whether the vehicle touches the floor."""
         ceiling_n, floor = 0.0, False
         wrench = np.zeros(6)
         for i, pair in enumerate(self._data.contact.geom.tolist()):
@@ -321,7 +321,7 @@ class Magnet:
         self._came_off = False
         self.engaged = False
         self.target_xy_m = scenario.target_xy_m
-        self.let_go = False  # permanently: it no longer pulls
+        self.let_go = False  # permanently failed: it no longer pulls
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
         """Return the pull on the gear's tip at `tip_m`, world axes; 0 unless `upright`."""

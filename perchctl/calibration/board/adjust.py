@@ -269,8 +269,7 @@ def jackknife_covariance(
     )
     count = len(blocks)
     spread = (count - 1) * moves.var(axis=0) * student_to_normal_ratio(count - 1) ** 2
-    # Treat each parameter by itself: all of them together would be more than the blocks can
-    # determine.
+    # Treat each parameter separately, because the blocks cannot determine all of them together.
     grown = np.sqrt(np.maximum(spread / np.diagonal(inverted), 1.0)) * scale
     return np.asarray(inverted * np.outer(grown, grown))
 

@@ -1,4 +1,4 @@
-"""Views of a board from images, a video or a live camera, and how alike two views are."""
+"""Views of a board from images, a video or a live camera, and the similarity of two views."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
     return [view for view in views if view.legacy == legacy], others
 
 
-# --- How alike two views are ---
+# --- Similarity of two views ---
 
 
 COVERAGE_AXES = ("position x", "position y", "size", "skew")
@@ -115,7 +115,7 @@ GOALS = {"position x": 0.5, "position y": 0.5, "size": 0.3, "skew": 0.4}
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
 MOST_VIEWS = 40
-"""Number of views that suffice whatever they cover."""
+"""Number of views that are always enough, regardless of their coverage."""
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
 
@@ -176,7 +176,7 @@ def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
 _STILL_SHARE = 1.5 / 640.0  # share of the width, between two frames
 _BLUR_SHARE = 2.5 / 640.0
 _UNSEEN_EVERY = 15
-"""Of the frames without a board, one in this many is kept, to name the board that they show."""
+"""One in this many frames without the board is kept, to find out which board they show."""
 _ADVICE = (
     (0.5, "move the board to the right edge", "move the board to the left edge"),
     (0.5, "move the board to the bottom edge", "move the board to the top edge"),
@@ -245,11 +245,11 @@ class GuidedCapture:
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
     def count_repeated(self) -> None:
-        """Count a frame that the source gave twice."""
+        """Count a frame that the source returned twice."""
         self._count("repeated")
 
     def update(self, view_or_reason: BoardView | str) -> bool:
-        """Process the next image: extract its view of the board, or find out why it has none.
+        """Process the next image: extract its view of the board, or determine why there is none.
 
         Return True if the view was taken because it is new, sharp and still.
         """

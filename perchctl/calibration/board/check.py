@@ -9,8 +9,8 @@ check fails
 - when these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
   distance) and by more than the 95 % bound of the new images.
 
-If the 95 % bound of the new images is above twice the limit, they cannot decide, and the check is
-refused.
+If the 95 % bound of the new images is above twice the limit, the images are not accurate enough,
+and the check is refused.
 """
 
 from __future__ import annotations
@@ -81,12 +81,11 @@ class CheckResult:
 def check_calibration(
     camera: CameraModel, found: FoundViews, own_hashes: Collection[str] = ()
 ) -> CheckResult:
-    """Judge a calibration against new views of a board.
+    """Check a calibration against new views of a board.
 
     Args:
-        own_hashes: `BoardView.picture_hash` of the images that the calibration was made from.
-            These images are left out: a calibration always fits its own images, even if both
-            are wrong.
+        own_hashes: `BoardView.picture_hash` of the images that the calibration was made from. These
+            images are left out: a calibration always fits its own images, even if it is wrong.
 
     Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
     """

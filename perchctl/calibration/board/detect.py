@@ -116,8 +116,8 @@ class FrameCounts:
 
     @property
     def advice(self) -> str:
-        """Advice on how to get more views; empty if the board has to be shown in another place, or
-        at all."""
+        """Advice on how to get more views; empty if the board only needs to be shown, or shown in
+        another place."""
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
@@ -237,8 +237,8 @@ def _chessboard(image: Grey, board: Board) -> _Corners | str:
 
 
 def _without_board(image: Grey) -> str:
-    """Return why an image shows no board: it may show the target, the other print that lies
-    about."""
+    """Return why an image shows no board. It may show the perching target instead, which the user
+    also has at hand."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
@@ -270,10 +270,10 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 
 
 # --- The corner where four squares meet, found by fitting the image around it ---
-# `cv2.cornerSubPix` with a fixed window takes in the neighbouring corners of small squares, and a
-# ChArUco board's markers: it errs by 0.03 to 0.5 px where this errs by 0.02. Here the window
-# follows the square's own size and slant, and the grey levels in it are fitted by what a lens
-# makes of two crossing edges:
+# `cv2.cornerSubPix` has a fixed window, which includes neighbouring corners of small squares and
+# the markers of a ChArUco board. Its errors are 0.03 to 0.5 px where those of this fit are 0.02 px.
+# Here the window follows the size and slant of the square, and a model of two crossing blurred
+# edges is fitted to its grey levels:
 #
 #     I = a + gx x + gy y + (c + hx x + hy y) tanh(d1 / w1) tanh(d2 / w2)
 #

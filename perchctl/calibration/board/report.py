@@ -1,9 +1,9 @@
 """The report of a calibration: what the views cover, how well the camera model fits them, and what
 to add.
 
-A residual is the found corner minus the corner that the camera model predicts. Residuals that point
-at random come from noise in the images. Neighbouring residuals that point the same way in many
-views mean that the model does not describe the lens, or that the board is not flat.
+A residual is the found corner minus the corner that the camera model predicts. Residuals in random
+directions come from image noise. If neighbouring residuals point in the same direction in many
+views, the model does not describe the lens, or the board is not flat.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class CalibrationReport:
 
     @property
     def advice(self) -> list[str]:
-        """What to do better, a sentence each; empty if nothing is to be done."""
+        """Suggestions for improvement, one sentence each; empty if there are none."""
         advice = [f"{defect}." for defect in self.result.defects]
         for axis, share in covered_shares(self._signatures).items():
             if share < 1.0:

@@ -54,7 +54,8 @@ class Calibration:
         without_board: images without a board, and why.
         errors: predicted position error of the target, by distance.
         covered_cells: mask (rows, columns) of the image's grid cells that boards covered.
-        defects: sentences on the views' defects, with remedies; any rules out the best verdict.
+        defects: sentences about defects of the views, with remedies; any defect rules out the best
+            verdict.
         frames: the results of a video's or camera's frames; None for images.
     """
 
@@ -186,7 +187,7 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
     models = MODEL_NAMES if model == "auto" else (model,)
     fit, kept, rejections = robust_fit(found.views, models)
     _check_count(kept, found)
-    # First tilt and coverage: their messages say best what to add.
+    # Tilt and coverage are checked first, because their messages give the best advice.
     covered = covered_cells(kept)
     _check_variety(fit, covered)
     covariance = lens_covariance(kept, fit)

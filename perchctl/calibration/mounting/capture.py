@@ -1,4 +1,4 @@
-"""Record a vehicle that is moved by hand, with advice on the motions that are still missing."""
+"""Record a vehicle that is moved by hand, and advise which motions are still missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5
-"""Age at the beginning of a part above which an attitude belongs to none of its images, s."""
+"""Age at the start of a part above which an attitude cannot belong to any of its images, s."""
 MIRRORED_PICTURES = 60
 """Number of mirrored images, with no others, after which the recording ends."""
 SHARE_OVER = 60
@@ -65,7 +65,7 @@ def record_mounting(
             continue
         poses = reader.read_poses(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
-        if frame.repeated and not reader.trouble:  # an image without a target counts as no image
+        if frame.repeated and not reader.trouble:  # an image without a target is treated as missing
             continue
         recording.poses += poses
         recording.mirrored_pictures = reader.mirrored

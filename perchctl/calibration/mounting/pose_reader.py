@@ -1,5 +1,4 @@
-"""Read the target's poses from the images of a stream, as far as measuring the mounting needs
-them."""
+"""Read the target's poses from a stream of images, for measuring the mounting."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Recordings of poses and attitudes of a vehicle that is moved by hand: the motion that they need,
-and their file of JSON lines.
+"""Recordings of poses and attitudes of a vehicle that is moved by hand: the required motion, and
+the file format (JSON lines).
 
 Each part begins with a line ``{"part": "carry", ...}``. One line per sample follows, first all
 attitudes, then all poses. A file holds one part or both.
@@ -154,7 +154,7 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
     )
 
 
-# --- The motion that a recording needs, checked during the recording and before the solution ---
+# --- The required motion, checked during the recording and before the solution ---
 
 
 HOW_TO_RECORD: dict[MountingPart, str] = {
@@ -197,7 +197,8 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
 
 
 def missing_motion(recording: MountingRecording) -> list[str]:
-    """Advice on each motion that the recording still lacks; empty if it is complete."""
+    """Return advice on each motion that is still missing in the recording; empty if it is
+    complete."""
     part = recording.part
     poses = recording.poses
     attitudes = recording.attitudes

@@ -1,10 +1,10 @@
 """The cascaded PID controller: position and velocity at 100 Hz, attitude and rate at 500 Hz.
 
 Gains and limits are the firmware's defaults for the airframe, whatever is written into the
-parameters of the same names. Angles in degrees, pitch nose up, as inside
-the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
-"Setpoint modes"), so the thrust starts again from `thrustBase`. The loops request
-thrust; `MotorDriver` turns these requests into duty cycles.
+parameters of the same names. Angles are in degrees with pitch nose up, as inside the firmware.
+Every change of setpoint mode resets all integrators (docs/firmware.md, "Setpoint modes"), so the
+thrust starts again from `thrustBase`. The loops request thrust; `MotorDriver` turns these requests
+into duty cycles.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ class Controller:
 # costs no height (docs/firmware.md, "Yaw step").
 
 SUPPLY_AT_BOOT_V = 4.2
-SUPPLY_FILTER = 0.01  # of each sample, at `SUPPLY_RATE_HZ`
+SUPPLY_FILTER = 0.01  # weight of each sample, at `SUPPLY_RATE_HZ`
 SUPPLY_RATE_HZ = 1000.0
 SUPPLY_LEAST_V = 2.0  # a reading below this counts as broken: no thrust
 
@@ -257,7 +257,7 @@ class MotorDriver:
         self._voltage = inverse_thrust(curve)
         self._n_per_command = curve.most_n / FULL_COMMAND
         self.thrust_min = FULL_COMMAND * curve.least_n / curve.most_n
-        # Low-passed with 0.1 s: the compensation meets a sagging battery late.
+        # Low-pass filter with 0.1 s: the compensation lags behind a sagging battery.
         self._supply_v = SUPPLY_AT_BOOT_V
 
     def pwm(self, requests: Motors, battery_v: float) -> Motors:

@@ -1,4 +1,4 @@
-"""The state estimate: the truth with the errors of a flow deck or of motion capture.
+"""The state estimate: the true state plus the errors of a Flow deck or of motion capture.
 
 The drift starts when the motors first turn. A vehicle without a deck (scenario
 `extra["external_position"]`) uses external positions instead, if the parameter
@@ -181,7 +181,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """The attitude after one more control period."""
+        """Return the attitude one control period later."""
         truth = world.quaternion
         if self.gyro is None:
             return truth

@@ -48,7 +48,7 @@ class Firmware:
         self.reboot()
 
     def reboot(self) -> None:
-        """Restart in the present world; no parameter was stored."""
+        """Restart in the current world, with the default parameters."""
         self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self._steps = 0
         self._flown = False
@@ -101,7 +101,7 @@ class Firmware:
                 acc_g=self.estimator.acc_g,
             )
             if ended:
-                # A setpoint from a flight that is over must not fly the next one. After re-arming,
+                # A setpoint from a finished flight must not affect the next one. After re-arming,
                 # only a new packet or the planner can spin the motors.
                 self._low_level = False
             self.planner.set_blocked(not supervisor.motors_allowed)
@@ -158,7 +158,7 @@ class Firmware:
         """Take an external position, m, or a pose; `quaternion`: w, x, y, z, body to world."""
         self.estimator.take_external(position_m, quaternion)
 
-    # What can be read ---------------------------------------------------------------
+    # Readable values ----------------------------------------------------------------
 
     @property
     def supervisor_info(self) -> int:

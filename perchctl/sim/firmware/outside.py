@@ -6,8 +6,8 @@ gyroscope updates the attitude and the accelerometer updates the velocity. In fl
 is updated along the thrust axis only, so drag and draught are not felt. Otherwise it is updated
 along all three axes, and the attitude is pulled towards the initial one. A position corrects
 position, velocity and attitude according to their covariance with it. The filter never sees the
-truth: the errors of the sensors (`Imu`) mislead the estimate, and so does any wrong position, since
-there is no gate (source).
+true state: the sensor errors (`Imu`) and any wrong position corrupt the estimate, because there is
+no gate (source).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Reading = tuple[float, float, float, float, float, float]
 """Acceleration, m/s^2, and turning rates, rad/s, body axes."""
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
-# --- What the gyroscope and the accelerometer read, as means of 100 a second for the estimator ---
+# --- Gyroscope and accelerometer readings, as means at 100 Hz for the estimator ---
 # The errors are those of the trial in docs/firmware.md, "Target as position": white noise, which
 # accumulates to a random walk of attitude and velocity, and a bias. The gyroscope's bias is what
 # remains after the firmware has subtracted the bias that it measured on the ground.
@@ -136,11 +136,11 @@ class ExternalFilter:
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
-        self._parameters = parameters  # the firmware's parameters with their present values
+        self._parameters = parameters  # the firmware's parameters with their current values
         self.reset()
 
     def reset(self) -> None:
-        """Start anew at the position and heading of `kalman.initial*`, level and at rest."""
+        """Restart at the position and heading of `kalman.initial*`, level and at rest."""
         self.covariance = first_covariance()
         names = ("X", "Y", "Z", "Yaw")
         x, y, z, yaw = (self._parameters[f"kalman.initial{name}"] for name in names)
@@ -179,7 +179,7 @@ class ExternalFilter:
             self.reset()
 
     def update_position(self, measured_m: Vector) -> None:
-        """Correct the estimate using an external position, taken as current."""
+        """Correct the estimate using an external position, which is treated as current."""
         if all(map(math.isfinite, measured_m)):
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
             sigma_m = self._parameters["locSrv.extPosStdDev"]
