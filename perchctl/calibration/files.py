@@ -99,8 +99,8 @@ def _checked(lens: Lens) -> CameraModel:
     (width, height), (cx, cy) = camera.size_px, K[:2, 2]
     if not (0 < cx < width and 0 < cy < height and K[0, 0] > 0 and K[1, 1] > 0):
         raise InvalidValue(
-            f"camera_matrix does not fit a {width}x{height} picture: focal lengths "
-            f"must be positive and the centre inside the picture"
+            f"camera_matrix does not fit a {width}x{height} image: focal lengths "
+            f"must be positive and the centre inside the image"
         )
     return replace(camera, K=K)
 

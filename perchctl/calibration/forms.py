@@ -394,7 +394,7 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
     neutral = " or ".join(f"{each:g}" for each in allowed)
     raise InvalidValue(
         f"{key} = {clip_text(str(value))} changes the projection, which is not "
-        f"supported: calibrate with unmodified pictures from the camera, and {key} "
+        f"supported: calibrate with unmodified images from the camera, and {key} "
         f"{neutral}"
     )
 
@@ -412,8 +412,8 @@ def _check_region(found: _Found) -> None:
         whole = tuple(_pixels(*found[each][0]) for each in ("width", "height") if each in found)
         if offset != (0, 0) or size not in ((0, 0), whole):
             raise InvalidValue(
-                f"{key} is only a part of the picture, {size[0]}x{size[1]} px at {offset}: "
-                "calibrate with unmodified pictures from the camera"
+                f"{key} is only a part of the image, {size[0]}x{size[1]} px at {offset}: "
+                "calibrate with unmodified images from the camera"
             )
 
 
@@ -423,7 +423,7 @@ def _check_rms(found: _Found, width_px: int) -> None:
         rms_px = _numbers(key, value)
         if (rms_px > _MAX_RMS_SHARE * width_px).any():
             raise InvalidValue(
-                f"{key} = {rms_px.max():g} px: the calibration misses its own pictures by more "
+                f"{key} = {rms_px.max():g} px: the calibration misses its own images by more "
                 f"than {100 * _MAX_RMS_SHARE:g} % of their width; calibrate again"
             )
 
@@ -449,7 +449,7 @@ def _size(found: _Found, form: Form) -> tuple[int, int]:
     if not {"width", "height"} <= found.keys():
         raise InvalidValue(
             f"the image size is missing in this {form.name}: add {form.read['width'][0]} "
-            f"and {form.read['height'][0]}, the size in px of the pictures that the camera "
+            f"and {form.read['height'][0]}, the size in px of the images that the camera "
             "was calibrated with"
         )
     width, height = (_pixels(*found[each][0]) for each in ("width", "height"))

@@ -47,14 +47,14 @@ def learn_gear_mask(
         soft = cv2.blur(frame.image, (3, 3)).astype(np.float64)
         if count and soft.shape != total.shape:
             raise InvalidValue(
-                f"picture {count + 1} is {soft.shape[1]}x{soft.shape[0]} px, but the first is "
+                f"image {count + 1} is {soft.shape[1]}x{soft.shape[0]} px, but the first is "
                 f"{total.shape[1]}x{total.shape[0]} px: a mask is for one size"
             )
         total, squares = (soft, soft**2) if not count else (total + soft, squares + soft**2)
         count += 1
     if count < LEAST_PICTURES:
         raise InvalidValue(
-            f"{count} pictures are too few to find what stays the same in them, at least "
+            f"{count} images are too few to find what stays the same in them, at least "
             f"{LEAST_PICTURES} are needed: turn the vehicle around for several seconds"
         )
     spread = np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0.0))
@@ -63,12 +63,12 @@ def learn_gear_mask(
     share = float(covered.mean())
     if motion < _LEAST_MOTION_GREY or share > MOST_GEAR_SHARE:
         raise InvalidValue(
-            "the pictures hardly change: turn the vehicle around where strong patterns "
-            "fill the picture, not in front of a plain wall"
+            "the images hardly change: turn the vehicle around where strong patterns "
+            "fill the image, not in front of a plain wall"
         )
     if share == 0.0:
         raise InvalidValue(
-            "nothing stays the same in the pictures, so the vehicle covers nothing: "
+            "nothing stays the same in the images, so the vehicle covers nothing: "
             "camera.mask is not needed"
         )
     return covered

@@ -108,7 +108,7 @@ def camera(
 
     found = _find_views(pictures, size, layout, view, checked_file)
     file = checked_file(found.views[0].size_px)
-    without = f", {len(found.without_board)} pictures without it" if found.without_board else ""
+    without = f", {len(found.without_board)} images without it" if found.without_board else ""
     say(f"{len(found.views)} views of the board{without}")
     seen = found.layout_of(layout)
     if seen.legacy != layout.legacy:
@@ -166,7 +166,7 @@ def mask(
     write_files({output: cv2.imencode(".png", 255 * covered.astype("uint8"))[1].tobytes()})
     share = 100.0 * covered.mean()
     say(
-        f"wrote {output}: the vehicle covers {share:.1f} % of the picture; name this "
+        f"wrote {output}: the vehicle covers {share:.1f} % of the image; name this "
         "file in camera.mask"
     )
     print_result(output)
@@ -188,7 +188,7 @@ def check(
     say_on_terminal(f"reading {calibration}")
     if not calibration.is_file() and file_kind(Path(source)) == "a camera calibration":
         raise UsageError(
-            f"{source} is a camera calibration: name it first, and then the pictures, as in "
+            f"{source} is a camera calibration: name it first, and then the images, as in "
             f"perchctl calibrate check {source} {calibration}"
         )
     pictures = _source(source)
@@ -299,7 +299,7 @@ def _find_views(
             "--board match it?"
         )
         raise InvalidValue(
-            f"none of {len(found.without_board)} pictures of {source} shows the board "
+            f"none of {len(found.without_board)} images of {source} shows the board "
             f"{board.notation()}: {seen if found.other_board else why}"
         )
     return found
@@ -324,7 +324,7 @@ def capture_live_views(
         show = stack.enter_context(guidance_display(page))
         if source.live:
             say(
-                "show the board near and far, tilted, and in every corner of the picture "
+                "show the board near and far, tilted, and in every corner of the image "
                 "(Ctrl-C stops and calibrates)"
             )
         found = calibrations.capture_views(source, board, show, stopped=stop.requested.is_set)

@@ -59,7 +59,7 @@ COMMANDS: dict[str, str] = {
     "fit-weights": (
         "Fit the merge weights to poses with known ground truth, and verify that they help."
     ),
-    "track": "Find the target in a camera stream, a video or pictures, without a vehicle.",
+    "track": "Find the target in a camera stream, a video or images, without a vehicle.",
     "check": (
         "Check vehicle, camera, computer and profile on the ground, and report what is not fit "
         "to fly."

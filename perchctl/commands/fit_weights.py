@@ -117,7 +117,7 @@ def collect(
         typer.Option("--truth", help="Source of the ground truth."),
     ] = "typed",
     positions: Annotated[int, typer.Option("--positions", min=2, help="Number of positions.")] = 10,
-    frames: Annotated[int, typer.Option("--frames", min=10, help="Pictures per position.")] = 100,
+    frames: Annotated[int, typer.Option("--frames", min=10, help="Images per position.")] = 100,
     source: SourceOption = None,
     target_body: Annotated[
         str,

@@ -182,7 +182,7 @@ def fly(
         bool | None,
         typer.Option(
             "--record/--no-record",
-            help="Record the pictures to MCAP files next to the logs. Default: only of real "
+            help="Record the images to MCAP files next to the logs. Default: only of real "
             "vehicles.",
         ),
     ] = None,

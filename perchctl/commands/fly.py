@@ -63,8 +63,7 @@ RecordOption = Annotated[
     bool | None,
     typer.Option(
         "--record/--no-record",
-        help="Record the pictures to an MCAP file next to the log. Default: only for a real "
-        "vehicle.",
+        help="Record the images to an MCAP file next to the log. Default: only for a real vehicle.",
     ),
 ]
 DryRunOption = Annotated[

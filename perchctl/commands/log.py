@@ -201,7 +201,7 @@ def replay(
         bool,
         typer.Option(
             "--pictures/--no-pictures",
-            help="Process the recorded pictures again, if there are any.",
+            help="Process the recorded images again, if there are any.",
         ),
     ] = True,
     as_json: JsonOption = False,
@@ -281,7 +281,7 @@ def report(
     place = _place(logs[0], output, PAGES, force)
     from perchctl.commands.progress import done_of_total_bar
 
-    with done_of_total_bar("pictures of a film" if with_film else "flights") as progress:
+    with done_of_total_bar("images of a film" if with_film else "flights") as progress:
         page = analysis.write_report(logs, place, with_film, names, progress)
     say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)

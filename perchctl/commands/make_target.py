@@ -45,7 +45,7 @@ CeilingOption = Annotated[
 ]
 BlurOption = Annotated[
     float,
-    typer.Option("--blur", min=0.0, max=20.0, help="Blur of the picture, sigma in px."),
+    typer.Option("--blur", min=0.0, max=20.0, help="Blur of the image, sigma in px."),
 ]
 
 app = new_app(Group)

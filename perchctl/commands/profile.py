@@ -102,9 +102,9 @@ WORDS: dict[str, str] = {
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
     "aideck://HOST",
     "camera.calibration": "The camera's calibration file, from perchctl calibrate",
-    "camera.latency_s": "Latency of the picture, from exposure to arrival (often 60 to 100 ms),\n"
+    "camera.latency_s": "Latency of the image, from exposure to arrival (often 60 to 100 ms),\n"
     "or measured, to have each flight measure it",
-    "front": "Move a hand over the front of the vehicle. At which edge of the picture does it\n"
+    "front": "Move a hand over the front of the vehicle. At which edge of the image does it\n"
     "appear: top, right, bottom or left?",
     "left": "Move a hand over its left side. At which edge does it appear? (A camera that\n"
     "mirrors shows it at the opposite edge.)",
@@ -173,7 +173,7 @@ def new(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Answer a question in advance: any profile key, front or left (a picture edge), "
+            help="Answer a question in advance: any profile key, front or left (an image edge), "
             "or ceiling (m). Repeatable.",
         ),
     ] = None,
@@ -206,8 +206,8 @@ def new(
     if profile.camera.mirrored:
         say(
             f"camera: with the front at its {answers['front']} and the left side at its "
-            f"{answers['left']} edge, the picture is mirrored: wrote camera.mirrored: true, "
-            "which flips each picture before use; if it is not mirrored, answer both "
+            f"{answers['left']} edge, the image is mirrored: wrote camera.mirrored: true, "
+            "which flips each image before use; if it is not mirrored, answer both "
             "questions again"
         )
     _say_doubts(profiles.load_profile(str(output.absolute())))

@@ -97,7 +97,7 @@ def run(
         bool,
         typer.Option(
             "--record",
-            help="Record the pictures to an MCAP file next to each log.",
+            help="Record the images to an MCAP file next to each log.",
         ),
     ] = False,
     out: Annotated[

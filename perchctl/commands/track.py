@@ -66,7 +66,7 @@ def track(
         typer.Option(
             "--udp",
             metavar="HOST:PORT",
-            help="Also send the JSON object of each picture to this address, as a UDP datagram.",
+            help="Also send the JSON object of each image to this address, as a UDP datagram.",
         ),
     ] = None,
     frame_id: Annotated[

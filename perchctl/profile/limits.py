@@ -72,7 +72,7 @@ _IMPOSSIBLE = {
     ),
     f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
     " < planner.approach_timeout_s": ("the take-off takes longer than its timeout"),
-    "camera.latency_s < safety.max_frame_age_s": "every picture would be too old to use",
+    "camera.latency_s < safety.max_frame_age_s": "every image would be too old to use",
     f"link.telemetry_period_s < {SafetyConfig.proof_age_s:g}": (
         "telemetry would be too old to prove a contact or a landing"
     ),

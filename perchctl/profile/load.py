@@ -198,19 +198,19 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     path = find_mask(name)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InvalidValue(f"camera.mask: {path} cannot be read as a picture")
+        raise InvalidValue(f"camera.mask: {path} cannot be read as an image")
     height, width = image.shape[:2]
     if (width, height) != size_px:
         raise InvalidValue(
             f"camera.mask: {path} has {width}x{height} px, but the calibration was made at "
-            f"{size_px[0]}x{size_px[1]} px: make the mask from this camera's pictures"
+            f"{size_px[0]}x{size_px[1]} px: make the mask from this camera's images"
         )
     covered = np.asarray(image > _WHITE)
     share = float(covered.mean())
     if share > MOST_MASKED_SHARE:
         covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_MASKED_SHARE, 0)
         raise InvalidValue(
-            f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
+            f"camera.mask: {path} covers {covers} % of the image, at most {allowed} % are "
             "allowed: white marks what the vehicle covers, black is free"
         )
     if share == 0.0:

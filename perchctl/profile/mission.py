@@ -21,7 +21,7 @@ class SearchConfig(Section):
     max_height_m: float = key(1.3, "maximum height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
         60.0,
-        "rotation between two waits, because the picture is wider than it is high",
+        "rotation between two waits, because the image is wider than it is high",
         ge=0,
         le=180,
     )
@@ -287,13 +287,13 @@ class SafetyConfig(Section):
     proof_age_s: ClassVar[float] = 0.1
     """Age above which telemetry is too old to prove a contact, a landing or a motor stop, s."""
     camera_hold_s: float = key(
-        0.5, "time without a good picture after which the vehicle holds its position", gt=0, le=10
+        0.5, "time without a good image after which the vehicle holds its position", gt=0, le=10
     )
     camera_land_s: float = key(
-        3.0, "time without a good picture after which the vehicle lands", gt=0, le=60
+        3.0, "time without a good image after which the vehicle lands", gt=0, le=60
     )
     max_frame_age_s: float = key(
-        0.4, "maximum age of a picture; older ones are not used", gt=0, le=5
+        0.4, "maximum age of an image; older ones are not used", gt=0, le=5
     )
     jump_m: float = key(
         0.25,

@@ -54,7 +54,7 @@ class SimulationConfig(Section):
     )
     camera_receiver_hz: float | None = key(
         None,
-        "rate at which the receiver repeats its newest picture; none: each picture once",
+        "rate at which the receiver repeats its newest image; none: each image once",
         gt=0,
         le=200,
     )

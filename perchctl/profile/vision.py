@@ -74,7 +74,7 @@ class Mounting(Section):
     )
     rpy_deg: Vector3 = key(
         (0.0, 0.0, 0.0),
-        "rotation of the camera; at 0 0 0, picture right is forward and picture bottom is left",
+        "rotation of the camera; at 0 0 0, image right is forward and image bottom is left",
     )
 
     @field_validator("rpy_deg")
@@ -132,8 +132,8 @@ class CameraConfig(Section):
         USUAL_LATENCY_S, "time from exposure to arrival; with `measured`, each flight measures it"
     )
     mount: Mounting = Mounting()
-    start_timeout_s: float = key(8.0, "time limit for the first good picture", gt=0, le=60)
-    mirrored: bool = key(False, "flip each picture before use")
+    start_timeout_s: float = key(8.0, "time limit for the first good image", gt=0, le=60)
+    mirrored: bool = key(False, "flip each image before use")
     mask: str | None = key(None, "mask file, white where the vehicle covers the view")
     fields: ClassVar[str] = "auto"  # of interlaced images: which field comes first is measured
     readout_s: float | None = key(

@@ -70,7 +70,7 @@ class TargetDesign:
         far_m = self.z1_m
         if far_m is None or self.z2_m is None or self.z3_m is None:
             return (
-                "one of the markers can never be read with this blur: a sharper picture is needed",
+                "one of the markers can never be read with this blur: a sharper image is needed",
             )
         if self.start_height_m == 0.0:
             sure_px = reliable_side_px(self.large_px)

@@ -116,7 +116,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
     wander_px = max(float(np.linalg.norm(centers.std(axis=0))), drift_px)
     if wander_px > MOST_WANDER_PX:
         return (
-            f"not still: the target moved by {wander_px:.1f} px in the picture (at most "
+            f"not still: the target moved by {wander_px:.1f} px in the image (at most "
             f"{MOST_WANDER_PX:g} px allowed); fix the camera in place"
         )
     return None

@@ -71,7 +71,7 @@ def test_views_in_another_layout_than_most_are_left_out(tmp_path: Path) -> None:
     seen = found([*pictures, sheet(replace(board, legacy=True))], EVEN, tmp_path)
     assert [view.name for view in seen.views] == ["0.png", "1.png"]
     ((name, reason),) = ((r.view, r.reason) for r in seen.without_board)
-    assert (name, reason) == ("2.png", "its markers have another layout than in most pictures")
+    assert (name, reason) == ("2.png", "its markers have another layout than in most images")
 
 
 @pytest.mark.long
@@ -164,6 +164,6 @@ def test_all_pictures_of_another_size_are_named_before_the_search(tmp_path: Path
     for name, size in sizes.items():
         cv2.imwrite(f"{tmp_path}/{name}.png", np.full(size, 90, np.uint8))
     (tmp_path / "f.png").write_bytes(b"no picture")
-    said = "3 of 5 pictures are 64x48 px, but b.png is 65x49 px, d.png is 48x64 px: "
+    said = "3 of 5 images are 64x48 px, but b.png is 65x49 px, d.png is 48x64 px: "
     with pytest.raises(InvalidValue, match=said):
         find_views(sorted(tmp_path.iterdir()), Board.parse(EVEN))

@@ -103,7 +103,7 @@ def test_a_calibration_is_not_judged_by_its_own_pictures(
     said = calibrate("check", file, f"images:{tmp_path}")
     assert said.exit_code == 30
     assert f"the board is {BOARD} (the calibration's)" in said.stderr
-    assert "10 of 10 views are from the pictures that the calibration was made from" in said.stderr
+    assert "10 of 10 views are from the images that the calibration was made from" in said.stderr
     render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
     passed = calibrate("check", file, f"images:{tmp_path}")
     assert passed.exit_code == 0, passed.output
@@ -151,7 +151,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
         (["images:{board}", "-o", "mine.yaml"], 30, ["mine.yaml already exists", "--force"]),
         (["images:{board}", "-o", "reported.yaml"], 30, ["reported.html already exists"]),
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
-        (["images:sizes"], 30, ["3 of 4 pictures are 480x360", "board_02.png is 480x300 px"]),
+        (["images:sizes"], 30, ["3 of 4 images are 480x360", "board_02.png is 480x300 px"]),
         (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 pictures"]),
     ],
 )

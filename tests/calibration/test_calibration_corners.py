@@ -162,7 +162,7 @@ def test_what_does_not_reach_the_edge_is_no_gear() -> None:
 @pytest.mark.parametrize(
     ("pictures", "told"),
     [
-        (turned_about(5), "5 pictures are too few"),
+        (turned_about(5), "5 images are too few"),
         (turned_about(contrast=2.0), "hardly change"),
         (turned_about(covered=np.zeros(SIZE_PX[::-1], np.bool_)), "covers nothing"),
         ([*turned_about(3), np.zeros((10, 10), np.uint8)], "is for one size"),

@@ -150,7 +150,7 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
         (ros(FIVE, "binning_x: 2\nbinning_y: 2\n"), "binning_x = 2 changes the projection"),
         (
             ros(FIVE, "roi: {x_offset: 9, y_offset: 0, width: 200, height: 150}\n"),
-            "roi is only a part of the picture",
+            "roi is only a part of the image",
         ),
         (
             ros(FIVE, "roi: {x_offset: 0, y_offset: 0, width: 200, height: 150}\n"),

@@ -92,7 +92,7 @@ def test_what_no_board_covered_is_marked() -> None:
     assert share == pytest.approx(1.0 - report.result.covered_cells.mean())
     assert ((left >= 0) & (left + width <= 640) & (top >= 0) & (top + height <= 480)).all()
     assert np.isclose(left + width, 640).sum() == 24  # each row of the grid ends uncovered
-    assert any("% of the picture is uncovered" in sentence for sentence in report.advice)
+    assert any("% of the image is uncovered" in sentence for sentence in report.advice)
     html = calibration_report(report.result, "camera.yaml", DATE)
     assert html.count('class="empty"') == len(boxes)
 

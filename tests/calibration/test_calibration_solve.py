@@ -64,7 +64,7 @@ def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
     result = calibrate_camera([v for v in cut if len(v) >= 8])
     assert max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in result.errors) < 1.0
     assert result.verdict == "care"
-    assert "% of the picture is uncovered: add views with the board at the" in result.defects[-1]
+    assert "% of the image is uncovered: add views with the board at the" in result.defects[-1]
     assert "right" in result.defects[-1]
 
 

@@ -183,7 +183,7 @@ def reject_outliers(
             raise InvalidValue(
                 f"{len(rejections)} of {len(views)} views do not fit one camera ({named}): "
                 "check that the board is flat, that --board matches it, and that zoom and "
-                "focus were not changed between the pictures"
+                "focus were not changed between the images"
             )
         kept = [
             view.select(mask)

@@ -91,7 +91,7 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
     odd = {name: size for name, size in sizes.items() if size not in (most, None)}
     named = ", ".join(f"{name} is {size[0]}x{size[1]} px" for name, size in odd.items() if size)
     raise InvalidValue(
-        f"{count} of {counts.total()} pictures are {most[0]}x{most[1]} px, but {named}: "
+        f"{count} of {counts.total()} images are {most[0]}x{most[1]} px, but {named}: "
         "a calibration is for one size, so remove the others"
     )
 
@@ -100,7 +100,7 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
     """Return the views of the layout that most images show, and reject the others: there is only
     one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
-    reason = "its markers have another layout than in most pictures"
+    reason = "its markers have another layout than in most images"
     others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
     return [view for view in views if view.legacy == legacy], others
 

@@ -93,12 +93,12 @@ def check_calibration(
     found = replace(found, views=tuple(view for view in found.views if view not in own))
     if own and len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
-            f"{len(own)} of {len(own) + len(found.views)} views are from the pictures that "
-            "the calibration was made from, which cannot test it: take new pictures"
+            f"{len(own)} of {len(own) + len(found.views)} views are from the images that "
+            "the calibration was made from, which cannot test it: take new images"
         )
     if len(found.views) < MIN_CHECK_VIEWS:
-        advice = "add some with the board tilted by 20 to 45 deg and near the picture's edges"
-        seen = f"{len(found.views)} pictures show the board"
+        advice = "add some with the board tilted by 20 to 45 deg and near the image's edges"
+        seen = f"{len(found.views)} images show the board"
         if found.frames is not None:
             seen = f"{len(found.views)} usable views ({found.frames.text})"
             advice = found.frames.advice or advice
@@ -126,13 +126,13 @@ def _verdict(
     if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
         return False, (
             f"reprojection RMS {fixed.rms_px:.2f} px, but {free.rms_px:.2f} px is possible "
-            "with these pictures"
+            "with these images"
         )
     worst = max(deviations, key=lambda d: d.allowed_error_share, default=None)
     if worst is not None and worst.allowed_error_share > 0.5:
         return False, (
             f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
-            f"these pictures place it (+-{worst.mm95:.1f} mm), but only "
+            f"these images place it (+-{worst.mm95:.1f} mm), but only "
             f"{0.5 * allowed_error_mm(worst.z_m):.1f} mm is allowed"
         )
     return True, f"reprojection RMS {fixed.rms_px:.2f} px ({free.rms_px:.2f} px at best)"
@@ -143,7 +143,7 @@ def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(
-        f"{len(free.poses)} pictures (board tilted by at most "
+        f"{len(free.poses)} images (board tilted by at most "
         f"{tilts_deg(free.poses).max():.0f} deg) are not enough to judge a focal "
-        "length: add some with the board tilted by 20 to 45 deg and filling the picture"
+        "length: add some with the board tilted by 20 to 45 deg and filling the image"
     )

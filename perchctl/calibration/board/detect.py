@@ -124,7 +124,7 @@ class FrameCounts:
             return "hold the board still for a moment at each place, in good light"
         return (
             "record again and hold still for a moment at each place, in good light, or "
-            "save sharp frames as pictures (images:)"
+            "save sharp frames as images (images:)"
         )
 
 

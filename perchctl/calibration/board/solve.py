@@ -229,7 +229,7 @@ def robust_fit(
             return reject_outliers(views, best)
     except NoSolution:
         pass
-    raise InvalidValue("no camera model fits these pictures: check that --board matches the board")
+    raise InvalidValue("no camera model fits these images: check that --board matches the board")
 
 
 def _is_usable(camera: CameraModel) -> bool:
@@ -266,7 +266,7 @@ def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
     missing = MIN_VIEWS - len(views)
     variety = (
         "with the board tilted by 20 to 45 deg in all directions, near and far, and in every "
-        "corner of the picture"
+        "corner of the image"
     )
     if found.frames is not None:
         advice = found.frames.advice or f"show the board {variety.removeprefix('with the board ')}"
@@ -275,7 +275,7 @@ def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
             f"({found.frames.text}): {advice}"
         )
     pictures = len(found.views) + len(found.without_board)
-    of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
+    of = f"of {pictures} images" if pictures > len(views) else "pictures"
     raise InvalidValue(
         f"only {len(views)} {of} show the board, but at least {MIN_VIEWS} are needed: "
         f"add {missing} or more (15 to 25 are good) {variety}"
@@ -294,9 +294,9 @@ def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
         )
     if covered.mean() < MIN_COVERED:
         raise InvalidValue(
-            f"the boards cover {100 * covered.mean():.0f} % of the picture, but at least "
+            f"the boards cover {100 * covered.mean():.0f} % of the image, but at least "
             f"{100 * MIN_COVERED:.0f} % are needed: add views with the board "
-            f"{_uncovered_text(covered)} of the picture, or closer"
+            f"{_uncovered_text(covered)} of the image, or closer"
         )
 
 
@@ -306,19 +306,19 @@ def _check_focal(parameters: Array, std: Array) -> None:
         raise InvalidValue(
             f"the views determine the focal length only to +-{100 * share:.1f} % (at most "
             f"{100 * MAX_FOCAL_ERROR:g} % is accepted): add sharp views with the board "
-            "tilted by 20 to 45 deg about both axes and filling half of the picture"
+            "tilted by 20 to 45 deg about both axes and filling half of the image"
         )
 
 
 def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
     lacks = []
     if not _is_usable(fit.camera):
-        lacks.append("the lens model folds back inside the picture: add views at its edges")
+        lacks.append("the lens model folds back inside the image: add views at its edges")
     if views < GOOD_VIEWS:
         lacks.append(f"only {views} views: add {GOOD_VIEWS - views} or more")
     if covered.mean() < GOOD_COVERED:
         lacks.append(
-            f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered: add views with the "
+            f"{100 * (1 - covered.mean()):.0f} % of the image is uncovered: add views with the "
             f"board {_uncovered_text(covered)}"
         )
     return lacks

@@ -152,7 +152,7 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
         raise InvalidValue(
             "the rotations from the gyroscope and from the camera differ by "
             f"{math.degrees(off_rad):.1f} deg ({100 * rows.rejected_share:.0f} % of the "
-            "pictures do not fit at all): fix the target in the room and the camera on the "
+            "images do not fit at all): fix the target in the room and the camera on the "
             f"vehicle; then {HOW_TO_RECORD['carry']}"
         )
     sigma = np.sqrt(np.diagonal(cov))
@@ -172,7 +172,7 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
         )
     if latency_s < -2.0 * sigma_s:
         raise InvalidValue(
-            f"the pictures have time stamps {-1e3 * latency_s:.0f} ms before they can have "
+            f"the images have time stamps {-1e3 * latency_s:.0f} ms before they can have "
             "been taken: camera and telemetry must use the same clock"
         )
 

@@ -82,7 +82,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         raise InvalidValue(
             f"the tip is known only to {1e3 * sigma_m:.1f} mm, at most "
             f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.rejected_share:.0f} % "
-            f"of the pictures do not fit: {HOW_TO_RECORD['pivot']}"
+            f"of the images do not fit: {HOW_TO_RECORD['pivot']}"
         )
     return PivotSolution(
         gear_cam_m=tip_m,

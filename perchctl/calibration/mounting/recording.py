@@ -189,7 +189,7 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
         together = sum(begin_s <= p.t_s <= end_s + MOST_LATE_S for p in poses)
         if together < 0.5 * len(poses):
             raise InvalidValue(
-                f"only {together} of {len(poses)} pictures were taken while telemetry was "
+                f"only {together} of {len(poses)} images were taken while telemetry was "
                 "recorded: both must use the same clock; record again"
             )
     if lacking := missing_motion(recording):
