@@ -251,7 +251,7 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str) -> None:
     """cflib logs them unless it is told not to: seen by a process of its own."""
     said = run_apart("fly", "-p", profile, "--uri", NOWHERE, "--source", eyes, "--yes")
     assert said.code == 10
-    assert "nothing listens there" in said.stderr
+    assert "no program is listening there" in said.stderr
     assert "link error callback" not in said.stderr
 
 

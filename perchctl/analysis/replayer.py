@@ -26,7 +26,7 @@ from perchctl.vision import Pipeline, make_pipeline
 
 CAUTION = (
     "after the first difference the vehicle would have moved differently: from "
-    "there on the replay shows how the planner reacts to telemetry and pictures of "
+    "there on the replay shows how the planner reacts to telemetry and images of "
     "another flight"
 )
 
@@ -143,8 +143,8 @@ class Replay:
             )
         if self.log.truncated:
             found.append(
-                "the log ends during the flight, without its summary: only what it holds was "
-                "replayed"
+                "the log ends during the flight, without its summary: only the part that "
+                "it contains was replayed"
             )
         ended = "" if self.seen is None else self.seen.end_reason
         found += [note for note in (self.gap_text, ended) if note]

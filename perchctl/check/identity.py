@@ -126,7 +126,7 @@ def _vehicle_finding(
     link: ProbeLink, options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask
 ) -> Finding:
     if options.simulated:
-        return skipped("simulated: it has its address to itself")
+        return skipped("simulated: no other vehicle has its address")
     seen = vehicle.query_vehicle(link, options.uri, scope.listen_s)
     if seen.telemetry is None:
         return failed("no telemetry arrives", "restart the vehicle, and run perchctl check")
@@ -218,13 +218,13 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     view.scope.announce(f"looking for the target for {view.scope.rehearse_s:g} s")
     target, stand = view.profile.target, view.stand
     expected_m = target.expected_xy_m
-    assert expected_m is not None, "each vehicle of a fleet has a target at a place"
+    assert expected_m is not None, "each vehicle of a fleet has a target position"
     own = view.rehearse()
     place_m = _target_place(own)
     away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
     # Single images may be within the limit although the target is not.
     if away_m <= target.expected_within_m:
-        found = f"its camera sees its target {away_m:.2f} m from its place"
+        found = f"its camera sees its target {away_m:.2f} m from its expected position"
         if ask is None or not stand.lookalikes:
             return passed(found)
         return _covered_finding(
@@ -257,9 +257,9 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
         return failed(f"{why}, and you have not covered the lens", "give each target its own ids")
     covered = view.rehearse()
     if _is_dark(covered) or (before.target_pictures and not covered.target_pictures):
-        return passed("its camera went blind as you covered the lens")
+        return passed("its camera image went dark when you covered the lens")
     return failed(
-        "its camera went on to see as you covered the lens",
+        "its camera image did not go dark when you covered the lens",
         "it may be another vehicle's: correct source; if it is not, cover the whole lens",
     )
 

@@ -314,7 +314,7 @@ def simulate(
     if faults == "list":
         return _list_fleet_faults(as_json)
     if resume and out is None:
-        raise UsageError("--resume goes on with a file of results: name it with --out")
+        raise UsageError("--resume continues a file of results: name it with --out")
     _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     names = () if faults is None else fleets.select_fleet_faults(faults)

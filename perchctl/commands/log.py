@@ -124,7 +124,7 @@ def plot(
     beside = records.path_beside(path, PLOTS[0][0])
     with _opened(path) as log:
         if output is None and not force and beside.is_file():
-            say("this flight is plotted already; add --force to draw the plot again")
+            say("this flight has already been plotted; add --force to draw the plot again")
             print(f"plot:      {beside}")
             return
         picture = _place(path, output, PLOTS, force)

@@ -242,7 +242,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         page, name = self.server.page, urlsplit(self.path).path.removeprefix("/")
         if not page.has_button(name):
-            self._refuse(404, "only the buttons take a POST")
+            self._refuse(404, "only buttons accept POST requests")
         elif not page.may_order(self.headers.get(TOKEN_HEADER, "")):
             self._refuse(403, "this button needs the token of the address that perchctl printed")
         elif not page.order(name):

@@ -279,7 +279,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("link-silent", "no packet in either direction", radio_effect(up=True, down="all")),
     Fault(
         "landing-lost",
-        "the operator lands, but 1 or 2 landing orders are lost",
+        "the operator lands, but 1 or 2 landing commands are lost",
         (packet_loss("land"), ONCE),
         BEFORE_LANDING,
     ),
@@ -297,7 +297,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "emergency-stop-lost",
-        "the operator stops, but 1 or 2 orders are lost",
+        "the operator stops, but 1 or 2 stop commands are lost",
         (packet_loss("emergency-stop"), effect(e.operator, presses_s=(0.0, 0.8))),
     ),
     Fault("packet-twice", "a packet arrives twice", _packet_twice),

@@ -24,7 +24,7 @@ FLAGS: dict[Flag, str] = {
     "slid": "touched down faster than 0.5 m/s sideways",
     "flies_on": "motors on in the air when it should have come down",
     "endless": "did not end within 240 s",
-    "stop_not_obeyed": "motors still on 0.5 s after the order to cut them",
+    "stop_not_obeyed": "motors still on 0.5 s after the command to cut them",
     "pressed": "pressed against ceiling or floor for more than 4 s",
     "strayed": "more than 1 m from where it should be, or too high",
     "lied": "perchctl reported a false state at the end",

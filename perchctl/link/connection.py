@@ -316,7 +316,7 @@ _CAUSES = {
         "another program has it open: a Crazyradio or a USB cable serves one program at a time",
         "end that program, or plug in another Crazyradio and name it as radio://1/...",
     ),
-    "Connection refused": Problem("nothing listens there (connection refused)", ""),
+    "Connection refused": Problem("no program is listening there (connection refused)", ""),
     "Could not open usb": Problem(
         f"no Crazyflie is connected by USB and switched on, or {_PERMISSION}", UDEV_HELP
     ),

@@ -66,7 +66,7 @@ class RadioHub:
         except (EOFError, OSError):
             why = last_line(self._output)
             self.stop()
-            raise ConnectionFailed(f"the radio hub has ended at its start{why}") from None
+            raise ConnectionFailed(f"the radio hub ended while starting{why}") from None
         except BaseException:
             self.stop()
             raise
@@ -127,7 +127,7 @@ def check_uris(uris: Sequence[str]) -> None:
         other = vehicles.setdefault(vehicle_uri(uri), uri)
         if other is not uri:
             raise InvalidValue(
-                f"{other} and {uri} are one vehicle: give each vehicle an address of its own"
+                f"{other} and {uri} are the same vehicle: give each vehicle its own address"
             )
 
 

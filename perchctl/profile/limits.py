@@ -138,7 +138,7 @@ _DOUBTFUL = {
             "the vehicle would climb faster near the target than far from it"
         ),
         # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
-        "40200 <= planner.perch.thrust": "so little raw thrust does not press against the target",
+        "40200 <= planner.perch.thrust": "this raw thrust is too small to press against the target",
         "20 <= safety.max_tilt_deg": (
             "a gust can tilt the vehicle that far, which would cut the motors"
         ),

@@ -136,7 +136,7 @@ class PrintCheck:
         few frames, it is not reported as wrong."""
         if not self.has_enough_frames:
             return PrintVerdict(
-                f"print not judged: both markers were seen in only {len(self._ratios)} frames "
+                f"print not checked: both markers were seen in only {len(self._ratios)} frames "
                 f"of {MIN_FRAMES} needed"
             )
         values, biases = np.array(self._ratios).T

@@ -121,7 +121,7 @@ def test_a_camera_that_another_one_resembles_is_proven_by_a_covered_lens(
     stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", lookalikes=("east",))
     row = rows_of(relay.uri, sim, stand, ask)["target"]
     assert row.verdict is verdict
-    assert ("went blind" in row.found) is covers
+    assert ("went dark" in row.found) is covers
 
 
 def test_a_lens_that_is_not_covered_proves_nothing(sim: SimProcess, relay: Relay) -> None:

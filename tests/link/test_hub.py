@@ -552,7 +552,7 @@ def test_the_driver_is_cflibs_for_its_own_uris_only() -> None:
 @pytest.mark.parametrize(("given", "words"), [
     (["udp://127.0.0.1:1"], "not a radio's URI"),
     ([FOUR[0], "radio://1/80/2M/E7E7E7E702"], "one dongle"),
-    ([FOUR[0], "radio://0/80/2M/e7e7e7e701?rate_limit=50"], "are one vehicle"),
+    ([FOUR[0], "radio://0/80/2M/e7e7e7e701?rate_limit=50"], "are the same vehicle"),
     ([FOUR[0], "radio://0/80/2M/XX"], "is not the URI of a vehicle"),
 ])  # fmt: skip
 def test_uris_that_one_dongle_cannot_serve_are_refused(given: list[str], words: str) -> None:
@@ -717,5 +717,5 @@ def test_a_hub_that_fails_says_its_last_line(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_hub_that_ends_at_its_start_says_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub, "PROGRAM", "raise SystemExit('no room')")
-    with pytest.raises(ConnectionFailed, match=r"^the radio hub has ended at its start: no room$"):
+    with pytest.raises(ConnectionFailed, match=r"^the radio hub ended while starting: no room$"):
         RadioHub(FOUR)
