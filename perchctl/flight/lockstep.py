@@ -37,7 +37,7 @@ from perchctl.sim import (
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import Frame, Step, make_pipeline
+from perchctl.vision import Frame, StepFunction, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2  # number of images that may wait; a newer one replaces the oldest
@@ -169,7 +169,7 @@ def fly_lockstep(
     watchers: tuple[Watcher, ...] = (),
     rows: Sequence[Transition] = (),
     camera: Callable[[FrameSource], FrameSource] = lambda source: source,
-    perception: Step | None = None,
+    perception: StepFunction | None = None,
 ) -> LockstepFlight:
     """Fly one seed of the profile's scenario to its end, faster than real time.
 

@@ -5,7 +5,7 @@ from .markers.cut import shows_enough_of_target as shows_enough_of_target
 from .markers.edge_fit import refine_corners_by_lines as refine_corners_by_lines
 from .pipeline import Detector as Detector
 from .pipeline import Pipeline as Pipeline
-from .pipeline import Step as Step
+from .pipeline import StepFunction as StepFunction
 from .pipeline import deinterlace as deinterlace
 from .pipeline import estimate as estimate
 from .pipeline import make_camera_only_profile as make_camera_only_profile

@@ -180,7 +180,7 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 
 UNKNOWN_READOUT_SIGMA_S = 0.012
 """Standard deviation of a camera's readout time if the profile does not specify it, s."""
-FLOW_SIGMA_FRACTION, FLOW_ROTATION_SIGMA = 0.05, 0.015
+FLOW_ALONG_SIGMA_FRACTION, FLOW_ACROSS_SIGMA_FRACTION = 0.05, 0.015
 """Errors along and across a corner's motion, as shares of it, since the motion was measured one
 frame earlier."""
 
@@ -210,7 +210,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         if readout_s is None:
             out.append(replace(d, rolling_shutter_error_shift_px=moved_px))
         else:
-            turned_px = FLOW_ROTATION_SIGMA * float(np.abs(moved_px).max())
+            turned_px = FLOW_ACROSS_SIGMA_FRACTION * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
             out.append(
                 replace(
@@ -218,7 +218,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    rolling_shutter_error_shift_px=FLOW_SIGMA_FRACTION * moved_px,
+                    rolling_shutter_error_shift_px=FLOW_ALONG_SIGMA_FRACTION * moved_px,
                 )
             )
     return out

@@ -79,7 +79,7 @@ class Detector(Protocol):
     def __call__(self, image: NDArray[np.uint8], /) -> Mapping[str, Any]: ...
 
 
-Step = Callable[
+StepFunction = Callable[
     [PipelineState, Frame, VehicleState | None, "Pipeline"], tuple[PipelineState, PipelineOutput]
 ]
 """The signature of `step`."""
@@ -97,7 +97,7 @@ class Pipeline:
     kalman: KalmanConfig
     camera: CameraModel
     custom_detector: Detector | None = None
-    custom_step: Step | None = None
+    custom_step: StepFunction | None = None
 
 
 def make_pipeline(

@@ -182,7 +182,7 @@ _MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
 # Errors outside any covariance: calibration, print, latency; plus shares of the range.
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
 _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
-_POSITION_AXES: Array = np.diag([0.0, 1.0, 1.0, 1.0])
+_POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _MIN_ROTATION_TO_REPORT_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
@@ -334,7 +334,7 @@ def update_lock(
         track=track,
         pose=frame_pose.pose,
         is_in_world_frame=frame_pose.is_in_world_frame,
-        accepted_frames=1 if before is None else before.accepted_frames + 1,
+        accepted_frame_count=1 if before is None else before.accepted_frame_count + 1,
         has_both_markers=frame_pose.has_both_markers
         or (before is not None and before.has_both_markers),
         track_before_last_pose=None if before is None else before.track,
@@ -386,7 +386,7 @@ def _compute_innovation(
     R = filter_setup.R if measurement.R is None else measurement.R
     S = (
         wanted.P[MEASURED, MEASURED]
-        + drift_m**2 * _POSITION_AXES
+        + drift_m**2 * _POSITION_SELECTION_MATRIX
         + R
         + error_shifts @ error_shifts.T
     )
@@ -477,7 +477,7 @@ def _update_rival(
         return replace(
             previous_rival,
             track=track,
-            seen_frames=previous_rival.seen_frames + 1,
+            seen_frame_count=previous_rival.seen_frame_count + 1,
             frames_with_both_markers=whole,
         )
     turned_rad, farther_m = (
@@ -495,7 +495,7 @@ def _update_rival(
         track=start_track(frame_pose.measurement, frame_pose.t_s, filter_setup),
         is_in_world_frame=frame_pose.is_in_world_frame,
         first_seen_s=frame_pose.t_s,
-        seen_frames=1,
+        seen_frame_count=1,
         frames_with_both_markers=int(frame_pose.has_both_markers),
         has_different_range=has_different_range,
         relative_position_text=where,
@@ -504,8 +504,8 @@ def _update_rival(
 
 def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     if (
-        lock.accepted_frames < MIN_ESTABLISHED_TRACK_FRAMES
-        and rival.seen_frames > lock.accepted_frames
+        lock.accepted_frame_count < MIN_ESTABLISHED_TRACK_FRAMES
+        and rival.seen_frame_count > lock.accepted_frame_count
     ):
         return True
     if frame_pose.is_attitude_unknown and _is_rival_likely_target(lock, rival, frame_pose):
@@ -537,7 +537,7 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
     ):
         return False
     if not lock.has_both_markers:
-        return rival.seen_frames >= MIN_ESTABLISHED_TRACK_FRAMES
+        return rival.seen_frame_count >= MIN_ESTABLISHED_TRACK_FRAMES
     return (
         frame_pose.has_both_markers
         and rival.frames_with_both_markers >= MIN_ESTABLISHED_TRACK_FRAMES
@@ -629,8 +629,8 @@ class _CameraDisplacements(NamedTuple):
     """The camera's displacement (3,) in the world between two times: from the difference of the
     estimated positions, and from velocity times time."""
 
-    from_positions_m: Array
-    from_velocity_m: Array
+    position_based_m: Array
+    velocity_based_m: Array
 
 
 def _camera_displacements_m(

@@ -355,8 +355,8 @@ class MotionErrors(NamedTuple):
     from the camera, rad^2: for the motion from the difference of two estimated positions, and for
     the motion from velocity times time."""
 
-    from_positions_rad2: float = 0.0
-    from_velocity_rad2: float = 0.0
+    position_based_error_rad2: float = 0.0
+    velocity_based_error_rad2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,13 +373,13 @@ class LastPose:
 @dataclass(frozen=True, eq=False)
 class TargetLock:
     """The target that the pipeline is locked on: its last track and pose, the number of frames with
-    an accepted pose (`accepted_frames`), and whether any of these poses used both markers.
+    an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers.
     `track_before_last_pose` is the track without its last pose; None after the first one."""
 
     track: MarkerTrack
     pose: MarkerPose
     is_in_world_frame: bool
-    accepted_frames: int
+    accepted_frame_count: int
     has_both_markers: bool
     track_before_last_pose: MarkerTrack | None = None
 
@@ -393,8 +393,8 @@ class RivalTrack:
         track: state of the rival's filter.
         is_in_world_frame: True if the track is in the world frame, False if in the level frame.
         first_seen_s: time of the rival's first frame.
-        seen_frames, frames_with_both_markers: number of frames that showed the rival, and of those
-            that showed both of its markers.
+        seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and of
+            those that showed both of its markers.
         has_different_range: True if the rival's range differs significantly from the target's.
         relative_position_text: the rival's position relative to the target, in words.
     """
@@ -402,7 +402,7 @@ class RivalTrack:
     track: MarkerTrack
     is_in_world_frame: bool
     first_seen_s: float
-    seen_frames: int
+    seen_frame_count: int
     frames_with_both_markers: int
     has_different_range: bool
     relative_position_text: str

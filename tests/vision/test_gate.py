@@ -164,7 +164,11 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     constants = make_filter(KalmanConfig(), is_world_frame=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
     lock = TargetLock(
-        track=track, pose=pose, is_in_world_frame=True, accepted_frames=9, has_both_markers=True
+        track=track,
+        pose=pose,
+        is_in_world_frame=True,
+        accepted_frame_count=9,
+        has_both_markers=True,
     )
     if _is_clearly_consistent(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).is_accepted

@@ -877,24 +877,28 @@ def average_fields(first: Detections, second: Detections) -> Detections:
     )
 
 
-def _average_detections(a: Detection, b: Detection) -> Detection:
+def _average_detections(first: Detection, second: Detection) -> Detection:
 
-    def half(one: float, other: float) -> float:
+    def half_root_sum_square(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)
 
     cov_px2 = None
-    if a.cov_px2 is not None or b.cov_px2 is not None:
-        one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+    if first.cov_px2 is not None or second.cov_px2 is not None:
+        one, other = (
+            d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (first, second)
+        )
         cov_px2 = (one + other) / 4.0
     return Detection(
-        a.marker,
-        (a.corners_px + b.corners_px) / 2.0,
-        half(a.sigma_px, b.sigma_px),
-        a.are_corners_fitted and b.are_corners_fitted,
-        max(a.remaining_edge_shift_sigma_px, b.remaining_edge_shift_sigma_px),
+        first.marker,
+        (first.corners_px + second.corners_px) / 2.0,
+        half_root_sum_square(first.sigma_px, second.sigma_px),
+        first.are_corners_fitted and second.are_corners_fitted,
+        max(first.remaining_edge_shift_sigma_px, second.remaining_edge_shift_sigma_px),
         cov_px2=cov_px2,
-        row_jitter_sigma_px=half(a.row_jitter_sigma_px, b.row_jitter_sigma_px),
-        horizontal_side_extra_sigma_px=half(
-            a.horizontal_side_extra_sigma_px, b.horizontal_side_extra_sigma_px
+        row_jitter_sigma_px=half_root_sum_square(
+            first.row_jitter_sigma_px, second.row_jitter_sigma_px
+        ),
+        horizontal_side_extra_sigma_px=half_root_sum_square(
+            first.horizontal_side_extra_sigma_px, second.horizontal_side_extra_sigma_px
         ),
     )

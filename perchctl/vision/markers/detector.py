@@ -154,7 +154,7 @@ sides."""
 _MASK_SPREAD_ROWS = 7  # rows of a field's image to which a covered row contributes
 # reduction factor, and standard deviation of the fill in the reduced image
 _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
-_MEAN_GREY_FILL_WEIGHT = 1e-4
+_MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
@@ -180,8 +180,8 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
         return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA), np.float32)
 
     mean = cv2.mean(image, (~hidden_mask).astype(np.uint8))[0]
-    grey = (around(image * free) + _MEAN_GREY_FILL_WEIGHT * mean) / (
-        around(free) + _MEAN_GREY_FILL_WEIGHT
+    grey = (around(image * free) + _MEAN_GREY_WEIGHT_IN_FILL * mean) / (
+        around(free) + _MEAN_GREY_WEIGHT_IN_FILL
     )
     smooth = cv2.resize(grey, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.where(hidden_mask, np.rint(smooth).astype(np.uint8), image)

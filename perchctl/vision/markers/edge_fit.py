@@ -529,7 +529,7 @@ class MarkerSides:
         cell_width_across_side_px: width (m, 4) of the border across each side.
         cell_size_px: mean width of a cell, (m,).
         widest_marker_index: index of the marker with the widest cells.
-        winding: direction of the corners, +1 or -1, (m,).
+        winding_sign: direction of the corners, +1 or -1, (m,).
         px_per_normalised: pixels per unit of normalised coordinates along each side, (4m,).
     """
 
@@ -540,7 +540,7 @@ class MarkerSides:
     cell_width_across_side_px: Array
     cell_size_px: Array
     widest_marker_index: int
-    winding: Array
+    winding_sign: Array
     px_per_normalised: Array
 
 
@@ -589,7 +589,7 @@ def prepare_marker_sides(
         cell_width_across_side_px=0.5 * across_px / cells[:, None],
         cell_size_px=cell_size_px,
         widest_marker_index=int(cell_size_px.argmax()),
-        winding=turn,
+        winding_sign=turn,
         px_per_normalised=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
@@ -621,7 +621,7 @@ def measure_edges(
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
         of = np.append(of, (widest, widest, widest, widest))
     # Normals point out of a marker with clockwise corners; dark must come first.
-    sign = markers.winding[of]
+    sign = markers.winding_sign[of]
     if with_inner_edges:
         sign[-4:] *= -1.0
     s = profile_positions(lengths_px.ravel())

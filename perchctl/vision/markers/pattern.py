@@ -27,7 +27,9 @@ MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
 _SMALL_MARKER_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
-_SAMPLE_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
+_SAMPLE_OFFSETS_CELLS: Array = np.array(
+    [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +107,8 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    sample_points_half_sides = (centres[:, None] + _SAMPLE_OFFSETS * 2.0 / n).reshape(-1, 2)
-    owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS))
+    sample_points_half_sides = (centres[:, None] + _SAMPLE_OFFSETS_CELLS * 2.0 / n).reshape(-1, 2)
+    owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_CELLS))
     free = (
         np.abs(sample_points_half_sides).max(axis=1)
         > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side_ratio
