@@ -259,4 +259,4 @@ def test_noise_hides_a_small_error_more_frames_are_surer_and_few_say_nothing() -
     assert many < 0.4 * few
     assert not checked(1.006, 0.6, 6).verdict().is_wrong
     assert not checked(1.05, 0.05, 2).has_enough_frames
-    assert "not judged" in checked(1.05, 0.05, 2).verdict().found
+    assert "not checked" in checked(1.05, 0.05, 2).verdict().found
