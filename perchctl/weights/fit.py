@@ -214,7 +214,7 @@ def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
     closed = closed_form_weights(total)
     if np.isnan(closed).any():
         raise InvalidValue(
-            f"{errors.name}: the two markers do not differ, or only by a constant, in "
+            f"{errors.name}: the two markers are equal or differ only by a constant in "
             f"{AXES[int(np.argmax(np.isnan(closed)))]}, so every weight fits equally well; "
             "check for repeated frames or a copied column"
         )
