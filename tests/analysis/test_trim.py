@@ -115,6 +115,7 @@ def test_the_heading_makes_no_difference(tmp_path: Path) -> None:
     assert turned.shares == pytest.approx(ahead.shares, abs=0.01)
 
 
+@pytest.mark.long
 def test_nearly_all_intervals_hold_the_truth(tmp_path: Path) -> None:
     """Of 20 vehicles drawn as for `perchctl simulate`, each in its own draught, with its own bias
     of the estimated lean: at least 90 % of what should be 95 %."""

@@ -319,6 +319,7 @@ def test_beside_another_vehicle_it_perches_on_its_own_target(seed: int, tmp_path
     assert not any("reacquired" in (r["lock_note"] or "") for r in log.records)
 
 
+@pytest.mark.long
 def test_a_logged_flight_is_the_same_as_one_that_is_not(tmp_path: Path) -> None:
     """To the bit, within one process. The target's standard deviations were once computed for the
     log alone, but the planner reads them, too."""

@@ -103,13 +103,10 @@ def test_its_log_shows_the_hover_and_replays(log_path: Path) -> None:
     assert "it hovered under the target" in page
 
 
-@pytest.mark.parametrize("name", [
-    "target-covered", "link-silent",
-    pytest.param("camera-silent", marks=pytest.mark.long),
-    pytest.param("kick", marks=pytest.mark.long),
-    pytest.param("exception", marks=pytest.mark.long),
-    pytest.param("battery-low", marks=pytest.mark.long),
-])  # fmt: skip
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name", ["target-covered", "link-silent", "camera-silent", "kick", "exception", "battery-low"]
+)
 def test_a_fault_in_a_hover_ends_well(name: str) -> None:
     """Judged by the truth: no fall, no flight astray, and nothing claimed that is not so."""
     profile = hovering(duration_s=20.0)

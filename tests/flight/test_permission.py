@@ -96,6 +96,7 @@ class WithheldFor(Watcher):
         self.begins_s.setdefault(tick.state.phase, tick.t_s)
 
 
+@pytest.mark.long
 def test_it_waits_below_its_target_until_it_may_climb_and_replays_alike(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
