@@ -137,7 +137,9 @@ def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch, is_set: bo
 
     def mirrored(*arguments: Any) -> Any:
         state, output = real(*arguments)
-        seen = Detections(output.detections.frame_index, output.detections.t_s, is_mirrored_marker_seen=True)
+        seen = Detections(
+            output.detections.frame_index, output.detections.t_s, is_mirrored_marker_seen=True
+        )
         return state, replace(output, detections=seen)
 
     monkeypatch.setattr(perception, "step", mirrored)
