@@ -368,7 +368,7 @@ class BacksOff(Motors):
         body_m = (self.lateral_offset_m + 0.02 * max(0.0, t_s - 10.5), 0.0, HANG_Z_M)
         target = target_at(
             t_s, body_m=body_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
-            measured_s=10.0,
+            measured_s=10.0, measured_offset_m=None,
         )  # fmt: skip
         return at(obs={"target": target}, position_m=body_m, thrust=self.thrust)(t_s)
 

@@ -74,6 +74,9 @@ MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
 climb is detected late."""
 TOUCH_OFFSET_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
+LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
+"""Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice what a
+settled one moves. Larger: a contact's offset is reported less precisely than it is known."""
 POSITION_DECK_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 POSITION_DECK_SIGMA_GROWTH_MPS = 0.01
@@ -118,21 +121,23 @@ HANGING_CONFIRMATION_DWELL_S = 1.0
 
 
 def current_gear_offset(b: Belief) -> ContactOffset:
-    """Return the distance between the gear and the target's axis, with its standard deviation: from
-    an image exposed during the present contact, otherwise by dead reckoning from the last sighting.
-    With decks, the standard deviation then grows, because the estimated position drifts and the
-    impact on the ceiling disturbs it."""
-    return _gear_offset_seen_in_contact(b) or _reckoned_gear_offset(b)
+    """Return the distance between the gear and the target's axis, with its standard deviation: in a
+    contact, from the newest image if that is more precise, otherwise by dead reckoning from the
+    last sighting. With decks, the standard deviation then grows, because the estimated position
+    drifts and the impact on the ceiling disturbs it."""
+    reckoned, seen = _reckoned_gear_offset(b), _gear_offset_seen_in_contact(b)
+    return reckoned if seen is None or reckoned.sigma_m < seen.sigma_m else seen
 
 
 def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
     """Return the distance between the gear and the target's axis in the newest image that shows the
-    target, if that image was exposed during the present contact; otherwise None.
+    target, if that image was exposed during the present contact or just before it; otherwise None.
 
     Friction holds the gear while it is pressed, so the distance in an image remains true until the
-    contact ends, and the state estimate, which wanders by millimetres, has no part in it. Images
-    that contradict the vehicle's motion are not used: they may be older than they seem. The
-    distance is wrong if the vehicle slides after the exposure.
+    contact ends, and the state estimate, which wanders by millimetres, has no part in it. Before
+    the touch, a settled vehicle hardly moves sideways. Images that contradict the vehicle's motion
+    are not used: they may be older than they seem. The distance is wrong if the vehicle is pushed
+    or slides after the exposure.
     """
     target = b.obs.target
     if (
@@ -141,15 +146,19 @@ def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
         or b.obs.camera_imu_mismatch is not None
         or b.mounting.is_camera_mounting_wrong
         or not _is_in_contact(b)
-        or target.measured_s < b.imu.climb_steady_since_s
     ):
         return None
     x_m, y_m, z_m = target.measured_offset_m.tolist()
-    if abs(z_m) > b.profile.planner.perch.contact_z_m:
+    before_touch_s = max(0.0, b.imu.climb_steady_since_s - target.measured_s)
+    perch = b.profile.planner.perch
+    if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
-    return ContactOffset(
-        math.hypot(x_m, y_m), math.hypot(target.measured_offset_sigma_m, TOUCH_OFFSET_SIGMA_M)
+    sigma_m = math.hypot(
+        target.measured_offset_sigma_m,
+        TOUCH_OFFSET_SIGMA_M,
+        LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS * before_touch_s,
     )
+    return ContactOffset(math.hypot(x_m, y_m), sigma_m)
 
 
 def _reckoned_gear_offset(b: Belief) -> ContactOffset:
