@@ -66,7 +66,7 @@ COMMANDS: dict[str, str] = {
     ),
     "fly": "Fly a perching mission: find the target, align, ascend, perch, stop the motors.",
     "hover": "Hover below the target for a time, land, and report the position error.",
-    "fleet": "Plan, fly and simulate several vehicles in one room, and convert other lists.",
+    "fleet": "Plan, fly and simulate several vehicles in one room, and import other fleet files.",
     "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
     "log": "Show, plot, compare, export, replay, film or report a flight from its log.",
 }

@@ -109,7 +109,7 @@ def fit(
 )
 def collect(
     session: Annotated[
-        Path, typer.Argument(help="CSV file to write. An unfinished one is continued.")
+        Path, typer.Argument(help="CSV file to write, or an unfinished one to continue.")
     ],
     profile: ProfileOption = "sim",
     truth: Annotated[
@@ -130,7 +130,7 @@ def collect(
     """Collect the data for a fit: poses of both markers at positions with known ground truth.
 
     Place the camera at each position and type in its actual pose. With --truth mocap, the profile's
-    motion capture measures that pose. With --truth sim, the simulator places the camera at seeded
+    motion-capture system measures it. With --truth sim, the simulator places the camera at seeded
     positions. To continue a stopped session, run the same command again.
     """
     say_on_terminal(f"reading profile {profile}")

@@ -70,7 +70,7 @@ app = new_app(Group)
     "perchctl fleet check",
     "perchctl fleet check atrium.yaml -o atrium.svg",
     "perchctl fleet check atrium.yaml --identify",
-    short_help="Plan a fleet's flight, and refuse what cannot be flown.",
+    short_help="Plan a fleet's flight, and reject plans that cannot be flown.",
 )
 def check(
     file: FleetArgument = None,
@@ -79,21 +79,22 @@ def check(
         bool,
         typer.Option(
             "--identify",
-            help="Also prove on the floor that each vehicle, its camera, its motion-capture body "
-            "and its home belong together.",
+            help="Also verify, with the vehicles on the floor, that each one is matched to the "
+            "right camera, motion-capture body and home position.",
         ),
     ] = False,
     as_json: JsonOption = False,
     force: ForceOption = False,
 ) -> int:
-    """Plan, fly and simulate several vehicles in one room, and convert other lists.
+    """Plan, fly and simulate several vehicles in one room, and import other fleet files.
 
     By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
-    vehicles, decides who flies together and in which order, and draws the room from above. It
-    connects to nothing. A plan that cannot be flown is drawn too, and refused in one sentence.
+    vehicles, decides which vehicles fly together and in which order, and draws the room from above.
+    It connects to nothing. If the plan cannot be flown, perchctl still draws it, and says why in
+    one sentence.
 
     With --identify, perchctl then connects to the vehicles one at a time and checks that each
-    stands at its home. Nothing is armed. The exit codes are those of perchctl check.
+    one is at its home. It arms nothing. The exit codes are those of perchctl check.
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
@@ -182,7 +183,7 @@ def fly(
         bool | None,
         typer.Option(
             "--record/--no-record",
-            help="Record the images to MCAP files next to the logs. Default: only of real "
+            help="Record the images to MCAP files next to the logs. Default: only for real "
             "vehicles.",
         ),
     ] = None,
@@ -195,11 +196,11 @@ def fly(
     view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Fly all vehicles of a fleet, each in a process of its own, in the order of the plan.
+    """Fly all vehicles of a fleet in the order of the plan, each one in its own process.
 
-    No vehicle is armed until all of them are ready. Press Ctrl-C to land all; those that hang
-    stay. Press it again to cut the motors. The space bar cuts the motors at once. The key with a
-    vehicle's number lands that one. The exit code is 0 only if all vehicles hang.
+    No vehicle is armed until all of them are ready. Press Ctrl-C to land all; vehicles that
+    hang stay there. Press it again to cut the motors. The space bar cuts the motors at once. To
+    land a single vehicle, press its number. The exit code is 0 only if all vehicles hang.
     """
     _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
@@ -290,8 +291,8 @@ def simulate(
         typer.Option(
             "--faults",
             metavar="all|list|NAME,NAME",
-            help="Inject a fault into one vehicle, or a common cause into several, and judge all "
-            "vehicles by the simulator's ground truth; list only prints the faults.",
+            help="Inject a fault into one vehicle, or a common-cause fault into several, and judge "
+            "all vehicles by the simulator's ground truth; list only prints the faults.",
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -307,9 +308,9 @@ def simulate(
 ) -> int:
     """Fly a fleet of simulated vehicles in one room many times, faster than real time.
 
-    Each vehicle flies as in perchctl simulate. All share one clock, feel the air that the others
-    blow down on them, and fly in the order of the plan. perchctl counts how they ended, how near
-    they came to each other, and what went wrong by the simulator's ground truth.
+    Each vehicle flies as in perchctl simulate. They share one clock, feel each other's downwash,
+    and fly in the order of the plan. perchctl reports how their flights ended, how close they came
+    to each other, and what went wrong according to the simulator's ground truth.
     """
     if faults == "list":
         return _list_fleet_faults(as_json)
@@ -374,7 +375,7 @@ def convert(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Crazyswarm2's crazyflies.yaml, or a swarm of cfcli or Swarmkeeper.",
+            help="Crazyswarm2's crazyflies.yaml, or a swarm file from cfcli or Swarmkeeper.",
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Fleet file to write.")] = Path(
@@ -384,8 +385,8 @@ def convert(
 ) -> None:
     """Make a fleet file from Crazyswarm2's or cfcli's list of Crazyflies.
 
-    perchctl takes names, URIs and, from Crazyswarm2, initial positions and motion-capture bodies.
-    Targets and cameras are not in these lists: you add them to the fleet file.
+    perchctl copies names, URIs and, from Crazyswarm2, initial positions and motion-capture bodies.
+    These lists contain no targets and cameras: add them to the fleet file.
     """
     check_output(output, (".yaml", ".yml"), force, "what a fleet file is")
     say_on_terminal(f"reading {file}")

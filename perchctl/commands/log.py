@@ -91,7 +91,7 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
 
     All subcommands read logs of real and simulated flights, of flights that were killed, and of
     older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do
-    not hold.
+    not contain.
     """
     with _opened(_log_file(file)) as log:
         flight = analysis.FlightAnalysis(log)
@@ -260,7 +260,8 @@ def report(
 ) -> None:
     """Write a page that describes one or more flights in sentences and plots.
 
-    The folder of a fleet's flight (with a fleet.json) gives one page of all its vehicles.
+    For the folder of a fleet's flight (with a fleet.json), perchctl writes one page about all of
+    its vehicles.
     """
     logs: list[Path] = []
     names: dict[Path, str] = {}
@@ -312,9 +313,9 @@ def film(
 ) -> None:
     """Make a film of a flight: camera image, side view to scale, error and thrust.
 
-    The camera image needs a recording next to the log (fly --record). The folder of a fleet's
-    flight (with a fleet.json) gives one film of all its vehicles: room from above, heights and
-    camera images.
+    The camera image needs a recording next to the log (fly --record). For the folder of a
+    fleet's flight (with a fleet.json), perchctl makes one film of all its vehicles: room from
+    above, heights and camera images.
     """
     fleet = fleets.read_fleet_folder(file) if file is not None and file.is_dir() else None
     if fleet is not None:

@@ -178,13 +178,13 @@ def new(
         ),
     ] = None,
     defaults: Annotated[
-        bool, typer.Option("--defaults", help="Ask nothing, and use the default answers.")
+        bool, typer.Option("--defaults", help="Ask no questions, and use the default answers.")
     ] = False,
     force: ForceOption = False,
 ) -> None:
     """Create a commented profile for your vehicle in a short dialogue.
 
-    With --defaults, or with --set for every question, perchctl asks nothing. You describe the
+    With --defaults, or with --set for every question, perchctl asks no questions. You describe the
     camera's mounting in words: hold a hand over the vehicle's front, then over its left side, and
     say at which edge of the image it appears.
     """

@@ -98,7 +98,7 @@ def track(
     atan2(R[1,0], R[0,0]), the marker's heading in the image plane. sigma_m is along the camera's
     x, y and z axes.
 
-    pose is the target's pose from this image alone, for ROS 2 and filters of your own. Its axes
+    pose is the target's pose from this image alone, for ROS 2 and your own filters. Its axes
     are the marker's, turned by 180 deg about x, so that z points away from the camera. covariance
     has 36 numbers, row by row: x, y, z (m), then small rotations about the camera's x, y, z (rad).
 
