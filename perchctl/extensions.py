@@ -1,4 +1,4 @@
-"""Your own code, named in a profile as ``my_module:MyCamera``: find it, create its object and check
+"""Your own code, named in a profile as ``my_module:MyCamera``: find it, create the object and check
 it."""
 
 from __future__ import annotations

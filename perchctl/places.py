@@ -1,4 +1,4 @@
-"""Paths of perchctl's shipped files and of the user's."""
+"""Paths of the files that perchctl ships, and of the user's files."""
 
 from __future__ import annotations
 

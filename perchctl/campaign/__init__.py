@@ -1,5 +1,5 @@
-"""Campaigns of many seeded flights in lockstep, flown in processes or on a cluster, counted and
-compared."""
+"""Campaigns: fly many seeds in lockstep, in processes or on a cluster, and count and compare the
+outcomes."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Faults injected into simulated flights, and the oracle that judges by the true state."""
+"""Faults injected into simulated flights, and the oracle that judges flights by the true state."""
 
 import lazy_loader
 

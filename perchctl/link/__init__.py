@@ -1,4 +1,4 @@
-"""The link to a vehicle: by cflib, or to the simulated one in lockstep."""
+"""The link to a vehicle: through cflib, or in lockstep with a simulated one."""
 
 import lazy_loader
 

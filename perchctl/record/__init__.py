@@ -1,4 +1,4 @@
-"""The flight log and its recording: written, read, summarised and exported as a table."""
+"""Write, read, summarise and export flight logs and their recordings."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The paper's merge weights: data from a session, the fit, and its certainty."""
+"""The paper's merge weights: data from a session, the fit, and its uncertainty."""
 
 import lazy_loader
 
