@@ -68,7 +68,7 @@ COMMANDS: dict[str, str] = {
     "hover": "Hover below the target for a time, land, and report the position error.",
     "fleet": "Plan, fly and simulate several vehicles in one room, and import other fleet files.",
     "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
-    "log": "Show, plot, compare, export, replay, film or report a flight from its log.",
+    "log": "Show, plot, compare, export, replay, film or summarise a flight from its log.",
 }
 """The commands in the order in which a user needs them, with the first sentence of their help."""
 

@@ -198,8 +198,8 @@ def fly(
 ) -> int:
     """Fly all vehicles of a fleet in the order of the plan, each one in its own process.
 
-    No vehicle is armed until all of them are ready. Press Ctrl-C to land all; vehicles that
-    hang stay there. Press it again to cut the motors. The space bar cuts the motors at once. To
+    No vehicle is armed until all of them are ready. Press Ctrl-C to land all vehicles except
+    those that hang. Press it again to cut the motors. The space bar cuts the motors at once. To
     land a single vehicle, press its number. The exit code is 0 only if all vehicles hang.
     """
     _say_reading(file)
@@ -292,17 +292,22 @@ def simulate(
             "--faults",
             metavar="all|list|NAME,NAME",
             help="Inject a fault into one vehicle, or a common-cause fault into several, and judge "
-            "all vehicles by the simulator's ground truth; list only prints the faults.",
+            "all vehicles by the simulator's ground truth. Use list to print all faults.",
         ),
     ] = None,
     as_json: JsonOption = False,
     cluster: ClusterOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="JSONL file to which each result is written as a fleet ends."),
+        typer.Option(
+            "--out", help="JSONL file to which each result is written as its flight ends."
+        ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue --out: fly only the seeds that it lacks.")
+        bool,
+        typer.Option(
+            "--resume", help="Continue the --out file: fly only the seeds that are not in it yet."
+        ),
     ] = False,
     force: ForceOption = False,
 ) -> int:

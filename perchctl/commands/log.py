@@ -87,7 +87,7 @@ def _opened(path: Path) -> Iterator[records.FlightLog]:
     short_help="Show how and why a flight ended: phases, holds, battery, frames and findings.",
 )
 def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
-    """Show, plot, compare, export, replay, film or report a flight from its log.
+    """Show, plot, compare, export, replay, film or summarise a flight from its log.
 
     All subcommands read logs of real and simulated flights, of flights that were killed, and of
     older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do

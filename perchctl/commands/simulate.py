@@ -83,7 +83,7 @@ def run(
             "--faults",
             metavar="all|list|NAME,NAME",
             help="Inject a fault into each flight, and judge the outcome by the simulator's ground "
-            "truth; list only prints the faults.",
+            "truth. Use list to print all faults.",
         ),
     ] = None,
     positioning: PositioningOption = None,
@@ -110,7 +110,7 @@ def run(
         bool,
         typer.Option(
             "--resume",
-            help="Continue --out: fly only the seeds that it lacks.",
+            help="Continue the --out file: fly only the seeds that are not in it yet.",
         ),
     ] = False,
     force: ForceOption = False,
