@@ -13,7 +13,7 @@ class SearchConfig(Section):
     """Phase 2: the vehicle waits `wait_s`, climbs `step_m`, tries again, up to `max_height_m`."""
 
     attempts: int = key(
-        6, "how often the vehicle waits for the target before it lands", ge=1, le=100
+        6, "number of times the vehicle waits for the target before it lands", ge=1, le=100
     )
     wait_s: float = key(1.5, "waiting time at each height", gt=0, le=60)
     step_m: ClassVar[float] = 0.12
@@ -21,7 +21,7 @@ class SearchConfig(Section):
     max_height_m: float = key(1.3, "maximum height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
         60.0,
-        "rotation between two waits, because the image is wider than it is high",
+        "rotation between two waits, to extend the view: the image is wider than it is high",
         ge=0,
         le=180,
     )
@@ -90,7 +90,10 @@ class AscendConfig(Section):
     settle_speed_mps: ClassVar[float] = 0.04
     """Largest speed to count as settled, m/s."""
     settle_dwell_s: float = key(
-        0.3, "time for which position, heading and speed must hold to count as settled", ge=0, lt=10
+        0.3,
+        "time for which position, heading and speed must stay within limits to count as settled",
+        ge=0,
+        lt=10,
     )
     settle_timeout_s: ClassVar[float] = 10.0  # time limit for settling at the stand-off
     fresh_s: float = key(
@@ -108,13 +111,14 @@ class PerchConfig(Section):
     `raw` raises the thrust with stabilised position control off, as the paper does."""
 
     mode: Literal["position", "raw"] = key(
-        "position", "press with a position setpoint above the contact, or with raw thrust"
+        "position",
+        "whether to press with a position setpoint above the contact point, or with raw thrust",
     )
     thrust: int = key(60000, "thrust with `mode: raw`", ge=1000, le=65535)
     press_m: ClassVar[float] = 0.25  # distance of the setpoint above the contact
     climb_mps: ClassVar[float] = 0.2
     """Speed at which the setpoint rises into the press, m/s."""
-    contact_dwell_s: float = key(0.25, "time for which the contact must hold", gt=0, lt=3)
+    contact_dwell_s: float = key(0.25, "time for which the contact must persist", gt=0, lt=3)
     contact_z_m: float = key(
         0.05, "maximum vertical distance to the target in contact", gt=0, le=0.3
     )
@@ -202,7 +206,9 @@ class LandingConfig(Section):
     handover_m: float = key(
         0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
-    undershoot_m: float = key(0.05, "how far below the ground the landing aims", ge=0, le=1)
+    undershoot_m: float = key(
+        0.05, "distance below the ground at which the landing aims", ge=0, le=1
+    )
     drift_mps: ClassVar[float] = 0.012  # assumed drift of the estimated height
     timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)
 
@@ -231,14 +237,14 @@ class PlannerConfig(Section):
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
     hover: HoverConfig | None = key(
-        None, "hover below the target instead of a perch; `perchctl hover` sets it"
+        None, "hover below the target instead of perching; set by `perchctl hover`"
     )
     rows: str | None = key(
         None, "your own mission transitions, as `my_module:ROWS`", pattern=PATTERN
     )
     attempts: int = key(5, "maximum number of perching attempts", ge=1, le=50)
     perching_time_s: float = key(
-        120.0, "time for all attempts together; then the vehicle lands", gt=0, le=1200
+        120.0, "total time for all attempts, after which the vehicle lands", gt=0, le=1200
     )
     integral_per_s: float = key(0.4, "integral gain of the horizontal control", ge=0, le=5)
     integral_limit_m: ClassVar[float] = 0.08
@@ -249,11 +255,13 @@ class CorridorConfig(Section):
     """The space that a vehicle of a fleet may use, in the axes of its state estimate: all places
     within `radius_m` of the line from `home_m` to `target_m` (`perchctl.corridor`)."""
 
-    home_m: tuple[float, float] = key(..., "place of take-off: x, y")
-    target_m: tuple[float, float] = key(..., "place under the target: x, y")
-    radius_m: float = key(..., "largest distance from the line between them", gt=0, le=50)
-    way_top_m: float = key(..., "height above the ground up to which it may fly", gt=0, le=20)
-    target_top_m: float = key(..., "the same under its target", gt=0, le=20)
+    home_m: tuple[float, float] = key(..., "take-off position: x, y")
+    target_m: tuple[float, float] = key(..., "position under the target: x, y")
+    radius_m: float = key(
+        ..., "maximum distance from the line between these positions", gt=0, le=50
+    )
+    way_top_m: float = key(..., "maximum height above the ground along the corridor", gt=0, le=20)
+    target_top_m: float = key(..., "maximum height above the ground under the target", gt=0, le=20)
 
     def contains(self, x_m: float, y_m: float, height_m: float) -> bool:
         """True for a place inside; False for a place that is unknown (NaN)."""
@@ -263,8 +271,10 @@ class CorridorConfig(Section):
 class SafetyConfig(Section):
     """Limits and reaction times: the vehicle hovers after `*_hold_s` and lands after `*_land_s`."""
 
-    min_rest_v: float = key(3.8, "minimum resting voltage for take-off", ge=0, le=5)
-    min_load_v: float = key(3.0, "voltage in flight below which the vehicle lands", ge=0, le=5)
+    min_rest_v: float = key(3.8, "minimum resting battery voltage for take-off", ge=0, le=5)
+    min_load_v: float = key(
+        3.0, "battery voltage in flight below which the vehicle lands", ge=0, le=5
+    )
     # time below `min_load_v` after which the vehicle lands
     battery_debounce_s: ClassVar[float] = 1.5
     energy_gate: bool = key(
@@ -272,7 +282,7 @@ class SafetyConfig(Section):
     )
     energy_reserve_s: float = key(
         4.0,
-        "hover time that the battery must have left after an attempt and a landing",
+        "hover time that must remain in the battery after an attempt and a landing",
         ge=0,
         le=120,
     )
@@ -293,11 +303,11 @@ class SafetyConfig(Section):
         3.0, "time without a good image after which the vehicle lands", gt=0, le=60
     )
     max_frame_age_s: float = key(
-        0.4, "maximum age of an image; older ones are not used", gt=0, le=5
+        0.4, "maximum age of an image; older images are not used", gt=0, le=5
     )
     jump_m: float = key(
         0.25,
-        "position jump: a change of the estimate that its velocity does not explain",
+        "position jump: a change in the estimate that the velocity does not explain",
         gt=0,
         le=5,
     )
@@ -327,7 +337,8 @@ class SafetyConfig(Section):
         2.0, "distance from the take-off point beyond which the vehicle lands", gt=0, le=50
     )
     corridor: CorridorConfig | None = key(
-        None, "corridor of a vehicle in a fleet, outside which it lands; the fleet sets it"
+        None,
+        "corridor of a vehicle in a fleet; the vehicle lands if it leaves it; set by the fleet",
     )
     max_tilt_deg: float = key(55.0, "tilt above which perchctl cuts the motors", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # time for which the vehicle must be tilted
@@ -347,7 +358,8 @@ class SafetyConfig(Section):
     )
     ground_tolerance_m: float = key(
         0.15,
-        "maximum distance from `ground_z_m` at take-off; a vehicle farther off hangs or is held",
+        "maximum distance from `ground_z_m` at take-off; if it is larger, the vehicle hangs or is "
+        "held",
         gt=0,
         le=10,
     )

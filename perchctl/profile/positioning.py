@@ -88,29 +88,32 @@ class PositioningConfig(Section):
     system: System = key(
         "vicon", "motion-capture system, or your own source, as `my_module:MySource`"
     )
-    host: str = key("", "host of the motion capture, as `NAME` or `NAME:PORT`", pattern=_HOST)
+    host: str = key(
+        "", "host of the motion-capture system, as `NAME` or `NAME:PORT`", pattern=_HOST
+    )
     body: str = key(
-        "crazyflie", "name of the vehicle's rigid body in the motion capture", min_length=1
+        "crazyflie", "name of the vehicle's rigid body in the motion-capture system", min_length=1
     )
     body_rpy_deg: Vector3 = key(
-        (0.0, 0.0, 0.0), "rotation of the rigid body in the vehicle's axes: roll, pitch, yaw"
+        (0.0, 0.0, 0.0),
+        "rotation of the rigid body relative to the vehicle's axes: roll, pitch, yaw",
     )
     body_position_m: BodyVector3 = key(
         (0.0, 0.0, 0.0), "position of the rigid body's origin in the vehicle's axes"
     )
     send: Literal["position", "pose"] = key(
-        "position", "what to send: position only, or position and attitude"
+        "position", "what to send: the position only, or position and attitude"
     )
     rate_hz: float = key(100.0, "maximum rate at which positions are sent", ge=10, le=100)
     latency_s: float = key(
         0.01,
-        "time from the exposure of the capture's cameras to arrival, as well as you know it",
+        "time from the exposure of the motion-capture cameras to arrival, as well as you know it",
         ge=0,
         le=MOST_CAPTURE_LATENCY_S,
     )
     position_sigma_m: float = key(
         0.005,
-        "standard deviation that the vehicle assumes for the positions (`locSrv.extPosStdDev`)",
+        "standard deviation that the vehicle assumes for positions (`locSrv.extPosStdDev`)",
         gt=0,
         le=0.2,
     )
@@ -125,11 +128,11 @@ class PositioningConfig(Section):
         0.7, "time without a fresh position after which the vehicle lands", gt=0, le=2
     )
     connect_timeout_s: float = key(
-        5.0, "time limit for the first frame of the motion capture", gt=0, le=60
+        5.0, "time limit for the first frame from the motion-capture system", gt=0, le=60
     )
 
     decks: tuple[str, ...] = key(
-        (), "positioning decks with drivers of your own, named as `check` shows them"
+        (), "positioning decks with your own drivers, named as `check` shows them"
     )
 
     @property

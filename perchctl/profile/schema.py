@@ -44,19 +44,19 @@ class LinkConfig(Section):
         "vehicle: `sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT` or `my_module:MyLink`",
     )
     connect_timeout_s: float = key(
-        15.0, "time limit for connecting, both tries together", gt=0, le=120
+        15.0, "total time limit for two connection attempts", gt=0, le=120
     )
     parameters: dict[str, int | float] = Field(
         default_factory=dict,
-        description="firmware parameters to set and read back before the flight; none may turn a "
-        "motor",
+        description="firmware parameters to set and read back before the flight; none may turn "
+        "motors",
     )
     telemetry_period_s: float = key(
-        0.01, "period of position and attitude in the telemetry", ge=0.01, le=0.1
+        0.01, "period at which telemetry reports position and attitude", ge=0.01, le=0.1
     )
     unreported: tuple[Literal["battery", "variance"], ...] = key(
         (),
-        "readings that this vehicle never reports, so that take-off does not need them: "
+        "readings that this vehicle never reports and that take-off therefore does not require: "
         "`battery`, `variance`",
     )
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
@@ -88,9 +88,9 @@ class LogConfig(Section):
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = key("unnamed", "name of the profile; default: that of its file")
+    name: str = key("unnamed", "name of the profile; default: the name of its file")
     description: str = key("", "one-sentence description of the profile")
-    date: datetime.date | None = key(None, "date of the measurements; printed on the target")
+    date: datetime.date | None = key(None, "date of the measurements, printed on the target")
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()

@@ -74,7 +74,8 @@ class Mounting(Section):
     )
     rpy_deg: Vector3 = key(
         (0.0, 0.0, 0.0),
-        "rotation of the camera; at 0 0 0, image right is forward and image bottom is left",
+        "rotation of the camera; at 0 0 0, the right of the image is forward and "
+        "its bottom is left",
     )
 
     @field_validator("rpy_deg")
@@ -125,7 +126,7 @@ class CameraConfig(Section):
     )
     calibration: str = key(
         "example_640x480.yaml",
-        "calibration file: one next to the profile or in `calib/`, or a full path",
+        "calibration file: a file next to the profile or in `calib/`, or a full path",
     )
     cam: ClassVar[None] = None  # of one camera in a Kalibr file with several
     latency_s: Annotated[float, Field(ge=0, le=MOST_CAMERA_LATENCY_S)] | Literal["measured"] = key(
@@ -134,7 +135,7 @@ class CameraConfig(Section):
     mount: Mounting = Mounting()
     start_timeout_s: float = key(8.0, "time limit for the first good image", gt=0, le=60)
     mirrored: bool = key(False, "flip each image before use")
-    mask: str | None = key(None, "mask file, white where the vehicle covers the view")
+    mask: str | None = key(None, "mask file, which is white where the vehicle covers the view")
     fields: ClassVar[str] = "auto"  # of interlaced images: which field comes first is measured
     readout_s: float | None = key(
         0.0, "rolling shutter: time from the first to the last row; none if unknown", ge=0, le=0.05
@@ -212,25 +213,27 @@ class TargetConfig(Section):
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
     size_sigma: float = key(
         0.005,
-        "relative error common to all printed sizes, one sigma; less once you have measured them",
+        "relative error common to all printed sizes, one sigma; smaller once they are measured",
         ge=0,
         le=0.1,
     )
     curl_per_m: float = key(
         0.03,
-        "curl of the sheet: maximum distance from its plane at r from its centre, divided by r^2",
+        "curl of the sheet: maximum deviation from its plane at distance r from its "
+        "centre, divided by r^2",
         ge=0,
         le=10,
     )
 
     expected_xy_m: tuple[_InARoom, _InARoom] | None = key(
         None,
-        "where to expect the target, in the world frame of the state estimate; of several targets "
-        "the nearest counts",
+        "where to expect the target, in the world frame of the state estimate; if there are "
+        "several targets, the nearest one is used",
     )
     expected_within_m: float = key(
         0.3,
-        "maximum distance of the target from `expected_xy_m`; one farther off is another vehicle's",
+        "maximum distance of the target from `expected_xy_m`; a target farther away belongs to "
+        "another vehicle",
         gt=0,
         le=20,
     )
@@ -271,7 +274,7 @@ class DetectorConfig(Section):
 
     refinement: Literal["subpix", "line"] = key(
         "line",
-        "find corners from edge lines (even if blurred or cut), or with OpenCV's sub-pixel method",
+        "find corners from edge lines (even blurred or cut ones), or with OpenCV's subpixel method",
     )
     own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
     blurred: ClassVar[bool] = True  # only with lines: searched for where blur may hide the target
@@ -314,7 +317,7 @@ class KalmanConfig(Section):
         0.004, "process noise per frame with `noise: fixed`; the paper's Q = k2 I", gt=0
     )
     alpha: float = key(
-        0.85, "factor by which a coasting track's velocities decay per frame", gt=0, le=1
+        0.85, "factor by which the velocities of a coasting track decay per frame", gt=0, le=1
     )
     n_max: int = key(8, "maximum number of frames for which a track coasts", ge=0, le=100)
     frame: Literal["level", "world"] = key(
@@ -322,7 +325,7 @@ class KalmanConfig(Section):
     )
     noise: Literal["fixed", "measured"] = key(
         "measured",
-        "`fixed` uses k1 and k2; `measured` uses each pose's covariance, and accelerations as "
+        "`fixed` uses k1 and k2; `measured` uses the covariance of each pose, and accelerations as "
         "process noise",
     )
     acceleration_mps2: ClassVar[float] = 3.0
@@ -336,7 +339,7 @@ class KalmanConfig(Section):
         le=100,
     )
     attitude_sigma_deg: float = key(
-        0.3, "constant error of roll and pitch, one sigma, with `noise: measured`", ge=0, le=10
+        0.3, "constant error in roll and pitch, one sigma, with `noise: measured`", ge=0, le=10
     )
     drift_mps: ClassVar[float] = 0.05
     """Largest speed at which an unmeasured target moves in the estimate's world, m/s."""
@@ -346,7 +349,9 @@ class KalmanConfig(Section):
 class WeightsConfig(Section):
     """The paper's weights: the large marker's share in each axis and in yaw."""
 
-    x: float = key(0.275, "weight of the large marker in x; the small one has the rest", ge=0, le=1)
+    x: float = key(
+        0.275, "weight of the large marker in x; the small one has the remaining weight", ge=0, le=1
+    )
     y: float = key(0.306, "weight of the large marker in y", ge=0, le=1)
     z: float = key(0.728, "weight of the large marker in z", ge=0, le=1)
     yaw: float = key(0.469, "weight of the large marker in yaw", ge=0, le=1)
@@ -356,7 +361,7 @@ class MergeConfig(Section):
     """The profile's `merge`: how the two markers become one estimate."""
 
     method: Literal["weights", "joint"] = key(
-        "joint", "merge the markers with the paper's weights, or solve both as one pose"
+        "joint", "merge the markers with the paper's weights, or compute one pose from both"
     )
     weights: WeightsConfig = WeightsConfig()
     weights_file: str | None = key(
@@ -364,7 +369,7 @@ class MergeConfig(Section):
     )
     stages: Literal["seen", "range"] = key(
         "seen",
-        "merge all markers in view, or choose by distance (the paper's equations 4, 6 and 11)",
+        "merge all markers in view, or choose by distance (equations 4, 6 and 11 of the paper)",
     )
     z2_m: float = key(0.25, "maximum distance at which the small marker is readable", gt=0)
     z3_m: float = key(0.12, "minimum distance at which the whole large marker is in view", gt=0)
