@@ -97,7 +97,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
     ("words", "code", "said"),
     [
         (["show", "none.jsonl"], 20, "does not exist"),
-        (["show", "empty"], 20, "holds no flight log"),
+        (["show", "empty"], 20, "contains no flight log"),
         (["replay", "flight_1.jsonl", "-p", "smi"], 20, "'smi'"),
         (["show", "a.csv"], 30, "not a perchctl flight log"),
         (["plot", "bare.jsonl"], 30, "nothing to plot"),

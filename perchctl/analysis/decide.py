@@ -48,21 +48,21 @@ def turns_and_gap_text(log: FlightLog) -> tuple[list[TickRecord], str]:
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
-            f"{log.path}: it holds no complete tick and cannot be replayed; {made_by} wrote "
-            f"it in version {log.header.get('version')}, and a replay needs version 3 or "
+            f"{log.path}: contains no complete tick, so it cannot be replayed; {made_by} wrote "
+            f"it in log version {log.header.get('version')}, and a replay needs version 3 or "
             "later"
         )
     for number, turn in enumerate(log.turns):
         if turn.number != number:
             return log.turns[:number], (
-                f"tick record {number} is missing from the log, which has lost records: what "
-                "follows it cannot be replayed"
+                f"tick record {number} is missing from the log: the flight cannot be replayed "
+                "beyond it"
             )
     problem = (log.summary or {}).get("problem")
     if problem:
         return log.turns, (
-            f"the log has lost records ({problem}): ticks after the last one may be among "
-            "them, and cannot be replayed"
+            f"the log has lost records ({problem}): they may include ticks after the last one, "
+            "which cannot be replayed"
         )
     return log.turns, ""
 

@@ -26,8 +26,8 @@ from perchctl.vision import Pipeline, make_pipeline
 
 CAUTION = (
     "after the first difference the vehicle would have moved differently: from "
-    "there on the replay shows how the planner reacts to telemetry and images of "
-    "another flight"
+    "then on, the replay shows how the planner reacts to the telemetry and images "
+    "of a different flight"
 )
 
 
@@ -131,15 +131,17 @@ class Replay:
         found = []
         if made_by != perchctl.__version__:
             found.append(
-                f"perchctl {made_by} flew it, and this is {perchctl.__version__}: a difference "
-                "may be a deliberate change since then"
+                f"perchctl {made_by} flew this flight, and this is {perchctl.__version__}: a "
+                "difference may be a deliberate change"
             )
         if elsewhere:
-            found.append(f"it was flown with {elsewhere}: numbers may differ in their last bits")
+            found.append(
+                f"the flight was made with {elsewhere}: numbers may differ in their last bits"
+            )
         if self.uncompared:
             found.append(
-                f"the perchctl that flew it did not record {', '.join(self.uncompared)}: these "
-                "are not compared, and the planner gets their defaults"
+                f"the log does not contain {', '.join(self.uncompared)}: these fields are not "
+                "compared, and the planner uses their defaults"
             )
         if self.log.truncated:
             found.append(
@@ -185,7 +187,7 @@ class Replay:
         lines = [f"changed:   {', '.join(self.changed_keys)}"] if self.changed_keys else []
         text = "all with the same commands"
         if self.differences:
-            text = f"{len(self.differences)} with another decision"
+            text = f"{len(self.differences)} with a different decision"
         lines.append(f"planner:   {self.ticks} ticks, {text}")
         lines += [f"first:     {each.text}" for each in self.differences[:1]]
         if (seen := self.seen) is None:
@@ -194,7 +196,7 @@ class Replay:
         if seen.end_reason:
             text = f"replayed up to frame {seen.frames} of {seen.frames_flown}"
         if seen.differences:
-            text += f", {len(seen.differences)} ticks with other poses"
+            text += f", {len(seen.differences)} ticks with different poses"
         elif seen.frames:
             text += ", all with bit-identical poses"
         lines.append(f"pictures:  {text}")

@@ -146,8 +146,8 @@ class ReportedFlight:
             found.append("The log has no ticks: there is no flight to report.")
         if log.summary is None:
             found.append(
-                "The log ends without its summary: the program was killed, or lost its disk or "
-                "power. This report ends with the last record."
+                "The log ends without its summary: the program was killed, or the disk or power "
+                "failed. This report ends with the last record."
             )
         if log.ignored_bytes:
             found.append(f"Its last {log.ignored_bytes} bytes are unreadable and were ignored.")
@@ -243,7 +243,7 @@ DECIDED = {
     "ASCEND": "aligned",
     "PERCH": "settled",
     "COMPLETE": "contact",
-    "HOVER": "at its place",
+    "HOVER": "in position",
 }
 WIDEST_PX = 480
 """Width to which a wider image is reduced. Larger: a larger file."""

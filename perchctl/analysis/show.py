@@ -194,7 +194,7 @@ def newest_logs(folder: Path, limit: int | None = None) -> list[Path]:
     paths = [*folder.glob("flight_*.jsonl"), *folder.glob("flight_*.jsonl.gz")]
     if not paths:
         raise NotFound(
-            f"folder {folder} holds no flight log (flight_*.jsonl): name a log, or another folder"
+            f"folder {folder} contains no flight log (flight_*.jsonl): name a log or another folder"
         )
     return sorted(paths, key=_age_key, reverse=True)[:limit]
 

@@ -128,8 +128,8 @@ class Trim:
         """The yaw imbalance in words, for the pair of motors with more thrust, and its causes."""
         pair, more = _yaw_pair(self.yaw_imbalance)
         return (
-            f"{pair} {_percent(more, self.yaw_margin)}; unequal motors or propellers, or a leaning "
-            "motor, cause this, but not the centre of mass"
+            f"{pair} {_percent(more, self.yaw_margin)}; caused by unequal motors or propellers, or "
+            "by a tilted motor, not by the centre of mass"
         )
 
 
@@ -234,15 +234,15 @@ def _advice(trim: Trim) -> Iterator[str]:
     if away:
         yield (
             f"the vehicle flies as if its centre of mass were {' and '.join(away)}: move the "
-            "battery the other way and fly again; if it lies in the middle, check the propellers "
-            "on that side"
+            "battery the other way and fly again; if the battery is already in the middle, check "
+            "the propellers on that side"
         )
     if abs(trim.yaw_imbalance) - trim.yaw_margin > HARMLESS_YAW:
         pair, more = _yaw_pair(trim.yaw_imbalance)
         yield (
-            f"the motors {pair} have to give {_percent(more, trim.yaw_margin)} to hold the "
-            "heading, whatever the position of the battery: check their propellers, and that "
-            "every motor stands upright"
+            f"the motors {pair} need {_percent(more, trim.yaw_margin)} thrust to hold the "
+            "heading, regardless of the battery's position: check their propellers, and that "
+            "every motor is upright"
         )
 
 

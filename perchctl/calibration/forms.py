@@ -210,7 +210,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     cameras = [key for key in values if re.fullmatch(r"cam\d+", key)]
     if len(cameras) > 1:
         raise InvalidValue(
-            f"holds the cameras {', '.join(cameras)}: keep only the one on the vehicle"
+            f"contains the cameras {', '.join(cameras)}: keep only the one on the vehicle"
         )
     if cameras:
         return _kalibr_lens(cameras[0], values[cameras[0]]), values
@@ -368,7 +368,7 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
         raise InvalidValue(
             f"{'key' if len(unknown) == 1 else 'keys'} {clip_text(', '.join(unknown))} of "
             f"this {form.name} may change the projection, and perchctl does not know "
-            f"{'it' if len(unknown) == 1 else 'them'}: remove what is only a note"
+            f"{'it' if len(unknown) == 1 else 'them'}: remove keys that are only notes"
         )
     return found
 

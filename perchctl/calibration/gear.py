@@ -54,7 +54,7 @@ def learn_gear_mask(
         count += 1
     if count < LEAST_PICTURES:
         raise InvalidValue(
-            f"{count} images are too few to find what stays the same in them, at least "
+            f"{count} images are too few to find the parts that stay the same, at least "
             f"{LEAST_PICTURES} are needed: turn the vehicle around for several seconds"
         )
     spread = np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0.0))

@@ -164,7 +164,7 @@ def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     lines = [*align_columns(rows), ""]
     together = (
         f"all {len(rows) - 1} comparisons hold jointly at {100 * LEVEL:.0f} %: the "
-        "intervals of differences and p are corrected for it"
+        "intervals of the differences and the p-values are corrected for this"
     )
     return "\n".join([*lines, together])
 

@@ -197,13 +197,13 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            "the process of a flight was killed; if memory is short, fly fewer at a time "
-            "(--jobs); --resume continues the file of --out"
+            "a flight's process was killed; if memory is short, run fewer flights at a time "
+            "(--jobs); to continue the file given with --out, add --resume"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(
-            "the scheduler of --cluster no longer answers: restart it, and continue the "
-            "file of --out with --resume"
+            "the scheduler given with --cluster no longer answers: restart it, and add --resume "
+            "to continue the file given with --out"
         ) from error
     except ImportError as error:
         raise InvalidValue(

@@ -176,7 +176,7 @@ def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dic
         others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header.get(key)]
         if others:
             raise InvalidValue(
-                f"{path} was flown with another {' and another '.join(others)}: use the same, "
+                f"the flights in {path} have another {' and another '.join(others)}: use the same, "
                 "or name another file"
             )
         if any(flight.pop("kind") != "flight" for flight in flights):

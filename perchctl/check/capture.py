@@ -138,7 +138,7 @@ def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
         return [
             first,
             Row("body", *body),
-            Row("body place", *skipped("the motion capture does not see the body")),
+            Row("body place", *skipped("the motion-capture system does not see the body")),
         ]
     body = _body(samples, places, profile)
     return [first, Row("body", *body), Row("body place", *_place(samples, places, profile))]
@@ -148,8 +148,8 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
-        advice = "a measured pose has noise: check whether the capture is paused or the body hidden"
-        return failed("frozen: all of its poses are identical", advice)
+        advice = "real poses are noisy: check whether the capture is paused or the body is hidden"
+        return failed("frozen: all its poses are identical", advice)
     sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
     times = [place.t_s for place in places]
     span_s = times[-1] - times[0]
@@ -167,7 +167,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     noisy = (
         "keep the vehicle still; calibrate the capture, or raise positioning.position_sigma_m"
         if sigma_m < WILD_M
-        else "the positions look like millimetres: set the unit of the capture's stream to metres"
+        else "the positions appear to be in millimetres: set the unit of the stream to metres"
     )
     limit_m = config.position_sigma_m
     return worst_finding(
@@ -344,7 +344,8 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
     """Check whether vehicle and capture agree on the motion; skipped for None."""
     if motion is None:
         return skipped(
-            "there is no time at which both the vehicle and the capture reported", HOW_TO_TURN
+            "the reports of the vehicle and the motion-capture system do not overlap in time",
+            HOW_TO_TURN,
         )
     own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (motion.R_vehicle, motion.R_capture))
     way_m = float(np.linalg.norm(motion.displacements_m, axis=1).max())
@@ -357,8 +358,8 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
     if seen_rad <= BODY_STILL_RAD and way_m <= BODY_STILL_M:
         return failed(f"the vehicle moves while the {body} stands still", others)
     if way_m > HAND_REACH_M:
-        found = f"the {body} moved by {way_m:.0f} m: the positions look like millimetres"
-        return failed(found, "set the unit of the capture's stream to metres")
+        found = f"the {body} moved by {way_m:.0f} m: the positions appear to be in millimetres"
+        return failed(found, "set the unit of the motion-capture stream to metres")
     turns = solve_alignment(motion)
     if turns is None:
         turned_deg = math.degrees(own_rad)
@@ -393,7 +394,7 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
             nearest_axis(turns.vertical),
         )
         if axis is not None:
-            found = f"swapped axes: up is {axis} in the motion capture"
+            found = f"swapped axes: up is {axis} in the motion-capture system"
         advice = (
             "set the capture's world to z up, and define the rigid body again with the "
             "vehicle level"
@@ -460,7 +461,7 @@ def save_comparison_row(
         return _record_row(config, uri, now)
     if not passes and load_comparison(config, vehicle).objection_and_advice(now) is None:
         found = f"this result could not be saved, so fly would rely on an older pass: {why}"
-        advice = "free some space or restore write permission, and do not fly before that"
+        advice = "free some space or restore write permission, and do not fly until then"
         return Row(COMPARED, *failed(found, advice))
     return Row(
         COMPARED,

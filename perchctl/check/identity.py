@@ -135,15 +135,15 @@ def _vehicle_finding(
     try:
         with link.blinking():
             is_there = ask(
-                f"{stand.name}: all LEDs of one vehicle blink. Is it the only one, and does it "
-                f"stand at its home, {stand.home_text}?"
+                f"{stand.name}: all LEDs of one vehicle are blinking. Is it the only one, and is "
+                f"it at its home, {stand.home_text}?"
             )
     except PerchError as error:
         return failed(f"its LEDs do not blink: {error.found}", "update its firmware")
     if is_there:
-        return passed(f"it blinks at its home, {stand.home_text}, as you confirmed")
+        return passed(f"you confirmed that it blinks at its home, {stand.home_text}")
     return failed(
-        f"you have not seen it blink at its home, {stand.home_text}",
+        f"you did not confirm that it blinks at its home, {stand.home_text}",
         "put each vehicle at its own home, or correct uri; if two blink, give one another address",
     )
 
@@ -163,7 +163,7 @@ def _body_finding(
     if not poses:
         return failed(
             f"{config.label} does not see the body {config.body!r}",
-            "correct body, or move the vehicle into the view of the motion capture",
+            "correct body, or move the vehicle into the view of the motion-capture system",
         )
     x_m, y_m = np.median([pose.position_m[:2] for pose in poses], axis=0)
     away_m = math.dist((x_m, y_m), stand.home_m)

@@ -258,7 +258,7 @@ def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
-        "mocap": f"by {profile.positioning.label}, see the rows on it",
+        "mocap": f"by {profile.positioning.label}, see the rows for it",
         "target": "by the target, see the row in view",
         "deck": f"by {decks}",
     }
@@ -287,7 +287,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return warned(f"{ESTIMATOR} {kind:g} estimates no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
-        return warned(found, "keep it still; if it was, check the light and the floor")
+        return warned(found, "keep it still; if it was still, check the light and the floor")
     if all(each.value is None for each in criteria.variances):
         return skipped(UNREPORTED)
     return passed(found)

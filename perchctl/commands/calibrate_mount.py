@@ -64,7 +64,7 @@ HOW: dict[Part, str] = {
     "pivot": "pivot: rest the tip of the gear on a point that does not move; tilt the "
     "vehicle around it in every direction, keeping the target in view",
 }
-_SIMULATED = "is simulated, so nobody can move it by hand: name a real one"
+_SIMULATED = "is simulated, so you cannot move it by hand: name a real one"
 
 
 def mount(

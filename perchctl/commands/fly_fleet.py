@@ -65,7 +65,7 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
     asks = not (settings.yes or all(each.simulated for each in options.values()))
     if asks and not sys.stdin.isatty():
         raise UsageError(
-            f"about to arm {len(options)} vehicles, and there is nobody to ask: add --yes"
+            f"about to arm {len(options)} vehicles, and the input is not a terminal: add --yes"
         )
     if settings.view:
         options = {name: replace(each, serve_pictures=True) for name, each in options.items()}

@@ -301,8 +301,12 @@ FAULTS: tuple[Fault, ...] = (
         (packet_loss("emergency-stop"), effect(e.operator, presses_s=(0.0, 0.8))),
     ),
     Fault("packet-twice", "a packet arrives twice", _packet_twice),
-    Fault("state-block-dead", "no position and velocity", radio_effect(down="state")),
-    Fault("attitude-block-dead", "no attitude, thrust, supervisor", radio_effect(down="attitude")),
+    Fault("state-block-dead", "no position or velocity", radio_effect(down="state")),
+    Fault(
+        "attitude-block-dead",
+        "no attitude, thrust or supervisor state",
+        radio_effect(down="attitude"),
+    ),
     Fault("battery-block-dead", "no battery voltage", radio_effect(down="battery")),
     Fault("variance-block-dead", "no variance", radio_effect(down="variance")),
     Fault(
@@ -369,7 +373,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "external-position",
-        "positions freeze or end",
+        "positions freeze or stop",
         mocap_effect(either(0.5, "frozen", "silent")),
     ),
     Fault(
@@ -532,7 +536,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("brown-out", "the vehicle restarts", effect(e.reboots, boots_s=uniform(0.5, 1.5))),
     Fault(
         "deck-silent",
-        "the deck's positions end",
+        "the deck's positions stop",
         effect(e.deck_silent, for_s=duration_s(0.3), acc_z_mps2=random_sign(uniform(0.03, 0.08))),
     ),
 )

@@ -61,9 +61,11 @@ def _dead_dongle(source: DrawInputs) -> e.Effect:
 
 
 COMMON_CAUSES: tuple[CommonCause, ...] = (
-    CommonCause(Fault("capture-silent", "the motion capture sends nothing", _capture("silent"))),
     CommonCause(
-        Fault("bodies-swap", "two bodies of the motion capture swap names", _capture("swapped")),
+        Fault("capture-silent", "the motion-capture system sends nothing", _capture("silent"))
+    ),
+    CommonCause(
+        Fault("bodies-swap", "two motion-capture bodies swap names", _capture("swapped")),
         "pair",
     ),
     CommonCause(Fault("stall", "the computer stalls for 2 s: all loops are late", _stall)),

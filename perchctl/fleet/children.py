@@ -114,7 +114,7 @@ class VehicleProcess:
         except (EOFError, OSError):
             raise
         except Exception as error:  # any error that unpickling raises
-            self._fault = f"it sent what is unreadable ({error_at(error)})"
+            self._fault = f"it sent an unreadable message ({error_at(error)})"
             return
         self._heard_s = time.monotonic()
         fault = None if message is None else find_fault(message)  # None: the process is running

@@ -21,8 +21,8 @@ from perchctl.plain_yaml import clip_text
 from perchctl.profile import read_yaml, yaml_scalar
 
 _CAPTURE = (
-    "# Name system and host of your motion capture in defaults. Each vehicle needs a rigid",
-    "# body of its own there; Crazyswarm2 can do with single markers, perchctl cannot.",
+    "# Name your motion-capture system and its host in defaults. Each vehicle needs its own",
+    "# rigid body there: Crazyswarm2 also works with single markers, but perchctl does not.",
 )
 
 

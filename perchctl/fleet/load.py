@@ -53,25 +53,27 @@ class _Common(Section):
     profile: str | None = key(None, "profile, by name or path")
     uri: str | None = key(None, "URI of the vehicle")
     source: str | None = key(None, "camera source")
-    heading_deg: float | None = key(None, "where the nose points at home, from the room's x axis")
+    heading_deg: float | None = key(None, "heading of the vehicle at home, from the room's x axis")
     frame: Frame | None = key(None, "axes of the state estimate: `room` or `home`")
 
 
 class _Vehicle(_Common):
     name: str = key(..., "name of the vehicle", pattern=_NAME_PATTERN)
-    home_m: tuple[_Length, _Length] = key(..., "where it stands before take-off: x, y")
-    target_m: tuple[_Length, _Length] | None = key(None, "where its target hangs: x, y")
-    body: str | None = key(None, "its rigid body in the motion capture", min_length=1)
+    home_m: tuple[_Length, _Length] = key(..., "position before take-off: x, y")
+    target_m: tuple[_Length, _Length] | None = key(None, "position of its target: x, y")
+    body: str | None = key(None, "its rigid body in the motion-capture system", min_length=1)
 
 
 class _File(Section):
     name: str | None = key(None, "name of the fleet")
     defaults: dict[str, Any] = Field(default_factory=dict)
-    order: str = key("one-at-a-time", "how many fly at a time", pattern=_ORDER)
-    on_failure: Literal["continue", "land-all"] = key("continue", "what the others do")
+    order: str = key("one-at-a-time", "how many vehicles fly at a time", pattern=_ORDER)
+    on_failure: Literal["continue", "land-all"] = key(
+        "continue", "what the other vehicles do if one fails"
+    )
     assign: Literal["fixed", "nearest"] = key("fixed", "whether the targets are interchangeable")
     separation_m: float | None = key(
-        None, "least distance between two corridors flown at a time", ge=0.2, le=10
+        None, "minimum distance between two corridors in use at the same time", ge=0.2, le=10
     )
     vehicles: list[dict[str, Any]] = key(
         ..., "the vehicles", min_length=1, max_length=MOST_VEHICLES
@@ -199,7 +201,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
-        axes = "the room's axes" if only == "room" else "axes that begin where it stands"
+        axes = "the room's axes" if only == "room" else "axes that start where it stands"
         raise InvalidValue(
             f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
             f"estimate has {axes}: write {only}, or leave it out"
@@ -213,7 +215,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
         raise type(error)(f"{where}: {error}") from None
     if not vehicle.simulated and (source.scheme == "sim" or not source.live):
         raise InvalidValue(
-            f"{where}: camera source {source} is no live camera, but {uri} is a real vehicle: "
+            f"{where}: camera source {source} is not a live camera, but {uri} is a real vehicle: "
             f"name its camera, as in source: camera:0"
         )
 
@@ -236,10 +238,10 @@ def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> 
 
 def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
     kinds: tuple[tuple[Callable[[FleetVehicle], str | None], str], ...] = (
-        (lambda v: v.name.lower(), "have one name, {0}: give each its own"),
-        (_address, "have one address, {0}: give each its own in Bitcraze's client, and its uri"),
-        (_camera, "have one camera, {0}: give each its own source"),
-        (_body, "have one motion-capture body, {0}: give each its own body"),
+        (lambda v: v.name.lower(), "share the name {0}: give each its own"),
+        (_address, "share the address {0}: give each its own in Bitcraze's client, and in its uri"),
+        (_camera, "share the camera {0}: give each its own source"),
+        (_body, "share the motion-capture body {0}: give each its own body"),
     )
     for read, words in kinds:
         seen: dict[str, tuple[int, FleetVehicle]] = {}

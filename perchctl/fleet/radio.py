@@ -184,15 +184,15 @@ def _refuse_mixed(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> N
                     f"dongle {dongle} has {first.name} on channel {there.channel} and {other.name} "
                     f"on channel {place.channel}, and would carry {OTHER_CHANNELS_PER_S[2]:g} "
                     f"packets/s for each of two vehicles instead of {SAME_CHANNEL_PER_S[2]:g}: set "
-                    f"both to one channel, or give {other.name} another dongle"
+                    f"both to the same channel, or give {other.name} another dongle"
                 )
             if MEASURED_RATE not in (there.rate, place.rate) or place.rate != there.rate:
                 slow, rate = (
                     (other, place.rate) if there.rate == MEASURED_RATE else (first, there.rate)
                 )
                 raise InvalidValue(
-                    f"dongle {dongle} is shared, but {slow.name} is at {rate}, where nobody knows "
-                    f"what a shared dongle carries: set it to {MEASURED_RATE}"
+                    f"dongle {dongle} is shared, but {slow.name} is at {rate}, for which the "
+                    f"capacity of a shared dongle is unknown: set it to {MEASURED_RATE}"
                 )
 
 
@@ -202,8 +202,8 @@ def _refuse_near(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> No
         if high - low < LEAST_APART:
             where = f"channel {low}" if low == high else f"channels {low} and {high}"
             raise InvalidValue(
-                f"dongles {one} and {other} disturb each other on {where}: put vehicles of one "
-                f"channel on one dongle, or set channels that are at least {LEAST_APART} apart"
+                f"dongles {one} and {other} interfere on {where}: put vehicles on the same channel "
+                f"on one dongle, or set channels that are at least {LEAST_APART} apart"
             )
 
 
@@ -225,8 +225,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
     )
     if shared_by > MOST_ON_A_DONGLE:
         raise InvalidValue(
-            f"dongle {dongle} has {shared_by} vehicles on channel {channel}, of at most "
-            f"{MOST_ON_A_DONGLE}: {fewer}"
+            f"dongle {dongle} has {shared_by} vehicles on channel {channel}, but at most "
+            f"{MOST_ON_A_DONGLE} are allowed: {fewer}"
         )
     if need > usable:
         raise InvalidValue(

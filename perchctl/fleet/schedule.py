@@ -297,12 +297,12 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
     radius_m = max(corridors[first].radius_m, corridors[then].radius_m)
     least_m = WANDER_M + ROOM_ERROR_M
     more = (
-        f", or let a motion capture or Lighthouse measure the positions (frame: room), for which a "
-        f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
+        f", or use a motion-capture system or Lighthouse (frame: room), with which a radius of "
+        f"{least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
     return (
         f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from it: move a home or "
-        f"target farther off{more if radius_m > least_m else ''}"
+        f"target farther away{more if radius_m > least_m else ''}"
     )
 
 
@@ -311,9 +311,9 @@ def _check_fence(vehicle: FleetVehicle) -> None:
     fence_m = vehicle.profile.safety.fence_radius_m
     if away_m + WANDER_M > fence_m:
         raise InvalidValue(
-            f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a draught carries "
-            f"it {WANDER_M:g} m beyond, but safety.fence_radius_m is {fence_m:g} m: move its home "
-            f"nearer, or set a larger fence"
+            f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a "
+            f"draught can carry it {WANDER_M:g} m beyond, but safety.fence_radius_m is "
+            f"{fence_m:g} m: move its home nearer, or set a larger fence"
         )
 
 
@@ -326,7 +326,7 @@ def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
             raise InvalidValue(
                 f"the targets of {one.name} and {other.name} have a marker id in common and are "
                 f"{apart_m:.2f} m apart, within target.expected_within_m ({within_m:g} m): print "
-                f"targets with other ids, or hang them farther apart"
+                f"targets with different ids, or hang them farther apart"
             )
 
 

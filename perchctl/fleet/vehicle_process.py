@@ -154,7 +154,9 @@ class ParentLine:
             self._ended.set()
             self._interrupt_start_alone()
         except Exception as error:
-            self._switch.lose_parent(f"the line to the parent process failed ({error_at(error)})")
+            self._switch.lose_parent(
+                f"the connection to the parent process failed ({error_at(error)})"
+            )
             self._ended.set()
             self._interrupt_start_alone()
         finally:

@@ -331,7 +331,7 @@ class GroundCriteria:
         """
         if not samples:
             return None
-        newest, advice = samples[-1], "keep it still; if it was, check its positioning"
+        newest, advice = samples[-1], "keep it still; if it was still, check its positioning"
         if profile.positioning.source.is_deck:
             advice += " (light, floor, base stations)"
         window = rest_window(samples)
@@ -373,13 +373,13 @@ class GroundCriteria:
             return self._unreachable(place)
         if not max(abs(x), abs(y), abs(z)) < ROOM_M:
             return Problem(
-                f"the motion capture places the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m, "
-                "which look like millimetres",
-                "set the unit of the capture's stream to metres",
+                f"the motion-capture system places the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} "
+                "m, which appears to be in millimetres",
+                "set the unit of the motion-capture stream to metres",
             )
         standing = self._off_the_ground(
             z,
-            "the motion capture places the vehicle at",
+            "the motion-capture system places the vehicle at",
             "its axes may be swapped, its unit millimetres, or its origin or rigid body "
             "wrong: run perchctl check --lift; if this height is right, set "
             "safety.ground_z_m to it",
@@ -426,10 +426,11 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
         return None
     axis = nearest_axis(up)
     found = (
-        f"the motion capture shows the vehicle tilted by {off_deg:.0f} deg from its own attitude"
+        f"the motion-capture system shows the vehicle tilted by {off_deg:.0f} deg from its own "
+        "attitude"
     )
     if axis is not None:
-        found = f"swapped axes: up is {axis} in the motion capture"
+        found = f"swapped axes: up is {axis} in the motion-capture system"
     return Problem(
         found,
         "set the capture's world to z up, define the rigid body's axes level, or set "
@@ -440,7 +441,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 def feed_name(profile: Profile) -> str:
     """Name of the source of external positions, as used in messages."""
     by_target = profile.positioning.source.is_target
-    return "the view of the target" if by_target else "the motion capture"
+    return "the view of the target" if by_target else "the motion-capture system"
 
 
 class RestCheck:

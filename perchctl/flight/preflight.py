@@ -136,7 +136,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     seen = None if feed is None else feed.measured
     waiting = _first(
         {
-            "positions of the motion capture": None if by_target else unsent,
+            "positions from the motion-capture system": None if by_target else unsent,
             "the state estimate to settle": criteria.estimate_unsettled,
             f"the state estimate to agree with {feed_name(profile)}": None
             if seen is None

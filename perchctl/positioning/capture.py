@@ -82,13 +82,12 @@ class LateFrames:
             )
         if self.count == 1:
             return ConnectionFailed(
-                f"{who} sends a frame only every {self.pause_s:.2f} s, and such frames are not "
-                "used",
+                f"{who} sends a frame only every {self.pause_s:.2f} s, so its frames are not used",
                 "set its rate to at least 50 Hz",
             )
         return ConnectionFailed(
             f"{who} sends its frames late, in bursts ({self.count} at once after "
-            f"{self.pause_s:.2f} s), and such frames are not used",
+            f"{self.pause_s:.2f} s), so they are not used",
             "connect it by cable",
         )
 

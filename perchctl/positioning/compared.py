@@ -47,7 +47,7 @@ class CaptureComparison(BaseModel):
         """Return why a flight must not rely on this comparison, and what to do; None if the
         comparison passed at most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
-            return "the motion capture has never been compared with this vehicle", AGAIN
+            return "the motion-capture system has never been compared with this vehicle", AGAIN
         when, age_s = self.text(now), (now - self.at).total_seconds()
         if not self.passed:
             return f"{self.found} ({when})", f"correct that, then {AGAIN}"

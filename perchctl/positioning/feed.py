@@ -163,8 +163,8 @@ class PositionFeed:
             return  # your own source checks its configuration itself
         if not config.host.strip():
             raise InvalidValue(
-                "positioning.host, the computer of the motion capture, is missing: write it in "
-                "the profile, as in positioning: {by: mocap, system: vicon, host: "
+                "positioning.host, the computer that runs the motion-capture system, is missing: "
+                "write it in the profile, as in positioning: {by: mocap, system: vicon, host: "
                 "192.168.1.2, body: crazyflie}; system is vicon, optitrack, qualisys or vrpn, "
                 "and body is the vehicle's rigid body there"
             )

@@ -65,7 +65,7 @@ def _read(found: re.Match[str]) -> str:
 
 _IMPOSSIBLE = {
     "planner.search.max_height_m <= safety.max_height_m": (
-        "the search would climb to where the vehicle has to land"
+        "the search would climb to a height at which the vehicle has to land"
     ),
     "planner.takeoff_height_m <= planner.search.max_height_m": (
         "the take-off would end above the search's highest point"
@@ -92,21 +92,21 @@ _DOUBTFUL = {
             "a climb overshoots by 0.1 m, which would make the vehicle land"
         ),
         "safety.ground_tolerance_m <= 0.45": (
-            "a vehicle that hangs would be taken for one on the ground"
+            "a hanging vehicle would be mistaken for one on the ground"
         ),
     },
     "fence": {
-        "0.3 <= safety.fence_radius_m": "a draught carries the vehicle that far",
+        "0.3 <= safety.fence_radius_m": "a draught can carry the vehicle that far",
     },
     "battery limits": {
         "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
         # The thrust that a full battery leaves for a light vehicle (docs/firmware.md, "Thrust to
         # PWM").
         "safety.min_load_v < 3.7": (
-            "hovering takes even a full battery down to it, so the vehicle would land as "
+            "hovering takes even a full battery below it, so the vehicle would land as "
             "soon as it takes off"
         ),
-        "safety.min_rest_v < 4.35": "no battery rests at such a voltage, so no flight would begin",
+        "safety.min_rest_v < 4.35": "no battery rests at this voltage, so no flight would begin",
     },
     "time limits": {
         f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"

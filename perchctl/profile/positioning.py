@@ -144,7 +144,7 @@ class PositioningConfig(Section):
     def label(self) -> str:
         """Name of the position source in messages."""
         if self.source.is_target:
-            return "the sight of the target"
+            return "the view of the target"
         return f"motion capture at {self.system}:{self.host}".rstrip(":")
 
     def with_method(self, by: str) -> dict[str, Any]:

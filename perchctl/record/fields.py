@@ -43,8 +43,8 @@ def _axes(name: str, meaning: str) -> dict[str, str]:
 
 DUTY_FIELDS = tuple(f"duty_m{motor}" for motor in (1, 2, 3, 4))
 _DUTIES = (
-    "duty cycle of the motor front right (M1), back right, back left and front left, 0..65535, as "
-    "old as the battery voltage"
+    "duty cycles of the motors front right (M1), back right, back left and front left, 0..65535, "
+    "as old as the battery voltage"
 )
 FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",
@@ -55,7 +55,7 @@ FIELDS: dict[str, str] = {
     "hold": "why the vehicle is held in place, empty when it is not",
     "attempts": "failed perching attempts so far",
     # the vehicle's own estimate, world axes
-    **_axes("{}_m", "body in the world of the state estimate, z up"),
+    **_axes("{}_m", "position of the body in the world frame of the state estimate, z up"),
     **_axes("v{}_mps", "velocity, world axes"),
     "roll_rad": "roll, right-handed about body x",
     "pitch_rad": "pitch, right-handed about body y: positive is nose down",
@@ -63,12 +63,12 @@ FIELDS: dict[str, str] = {
     "acc_z_g": "specific force along body z, +1 at rest",
     "thrust": "thrust command of the vehicle's controller, 0..65535",
     **dict.fromkeys(DUTY_FIELDS, _DUTIES),
-    "battery_v": "battery voltage under the present load",
+    "battery_v": "battery voltage under load",
     "battery_state": "pm.state; 3 is low power",
     "battery_rest_v": "resting voltage according to the energy model",
     "battery_used_mah": "charge used, according to the summed thrust and the assumed battery",
     "battery_left_s": "hover time left until row `battery-low` lands, according to the model",
-    "battery_attempts": "further attempts for which the battery suffices, and then for a landing",
+    "battery_attempts": "further attempts that the battery allows, with enough left for a landing",
     "supervisor": "supervisor bits",
     "vel_var_m2ps2": "largest of the estimator's velocity variances",
     "pos_var_m2": "largest of the estimator's position variances; with a Flow deck always 100",
@@ -77,7 +77,7 @@ FIELDS: dict[str, str] = {
     # positions from outside, as they are sent to the vehicle; None where its decks measure them
     "pos_age_s": "age of the last external position sent, since its exposure",
     "pos_note": "why no external position is sent now",
-    **_axes("pos_{}_m", "last external position sent, in the world of the state estimate"),
+    **_axes("pos_{}_m", "last external position sent, in the world frame of the state estimate"),
     # the camera; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
     "frame_t_s": "the frame's time of exposure on the loop's clock",
@@ -101,24 +101,24 @@ FIELDS: dict[str, str] = {
     # the target's estimate at t_s, which the planner steers by: the paper's error vector
     **_axes("e{}_m", "target relative to the gear, level frame"),
     "eyaw_rad": "heading of the target in the level frame",
-    **_axes("ev{}_mps", "the filter's velocity of the target, level axes"),
+    **_axes("ev{}_mps", "target velocity from the filter, level axes"),
     **_axes("es{}_m", "standard deviation of the target's position"),
     "esyaw_rad": "standard deviation of eyaw_rad",
     "measured": "true if the newest frame showed the target, false while the filter coasts",
     "tracked": "true while the filter runs, false for a remembered position",
     "target_age_s": "time since the exposure of the last frame that showed the target",
     "unseen": "frames since the target was last detected",
-    **_axes("t{}_m", "target in the world of the state estimate"),
-    "tyaw_rad": "heading of the target in the world of the state estimate",
+    **_axes("t{}_m", "position of the target in the world frame of the state estimate"),
+    "tyaw_rad": "heading of the target in the world frame of the state estimate",
     # the command that was sent
     "cmd": "idle, position, thrust, stop, land or emergency",
-    **_axes("cmd_{}_m", "position setpoint; z also the height of a landing"),
-    "cmd_yaw_rad": "setpoint's heading",
+    **_axes("cmd_{}_m", "position setpoint; z is also the target height of a landing"),
+    "cmd_yaw_rad": "heading setpoint",
     "cmd_thrust": "raw thrust 0..65535",
-    "cmd_roll_rad": "roll to the right with cmd_thrust",
-    "cmd_pitch_rad": "pitch nose down with cmd_thrust",
+    "cmd_roll_rad": "roll sent with cmd_thrust, positive to the right",
+    "cmd_pitch_rad": "pitch sent with cmd_thrust, positive nose down",
     "cmd_duration_s": "duration of a landing",
-    "late_s": "delay of this tick's start",
+    "late_s": "delay of the start of this tick",
     # simulation only
     **_axes("true_{}_m", "true position of the body, simulation only"),
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",

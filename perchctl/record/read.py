@@ -359,7 +359,7 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
         raise
     except (TypeError, ValueError, LookupError, AttributeError) as error:
         raise InvalidValue(
-            f"{path}: it has a value that no flight writes ({error}): use the original"
+            f"{path}: contains a value that no flight writes ({error}): use the original"
         ) from error
 
 

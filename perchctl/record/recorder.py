@@ -136,7 +136,7 @@ class Recorder:
         turn, size = self._turn, self._turn_bytes
         self._turn, self._turn_bytes = [], TURN_BYTES
         if turn and not self._writer.put(partial(self._attempt, *turn, self._flush), size):
-            self._remember("the disk does not keep up with the recording: parts of it are missing")
+            self._remember("the disk cannot keep up with the recording: parts of it are missing")
 
     def _remember(self, sentence: str) -> None:
         self.problem = self.problem or sentence

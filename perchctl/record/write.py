@@ -39,7 +39,7 @@ MOST_WAITING = 3000
 """Number of records that may wait for the disk: half a minute of a flight at 50 Hz. Further records
 are dropped."""
 NO_ANSWER = "the disk does not respond: the end of the flight log is missing"
-NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
+NO_ROOM = "the disk cannot keep up with the flight log: records are dropped"
 
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""

@@ -150,9 +150,10 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     diagonal = math.sqrt(2.0) * small.side_m
     if diagonal > magnet_m:
         raise InvalidValue(
-            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
-            f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
-            f"{math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g} mm, or a larger --magnet"
+            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) exceeds the magnet "
+            f"({mm_text(magnet_m)} mm), so the gear could touch where there is no magnet: make "
+            f"its side at most {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g} mm, or use a "
+            "larger --magnet"
         )
     for kind, marker in (("large", large), ("small", small)):
         if _cells_apart(marker, marker, turns=(1, 2, 3)) == 0:

@@ -303,13 +303,13 @@ class Experiment:
             number = self.session.next_position
             self.say(
                 f"position {self.session.done + 1} of {positions}: place the camera so that "
-                "both markers are wholly in view, at another height, place and heading"
+                "both markers are wholly in view, at a different height, position and heading"
             )
             fault = self._try_position(number, frames)
             if fault is None:
                 self.say(f"position {number} was saved to {self.session.path}")
             else:
-                self.say(f"position {number} was rejected, take it again: {fault}")
+                self.say(f"position {number} was rejected, measure it again: {fault}")
 
     def _try_position(self, number: int, frames: int) -> str | None:
         """Measure one position and add it to the file. Return a sentence if it must be measured
@@ -357,7 +357,8 @@ class Experiment:
             if got == count:
                 return
         raise NotFound(
-            f"{self.source.describe()} ended after {got} of {count} frames of the position"
+            f"{self.source.describe()} ended after {got} of the {count} frames needed at "
+            "this position"
         )
 
 

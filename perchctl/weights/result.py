@@ -33,7 +33,7 @@ from perchctl.weights.fit import (
 FORMAT = "perchctl-merge-weights"
 _HEAD = """\
 # Merge weights of the large marker (the small one's are 1 - w), fitted by perchctl
-# fit-weights. Named by a profile: merge: {method: weights, weights_file: THIS_FILE}
+# fit-weights. In a profile, write merge: {method: weights, weights_file: THIS_FILE}
 """
 
 

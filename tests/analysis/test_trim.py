@@ -273,8 +273,8 @@ def test_the_thrust_curve_does_for_a_brushless_too(mass_kg: float) -> None:
         (shares_of(0.004), 0.0, "4.0 +- 0.5 mm forward"),
         (shares_of(-0.004, -0.005), 0.0, "4.0 +- 0.5 mm backward and 5.0 +- 0.5 mm to the right"),
         (shares_of(0.004), 2.0, None),  # a draught may be the cause
-        (shares_of(yaw=0.1), 2.0, "front left and back right have to give +10.0 +- 2.3 %"),
-        (shares_of(yaw=-0.1), 0.0, "front right and back left have to give +10.0 +- 0.5 %"),
+        (shares_of(yaw=0.1), 2.0, "front left and back right need +10.0 +- 2.3 % thrust"),
+        (shares_of(yaw=-0.1), 0.0, "front right and back left need +10.0 +- 0.5 % thrust"),
     ],
 )
 def test_advice_needs_an_interval_beyond_the_harmless_range(
@@ -300,11 +300,11 @@ def test_show_and_report_say_the_same(tmp_path: Path) -> None:
         "front left +10.2 +- 2.2 % against the mean thrust (95 %, 6.0 s of level hover)",
         "balance: centre of mass 4.0 +- 0.5 mm forward and 0.0 +- 0.5 mm to the right, if the "
         "motors are equal; weaker motors on that side look the same in flight",
-        "yaw: front right and back left +2.0 +- 0.5 %; unequal motors or propellers, or a leaning "
-        "motor, cause this, but not the centre of mass",
+        "yaw: front right and back left +2.0 +- 0.5 %; caused by unequal motors or propellers, or "
+        "by a tilted motor, not by the centre of mass",
         "advice: the vehicle flies as if its centre of mass were 4.0 +- 0.5 mm forward: move the "
-        "battery the other way and fly again; if it lies in the middle, check the propellers on "
-        "that side",
+        "battery the other way and fly again; if the battery is already in the middle, check "
+        "the propellers on that side",
     ]
     for line in said:
         assert line in text

@@ -71,7 +71,10 @@ def test_views_in_another_layout_than_most_are_left_out(tmp_path: Path) -> None:
     seen = found([*pictures, sheet(replace(board, legacy=True))], EVEN, tmp_path)
     assert [view.name for view in seen.views] == ["0.png", "1.png"]
     ((name, reason),) = ((r.view, r.reason) for r in seen.without_board)
-    assert (name, reason) == ("2.png", "its markers have another layout than in most images")
+    assert (name, reason) == (
+        "2.png",
+        "its markers have a different layout from those in most images",
+    )
 
 
 @pytest.mark.long

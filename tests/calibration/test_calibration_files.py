@@ -103,7 +103,7 @@ def test_kalibr_s_file_of_one_camera_is_read(tmp_path: Path) -> None:
         300.0, 300.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002, 0.0,
     ]  # fmt: skip
     chain.write_text(CAMCHAIN + CAMCHAIN.replace("cam0", "cam1"))
-    with pytest.raises(InvalidValue, match="holds the cameras cam0, cam1"):
+    with pytest.raises(InvalidValue, match="contains the cameras cam0, cam1"):
         load_calibration(chain)
 
 

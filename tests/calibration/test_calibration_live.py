@@ -210,7 +210,10 @@ def test_what_became_of_each_frame_is_counted() -> None:
 
 @pytest.mark.parametrize(
     ("live", "advised"),
-    [(True, "hold the board still for a moment at each place"), (False, "record again .*images:")],
+    [
+        (True, "hold the board still for a moment at each position"),
+        (False, "record again .*images:"),
+    ],
 )
 def test_too_few_views_of_a_film_are_not_said_to_be_too_few_boards(
     live: bool, advised: str

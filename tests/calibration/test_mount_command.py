@@ -77,8 +77,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["-p", "no_such"], 20, ["no_such", "crazyflie"]),
         (["-p", "mine.yaml", "--part", "both sides"], 2, ["--part", "pivot"]),
         (["-p", "mine.yaml", "-u", "nonsense://x"], 30, ["nonsense://x", "radio://"]),
-        (["-p", "mine.yaml", "-u", "sim://"], 2, ["nobody can move it", "--part pivot"]),
-        (["-p", "sim"], 2, ["sim:", "nobody can move it", "--source"]),
+        (["-p", "mine.yaml", "-u", "sim://"], 2, ["you cannot move it", "--part pivot"]),
+        (["-p", "sim"], 2, ["sim:", "you cannot move it", "--source"]),
         (["-p", "mine.yaml", "--source", "sim:"], 2, ["name a real one"]),
         (["-p", "mine.yaml", "--source", "video:no.mp4"], 2, ["--part pivot", "clock"]),
         (["-p", "mine.yaml", "--source", "no.mp4"], 20, ["no.mp4"]),
@@ -216,7 +216,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     c = MountingReport(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
     assert "camera.latency_s" not in c.new_profile_values()
     assert "latency_s" not in c.record()["written"]
-    assert "the profile says measured, which is kept" in "\n".join(c.lines())
+    assert "the profile has measured, which is kept" in "\n".join(c.lines())
 
 
 def carried(R: Array) -> RotationSolution:

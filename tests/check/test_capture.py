@@ -109,7 +109,7 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body", Scripted(lambda t_s, p: {"cf2": STILL}), "fail", "frozen"),
     ("body", Scripted(lambda t_s, p: moved(p, 8.0)), "warn", "7.9 mm"),
     ("body", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", " mm"),
-    ("body place", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "look like millimetres"),
+    ("body place", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "to be in millimetres"),
     ("body place", Scripted(y_up), "fail", "swapped axes: up is y"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.0, 0.0, 1.4))), "fail", "1.40"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.05 * t_s, 0.0, 0.02))), "fail",

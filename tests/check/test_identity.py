@@ -64,7 +64,7 @@ def test_the_vehicle_that_blinks_is_confirmed_and_nothing_else_is_set(
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}, rows
     assert [*rows] == ["address", "vehicle", "camera", "target"]
     assert len(asked) == 1
-    assert asked[0].startswith("north: all LEDs of one vehicle blink. Is it the only one")
+    assert asked[0].startswith("north: all LEDs of one vehicle are blinking. Is it the only one")
     assert relay.commands() == []
     values = [packet.data[2] for packet in relay.writes()]
     assert values[:3] == [ALL_LEDS, NO_LEDS, ALL_LEDS]
@@ -77,7 +77,7 @@ def test_a_vehicle_that_nobody_has_seen_blink_at_its_home_fails(
 ) -> None:
     rows = rows_of(relay.uri, sim, ask=lambda _: False)
     assert rows["vehicle"].verdict is Verdict.FAIL
-    assert rows["vehicle"].found == "you have not seen it blink at its home, 0.00 1.20 m"
+    assert rows["vehicle"].found == "you did not confirm that it blinks at its home, 0.00 1.20 m"
     assert rows["target"].verdict is Verdict.PASS
 
 

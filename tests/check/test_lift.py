@@ -126,7 +126,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
 @pytest.mark.parametrize(("fault", "body", "words"), [
     (CaptureFault(axes=Y_UP), "crazyflie", "swapped axes: up is y"),
     (CaptureFault(axes=SWAPPED_XY), "crazyflie", r"are rotated by (8[5-9]|9.) deg"),
-    (CaptureFault(scale=1000.0), "crazyflie", "the positions look like millimetres"),
+    (CaptureFault(scale=1000.0), "crazyflie", "the positions appear to be in millimetres"),
     (None, "wand", "the vehicle moves while the rigid body 'wand' stands still"),
 ])  # fmt: skip
 def test_what_is_set_up_wrong_is_named_and_not_flown_by(

@@ -23,7 +23,7 @@ CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
         "as soon as it takes off",
     ),
     ("battery limits", {"safety.min_rest_v": 4.1, "safety.min_load_v": 3.9}, "a full battery"),
-    ("battery limits", {"safety.min_rest_v": 4.5}, "no battery rests at such"),
+    ("battery limits", {"safety.min_rest_v": 4.5}, "no battery rests at this"),
     ("time limits", {"planner.perching_time_s": 2.0}, "before a contact"),
     ("time limits", {"planner.search.wait_s": 30}, "before the search"),
     ("time limits", {"planner.landing.timeout_s": 15}, "the firmware lands"),

@@ -43,7 +43,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 def test_what_cannot_be_used_is_told_and_the_next_message_is_heard(start: Start) -> None:
     child = start("channel.send_bytes(b'no pickle'); channel.send_bytes(ready); time.sleep(60)\n")
     until(lambda: child.newest()[0])
-    assert (child.fault() or "").startswith("it sent what is unreadable (UnpicklingError")
+    assert (child.fault() or "").startswith("it sent an unreadable message (UnpicklingError")
     assert child.newest()[0] == Status(stage=Stage.READY)
     assert child.end_of_process() is None
 

@@ -425,7 +425,7 @@ def test_nobody_to_ask_is_no_yes(tmp_path: Path) -> None:
     air = two(tmp_path, ", uri: 'udp://127.0.0.1:9', source: 'http://127.0.0.1:9/'")
     done = run("fleet", "fly", str(air))
     assert done.code == 2
-    assert "about to arm 2 vehicles, and there is nobody to ask: add --yes" in done.stderr
+    assert "about to arm 2 vehicles, and the input is not a terminal: add --yes" in done.stderr
 
 
 def test_the_panel_has_a_line_for_each_in_80_columns() -> None:

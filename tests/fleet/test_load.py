@@ -162,25 +162,25 @@ REFUSED = [
     (two(second=", uri: radio://0/80/3M/E7"), f"vehicle east: {BAD_URI}"),
     (two(second=", source: 'camra:0'"), "vehicle east: "),
     (two(second=", uri: radio://0/80/2M/E7E7E7E701"), "vehicle east: camera source sim: is no"),
-    (two().replace("east", "north"), "vehicles 1 and 2 have one name, north: give each its own"),
+    (two().replace("east", "north"), "vehicles 1 and 2 share the name north: give each its own"),
     (
         two(RADIO.format("01", 0), RADIO.format("01", 1).replace("//0", "//1")),
-        "vehicles north and east have one address, radio/80/2M/E7E7E7E701: give each its own",
+        "vehicles north and east share the address radio/80/2M/E7E7E7E701: give each its own",
     ),
     (
         two(RADIO.format("01", 0), RADIO.format("02", 0)),
-        "vehicles north and east have one camera, camera:0: give each its own source",
+        "vehicles north and east share the camera camera:0: give each its own source",
     ),
     (
         two(", body: cf", ", body: cf", defaults=", positioning: mocap"),
-        "vehicles north and east have one motion-capture body, cf: give each its own body",
+        "vehicles north and east share the motion-capture body cf: give each its own body",
     ),
     (two().replace(", target_m: [3.2, 0]", ""), "vehicle east: nothing says where its target is"),
     (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure where it"),
     (two(second=", target: none.yaml"), "vehicle east: target: "),
     (
         two(", frame: room", defaults=", positioning: target"),
-        "vehicle north: frame: is room, but with positioning by the sight of the target its",
+        "vehicle north: frame: is room, but with positioning by the view of the target its",
     ),
     (
         two(", frame: home", defaults=", positioning: mocap"),
@@ -205,7 +205,7 @@ def test_two_names_of_one_camera_are_one_camera(
     plugged = [device.ConnectedCamera(0, "FPV receiver", "/dev/v4l/by-id/usb-fpv")]
     monkeypatch.setattr(device, "_known_cameras", lambda *_: plugged)
     text = two(RADIO.format("01", 0), RADIO.format("02", "receiver"))
-    words = "vehicles north and east have one camera, camera:0: give each its own source"
+    words = "vehicles north and east share the camera camera:0: give each its own source"
     assert refusal(tmp_path, text) == words
 
 

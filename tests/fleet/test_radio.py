@@ -86,7 +86,9 @@ def test_a_period_that_somebody_named_is_kept() -> None:
 
 def test_six_on_a_dongle_are_too_many() -> None:
     sentence = refusal(same_channel(6))
-    assert sentence.startswith("dongle 0 has 6 vehicles on channel 80, of at most 5: leave at most")
+    assert sentence.startswith(
+        "dongle 0 has 6 vehicles on channel 80, but at most 5 are allowed: leave at most"
+    )
 
 
 def test_positions_that_are_sent_count_too() -> None:
@@ -102,7 +104,8 @@ def test_vehicles_of_one_dongle_belong_on_one_channel() -> None:
     uris = ["radio://0/80/2M/E7E7E7E701", "radio://0/90/2M/E7E7E7E702"]
     assert refusal(on_air(uris)) == (
         "dongle 0 has v0 on channel 80 and v1 on channel 90, and would carry 151 packets/s for "
-        "each of two vehicles instead of 245: set both to one channel, or give v1 another dongle"
+        "each of two vehicles instead of 245: set both to the same channel, or give v1 "
+        "another dongle"
     )
 
 
@@ -111,7 +114,7 @@ def test_vehicles_of_one_dongle_belong_on_one_channel() -> None:
 )
 def test_dongles_are_two_channels_apart(channel: int, where: str) -> None:
     uris = ["radio://0/80/2M/E7E7E7E701", f"radio://1/{channel}/2M/E7E7E7E702"]
-    assert f"disturb each other on {where}" in refusal(on_air(uris))
+    assert f"interfere on {where}" in refusal(on_air(uris))
     budget_radio(on_air([uris[0], "radio://1/82/2M/E7E7E7E702"]))
 
 

@@ -181,7 +181,7 @@ def test_who_would_hang_in_each_other_s_corridor_is_refused_with_both_names() ->
     assert refusal(fleet([((0, 0), (1, 0)), ((2, 0), (1.2, 0))])) == (
         "v0 and v1 cannot fly in any order: v1 hangs 0.15 m inside the corridor of v0, and v0 "
         "hangs 0.15 m inside the corridor of v1; a vehicle that waits or hangs must be 0.24 m away "
-        "from it: move a home or target farther off"
+        "from it: move a home or target farther away"
     )
 
 

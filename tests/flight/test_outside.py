@@ -46,7 +46,7 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
 
 @pytest.mark.parametrize(("place", "profile", "words"), [
     (at(0.3, -0.2, 0.012), MOCAP, None),
-    (at(300.0, -200.0, 12.0), MOCAP, "x 300, y -200, z 12 m, which look like millimetres"),
+    (at(300.0, -200.0, 12.0), MOCAP, "x 300, y -200, z 12 m, which appears to be in millimetres"),
     (at(0.0, 0.0, 12.0), MOCAP, "millimetres"),
     (at(-1200.0, 0.0, 0.04), MOCAP, "millimetres"),
     (at(0.3, 0.02, 0.4), MOCAP, "at 0.40 m, but the ground .* 0.00 m: its axes"),
@@ -89,7 +89,7 @@ def test_another_axis_up_is_named_by_the_attitude(
     problem = up_axis_problem(at(0.0, 0.0, 0.0, turn @ own), tel)
     up = named_up(turn)
     assert (problem is None) is (up == "z")
-    assert problem is None or f"up is {up} in the motion capture" in problem.found
+    assert problem is None or f"up is {up} in the motion-capture system" in problem.found
 
 
 @pytest.mark.parametrize(("place", "agrees"), [
@@ -146,9 +146,9 @@ def test_positions_that_lead_astray_are_sent_no_more() -> None:
 
 
 @pytest.mark.parametrize(("how", "error", "words"), [
-    ({"hidden": lambda t_s: True}, TimedOut, f"positions of the motion capture .{HIDDEN}"),
+    ({"hidden": lambda t_s: True}, TimedOut, f"positions from the motion-capture system .{HIDDEN}"),
     ({"place": lambda p: at(250.0, -100.0, 12.0)}, SafetyAbort, "millimetres"),
-    ({"place": lambda p: at(1.0, 0.0, 0.0)}, TimedOut, "agree with the motion capture .they are 1"),
+    ({"place": lambda p: at(1.0, 0.0, 0.0)}, TimedOut, "the motion-capture system .they are 1"),
 ])  # fmt: skip
 def test_positions_that_are_none_keep_it_on_the_ground(
     how: dict[str, Any], error: type[Exception], words: str

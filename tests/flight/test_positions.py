@@ -116,7 +116,7 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_opened(
 ) -> None:
     check_options(options({"positioning.host": "lab"}))
     check_options(options({}, uri="sim://"))
-    with pytest.raises(InvalidValue, match="the computer of the motion capture"):
+    with pytest.raises(InvalidValue, match="the computer that runs the motion-capture system"):
         check_options(options({}))
     monkeypatch.setattr(session, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'perchctl\[mocap\]'"):

@@ -235,7 +235,7 @@ def test_remarks_that_raise_end_and_the_flight_does_not() -> None:
     _, works = flown(remarks=remarks)
     assert len(asked) == 61
     assert "the recording is full" in notes(works)
-    assert [note for note in notes(works) if note.startswith("the notes on this recording")]
+    assert [note for note in notes(works) if note.startswith("perchctl no longer adds notes")]
 
 
 def test_a_watcher_that_hangs_is_named_once() -> None:

@@ -146,9 +146,9 @@ def test_the_frames_between_two_pauses_are_counted(
 
 
 @pytest.mark.parametrize(("fault", "words"), [
-    ("bursts", r"vicon:bursts sends its frames late, in bursts \(12 at once after 0\.1\d s\), and "
-     "such frames are not used; connect it by cable"),
-    ("slow", r"vicon:slow sends a frame only every 0\.1\d s, and such frames are not used; set it"),
+    ("bursts", r"vicon:bursts sends its frames late, in bursts \(12 at once after 0\.1\d s\), "
+     "so they are not used; connect it by cable"),
+    ("slow", r"vicon:slow sends a frame only every 0\.1\d s, so its frames are not used; set it"),
 ])  # fmt: skip
 def test_frames_that_come_late_are_not_called_silence(
     faulty: Callable[..., MotionCapture], fault: str, words: str

@@ -25,7 +25,7 @@ from tests.helpers.capture import compared as was_compared
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
 NOW = datetime(2026, 11, 22, 15, 0, tzinfo=timezone(timedelta(hours=2)))
 URI, VEHICLE = "udp://127.0.0.1:1", "udp/127.0.0.1:1"
-SWAPPED = "swapped axes: up is y in the motion capture"
+SWAPPED = "swapped axes: up is y in the motion-capture system"
 DAY_S = 24 * 3600.0
 OTHERS: list[dict[str, Any]] = [
     {"system": "vrpn"}, {"host": "lab2"}, {"body": "cf3"}, {"body_rpy_deg": (0.0, 0.0, 90.0)},

@@ -111,7 +111,7 @@ def test_a_disk_that_hangs_holds_up_nobody(
     with stopwatch() as watch:
         recorded.fly(recorder, flight)
         assert watch.took_s < 2.0  # 240 turns; the disk answers none of them
-    assert "does not keep up" in (recorder.problem or "")
+    assert "cannot keep up" in (recorder.problem or "")
     hung.gate.set()
     until(lambda: recorder._writer._left == 0)
     recorder.write_frame(recorded.frame(200, 20.0, as_jpeg=True))

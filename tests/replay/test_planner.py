@@ -181,7 +181,9 @@ def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Pat
     assert any("is missing from the log" in note for note in found.notes)
     lines[0] = altered(lines[0], perchctl="0.0.9")
     other = replay(read_log(log_of(tmp_path, lines[:100])))
-    assert any(f"0.0.9 flew it, and this is {perchctl.__version__}" in n for n in other.notes)
+    assert any(
+        f"0.0.9 flew this flight, and this is {perchctl.__version__}" in n for n in other.notes
+    )
 
 
 @pytest.mark.parametrize("version", [2, 5])
@@ -190,7 +192,7 @@ def test_a_log_without_whole_turns_cannot_be_replayed(tmp_path: Path, version: i
     header = altered(lines_of()[0], version=version, perchctl="0.1.0")
     log = read_log(log_of(tmp_path, [header]))
     assert log.turns == []
-    with pytest.raises(InvalidValue, match=rf"perchctl 0\.1\.0 wrote it in version {version}"):
+    with pytest.raises(InvalidValue, match=rf"perchctl 0\.1\.0 wrote it in log version {version}"):
         replay(log)
 
 

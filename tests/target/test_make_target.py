@@ -258,7 +258,7 @@ def test_a_design_writes_nothing() -> None:
 
 REFUSALS = [
     (["--magnet", "20"], 30, "has no unit; write 20mm"),
-    (["--magnet", "20mm"], 30, "not inside the magnet"),
+    (["--magnet", "20mm"], 30, "exceeds the magnet"),
     (["--page", "150x150mm"], 30, "use --page a4"),
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
     (["--page", "9x9m"], 30, "too large: at most 5000 mm a side"),

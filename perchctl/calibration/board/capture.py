@@ -100,7 +100,7 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
     """Return the views of the layout that most images show, and reject the others: there is only
     one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
-    reason = "its markers have another layout than in most images"
+    reason = "its markers have a different layout from those in most images"
     others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
     return [view for view in views if view.legacy == legacy], others
 

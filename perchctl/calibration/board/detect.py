@@ -121,9 +121,9 @@ class FrameCounts:
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
-            return "hold the board still for a moment at each place, in good light"
+            return "hold the board still for a moment at each position, in good light"
         return (
-            "record again and hold still for a moment at each place, in good light, or "
+            "record again and hold still for a moment at each position, in good light, or "
             "save sharp frames as images (images:)"
         )
 

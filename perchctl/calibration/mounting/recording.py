@@ -218,7 +218,7 @@ def missing_motion(recording: MountingRecording) -> list[str]:
         across = arrays.R_cam_target[:, :2, 0]
         turned = _extent(np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0]))))
         if turned < YAW_DEG:
-            lacking.append(f"turn it about the vertical ({turned:.0f} of {YAW_DEG:.0f} deg)")
+            lacking.append(f"turn it about the vertical axis ({turned:.0f} of {YAW_DEG:.0f} deg)")
         gyro_radps = np.array([a.gyro_radps for a in attitudes])
         rate_dps = math.degrees(math.sqrt(float((gyro_radps**2).sum(axis=1).mean())))
         if rate_dps < LEAST_RATE_DPS:
