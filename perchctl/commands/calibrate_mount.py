@@ -278,7 +278,7 @@ def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
         if link.motors_running:
             raise SafetyAbort(
                 f"{uri} is armed, or its motors turned within the last 2 s: do not "
-                "move it by hand like that; switch it off and on again"
+                "move it by hand in this state; switch it off and on again"
             )
         return link.problem(now_s)
 

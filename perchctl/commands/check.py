@@ -139,7 +139,7 @@ def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     failing = [row.name for row in rows if row.verdict is checks.Verdict.FAIL]
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
-        ends.append("not finished, the other checks were not made")
+        ends.append("not finished, the other checks were not run")
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 

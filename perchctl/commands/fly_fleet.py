@@ -176,7 +176,7 @@ class FleetSession:
             return
 
         def land_one(number: int) -> None:
-            self._answers.append(self._land_one(coordinator, number, "its button"))
+            self._answers.append(self._land_one(coordinator, number, "button"))
 
         try:
             name, switch = self._plan.fleet.name, self._switch
@@ -274,10 +274,10 @@ class FleetSession:
         view = coordinator.views[number - 1]
         coordinator.land(view.name)
         if view.result is not None:
-            return f"{view.name}: it has ended already"
+            return f"{view.name}: its flight has already ended"
         if view.stage.is_before_takeoff:
-            return f"{view.name}: by {how}, it does not take off"
-        return f"{view.name}: by {how}, it lands"
+            return f"{view.name}: take-off cancelled ({how})"
+        return f"{view.name}: landing ({how})"
 
     def _is_given_up(self) -> bool:
         """True once the vehicles' time to end after a failure of the coordinator has passed."""
@@ -463,7 +463,7 @@ def _row(number: int, view: fleets.VehicleView) -> displays.FleetRow:
         number=number,
         name=view.name,
         phase=phase,
-        reason=f"its process is silent for {view.silent_s:.0f} s" if silent else reason,
+        reason=f"its process has been silent for {view.silent_s:.0f} s" if silent else reason,
         height_m=status.height_m,
         error_m=status.error_m,
         battery_v=status.battery_v,

@@ -282,8 +282,8 @@ def test_each_number_key_is_answered(
     said = [re.sub(r"^\[.*\] ", "", line) for line in capsys.readouterr().err.splitlines()]
     assert [line for line in said if "key" in line and "cuts" not in line] == [
         "no vehicle has the key 0: press 1 to 4 to land one",
-        "west: by key 4, it does not take off",
-        "north: by key 1, it lands",
+        "west: take-off cancelled (key 4)",
+        "north: landing (key 1)",
     ]
 
 
@@ -295,8 +295,8 @@ def test_a_number_key_is_answered_by_what_it_does(session: FleetSession) -> None
     )
     landed: list[str] = []
     fleet: Any = SimpleNamespace(views=views, land=landed.append)
-    assert session._land_by_key(fleet, 1) == "north: by key 1, it lands"
-    assert session._land_by_key(fleet, 2) == "east: it has ended already"
+    assert session._land_by_key(fleet, 1) == "north: landing (key 1)"
+    assert session._land_by_key(fleet, 2) == "east: its flight has already ended"
     assert landed == ["north", "east"]
 
 
@@ -360,7 +360,7 @@ def test_a_tiles_button_lands_its_vehicle_alone(
     ends = {name: each.outcome.value for name, each in outcome.results.items()}
     assert ends.pop("west") == "landed"
     assert {*ends.values()} == {"perched"}
-    assert "west: by its button, it does not take off" in capsys.readouterr().err
+    assert "west: take-off cancelled (button)" in capsys.readouterr().err
 
 
 def test_the_page_shows_the_flight_and_how_it_ended(
