@@ -22,7 +22,8 @@ class FlightComparison:
 
     @cached_property
     def phase_times(self) -> list[dict[str, Any]]:
-        """For each phase that A or B flew: its name `phase`, and the times in it `a_s`, `b_s`."""
+        """One dict for each phase that A or B flew: its name `phase`, and how long each flight
+        spent in it (`a_s`, `b_s`)."""
         names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.log.phases)
         found = []
         for name in names:
@@ -35,20 +36,21 @@ class FlightComparison:
 
     @cached_property
     def changed_keys(self) -> dict[str, tuple[Any, Any]]:
-        """Dotted profile keys that differ, each with its values in A and B."""
+        """The dotted profile keys that differ, each with its value in A and in B."""
         a, b = (flight.log.header.get("profile") for flight in self.flights)
         return profile_differences(a, b)
 
     @cached_property
     def differences(self) -> dict[str, Any]:
-        """B's value minus A's of each field of `Measures`; None if either value is unknown."""
+        """The difference, B minus A, for each field of `Measures`; None if either value is
+        unknown."""
         a, b = (asdict(flight.measures) for flight in self.flights)
         return {
             name: None if a[name] is None or b[name] is None else b[name] - a[name] for name in a
         }
 
     def record(self) -> dict[str, Any]:
-        """The comparison for JSON, in SI units; differences are B minus A."""
+        """The comparison as a JSON object, in SI units; differences are B minus A."""
         a, b = (_flight_record(flight) for flight in self.flights)
         return {
             "a": a,
@@ -117,8 +119,8 @@ def _row(name: str, a: str, b: str, difference: str) -> str:
 
 
 def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, Any]]:
-    """The dotted keys in which two profiles (nested dicts, as from JSON) differ, each with
-    the values of A and B (``not there`` for a missing key)."""
+    """The dotted keys whose values differ between two profiles (nested dicts, as read from JSON),
+    each with the values in A and B (``not there`` for a missing key)."""
     a, b = _flat(profile_a), _flat(profile_b)
     return {
         key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))

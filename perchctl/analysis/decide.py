@@ -2,7 +2,7 @@
 
 The planner is pure, so the same observations and the same profile must give the same commands. They
 are bit-identical on the computer that flew, and within a tolerance on any other, whose libraries
-may round differently.
+may round differently. A turn is one iteration of the flight loop.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ FieldDifference = tuple[str, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class ReplayedDecision:
-    """Result of replaying the planner on one turn.
+    """Result of replaying the planner on one turn (one iteration of the flight loop).
 
     Attributes:
-        tick: number of flown turns before this turn.
+        tick: number of turns flown before this one.
         difference: first field that differs from the log; None if there is none.
         error: class name of the exception that the planner raised, or None.
     """
@@ -42,8 +42,8 @@ class ReplayedDecision:
 
 
 def turns_and_gap_text(log: FlightLog) -> tuple[list[TickRecord], str]:
-    """The turns before the first turn missing from the log, and a sentence that names the missing
-    turn, or says that the last ones may be missing (empty for a whole log). Errors:
+    """The turns up to the first one that is missing from the log, and a sentence that names the
+    missing turn or says that the last turns may be missing (empty if the log is complete). Errors:
     InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
@@ -76,8 +76,8 @@ def replay_decisions(
     """Replay the planner turn by turn.
 
     `observation_of` returns a turn's observation (default: as recorded), or None to skip the turn.
-    Only flown turns advance the planner's state. The replay ends with the first turn on which the
-    planner raises, as a flight does. By default, `comparison` is bit for bit.
+    Only turns that were flown advance the planner's state. Like a flight, the replay ends at the
+    first turn on which the planner raises an exception. The default `comparison` is bit for bit.
     """
     comparison = comparison or Comparison()
     state: PlannerState | None = None
@@ -124,7 +124,7 @@ def _difference(
     )
 
 
-# --- In which field two values first differ ---
+# --- Find the first field in which two values differ ---
 
 
 @dataclass(frozen=True)
@@ -133,20 +133,21 @@ class Comparison:
     from -0.0, and NaN equals NaN.
 
     Attributes:
-        unknown: fields that are not compared, each as the names of its dataclass and of itself.
-        tolerances: permitted difference of a field's numbers, in the field's unit, by the field's
-            name; the empty name stands for all other fields.
+        unknown: fields that are not compared, each given as (dataclass name, field name).
+        tolerances: permitted difference for the numbers in a field, in the field's unit, keyed by
+            field name; the empty name stands for all other fields.
 
-    All names are those in the log.
+    All names are those used in the log.
     """
 
     unknown: Collection[tuple[str, str]] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
 
     def difference(self, name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
-        """Return the first subfield of field `name` in which its two values differ, or None.
+        """Return the first subfield of the field `name` in which the two values differ, or None.
 
-        Values of different classes are returned whole, as text with their class.
+        If the two values have different classes, they are returned whole, as text that names the
+        class.
         """
         if type(recorded) is not type(replayed):
             return name, _shown(recorded), _shown(replayed)
@@ -173,13 +174,14 @@ class Comparison:
         return self.first_difference(parts)
 
     def first_difference(self, fields: Iterable[FieldDifference]) -> FieldDifference | None:
-        """Return the first difference among fields (name, recorded and replayed value), or None."""
+        """Return the first difference among `fields` (name, recorded value, replayed value), or
+        None."""
         found = (self.difference(*each) for each in fields)
         return next((difference for difference in found if difference is not None), None)
 
     def _tolerance(self, name: str) -> float:
         last = name.rpartition(".")[2].partition("[")[0]
-        to_the_bit = -1.0  # 0.0 and -0.0 are not considered close either
+        to_the_bit = -1.0  # negative, so that even 0.0 and -0.0 count as different
         return self.tolerances.get(last, self.tolerances.get("", to_the_bit))
 
 

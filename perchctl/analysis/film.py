@@ -1,4 +1,4 @@
-"""A film of a flight: camera image, side view, error and thrust."""
+"""Make a film of a flight that shows the camera image, a side view, the error and the thrust."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def write_film(
     width_px: int = 960,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write the flight as a film (.mp4 or .gif) at its own pace, and return its number of images.
+    """Write the flight as a real-time film (.mp4 or .gif), and return the film's number of images.
 
     Args:
-        images: the recorded images, oldest first; None without a recording.
+        images: the recorded images, oldest first; None if there is no recording.
         rate_hz: images per second of flight; the period is rounded to 0.01 s.
-        width_px: width of the film; its height is 9/16 of it.
-        progress: called after each image of the film with the number done and of all.
+        width_px: width of the film; the height is 9/16 of the width.
+        progress: called after each image of the film with the number of images done and the total.
 
     Errors: InvalidValue for a log without ticks, a recording that cannot be read, or a file that
     cannot be written.
@@ -86,10 +86,10 @@ def _film_pictures(
 
 
 class ShownPicture:
-    """The recorded image that the flight had last processed, and its record in the log.
+    """The recorded image that the flight processed most recently, and its record in the log.
 
     Attributes:
-        image: grey (height, width); None before the first.
+        image: grey, (height, width); None before the first image.
         record: the log's record of the newest image.
     """
 
@@ -101,7 +101,7 @@ class ShownPicture:
 
     @property
     def has_more(self) -> bool:
-        """True if an image is still to come."""
+        """True if there are more images."""
         return self._coming is not None
 
     def advance(self, index: int) -> None:
@@ -114,7 +114,8 @@ class ShownPicture:
 
 
 class CameraView:
-    """Axes with an image and the markers' outlines. `add` registers each moving artist."""
+    """Axes that show an image and the outlines of the markers. `add` registers each moving
+    artist."""
 
     def __init__(self, ax: Axes, flight: FlightAnalysis, add: Callable[[Any], Any]) -> None:
         ax.set_axis_off()
@@ -129,7 +130,7 @@ class CameraView:
         }
 
     def show(self, shown: ShownPicture) -> None:
-        """Show this image from now on."""
+        """Replace the image that is shown."""
         if shown.image is None:
             return
         self._image.set_data(shown.image)
@@ -139,8 +140,8 @@ class CameraView:
 
 
 class _Stage:
-    """The figure. Static parts are drawn once, moving parts for each image. Without recorded
-    images, the side view is drawn in their place."""
+    """The figure. Static parts are drawn once, moving parts for each image. If no images were
+    recorded, the side view takes their place."""
 
     def __init__(self, flight: FlightAnalysis, width_px: int, *, has_pictures: bool) -> None:
         self._flight = flight
@@ -159,7 +160,7 @@ class _Stage:
         self._still = draw_still(self._figure)
 
     def drawn(self, index: int, shown: ShownPicture) -> Rgb:
-        """A tick's image, (height, width, 3)."""
+        """The film's image for one tick, (height, width, 3)."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
         if self._camera is not None:
             self._camera.show(shown)
@@ -217,9 +218,10 @@ class _Stage:
 
 
 def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | None]:
-    """The vehicle's centre in each tick, (n, 2) m: horizontal distance from the target and
-    height above ground, in the vertical plane through the target and the take-off point; and the
-    target's height, None if it was never seen. Errors: InvalidValue for a log without positions."""
+    """The position of the vehicle's centre in each tick, (n, 2) m, and the height of the target
+    (None if it was never seen). A position is the horizontal distance from the target and the
+    height above ground, in the vertical plane through the target and the take-off point. Errors:
+    InvalidValue for a log without positions."""
     log = flight.log
     body_m, targets_m = (
         np.column_stack([log.column(f"{prefix}{axis}_m") for axis in "xyz"]) for prefix in ("", "t")
@@ -237,7 +239,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     if not seen_m.size:
         return place_m, None
     target_z_m = float(target_m[2] - start_m[2])
-    # The vehicle cannot be above the sheet; the estimate of a hanging vehicle drifts.
+    # The vehicle cannot be above the sheet, but its estimate drifts while it hangs there.
     highest_m = target_z_m - log.flown_profile.vehicle.gear_body_m[2]
     place_m[:, 1] = np.minimum(place_m[:, 1], highest_m)
     return place_m, target_z_m
@@ -247,12 +249,12 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
 
 
 def film_period(rate_hz: float) -> Fraction:
-    """Time between two images, s, rounded to 0.01 s, in which a GIF counts."""
+    """Time between two images, s, rounded to 0.01 s, the unit of time in a GIF."""
     return Fraction(max(2, round(100 / rate_hz)), 100)
 
 
 def film_figure(width_px: int) -> Figure:
-    """An empty figure of a film's shape."""
+    """An empty figure with the aspect ratio of a film."""
     return new_figure(WIDTH_IN, HEIGHT_IN, width_px // SIZE_STEP_PX * SIZE_STEP_PX / WIDTH_IN)
 
 
@@ -298,7 +300,8 @@ def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
 
 
 def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
-    """Write a GIF with a single palette, so that static parts need no space."""
+    """Write a GIF with a single palette, so that static parts take no space after the first
+    image."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

@@ -1,7 +1,7 @@
-"""A film of a fleet: the room from above, all heights, and each vehicle's camera image.
+"""Make a film of a fleet that shows the room from above, all heights, and each camera's image.
 
-Each vehicle's log has its own clock. They are aligned by the fleet's clock, on which each flight
-has a start and a pace, because simulated time may run slower than the wall clock.
+Each vehicle's log has its own clock. The logs are aligned on the fleet's clock: each flight has a
+start time and a pace on it, because simulated time may run slower than the wall clock.
 """
 
 from __future__ import annotations
@@ -42,15 +42,16 @@ ROOM_MARGIN_M = 0.2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FilmedVehicle:
-    """One vehicle of a fleet's flight.
+    """One vehicle in the film of a fleet.
 
     Attributes:
-        images: the recorded ones, oldest first; None without a recording.
-        begin_s: its first tick, on the fleet's clock.
-        pace: time of its flight per time of the fleet's clock.
-        home_m, target_m, radius_m: of its corridor, in the room's axes.
-        heading_rad: where its nose points at home.
-        in_room: its state estimate has the room's axes; otherwise it begins at zero at home.
+        images: the recorded images, oldest first; None if there is no recording.
+        begin_s: time of the first tick, on the fleet's clock.
+        pace: seconds on the flight's clock per second on the fleet's clock.
+        home_m, target_m, radius_m: the two ends and the radius of its corridor, in room axes.
+        heading_rad: direction in which its nose points at home.
+        in_room: True if its state estimate is in room axes; otherwise the estimate starts at zero
+            at home.
     """
 
     name: str
@@ -66,15 +67,16 @@ class FilmedVehicle:
 
     @property
     def end_s(self) -> float:
-        """Its last tick, on the fleet's clock."""
+        """Time of the last tick, on the fleet's clock."""
         return self.begin_s + self.flight.log.end_s / self.pace
 
     def index_at(self, t_s: float) -> int:
-        """The tick at this time of the fleet's clock; the first one before its flight."""
+        """Index of the tick at this time on the fleet's clock; before the flight, the first
+        tick."""
         return self.flight.log.tick_index_at((t_s - self.begin_s) * self.pace)
 
     def path_m(self) -> Array:
-        """Its position in each tick, in room axes, (n, 2)."""
+        """Horizontal position in each tick, in room axes, (n, 2)."""
         log = self.flight.log
         place_m = np.column_stack([log.column("x_m"), log.column("y_m")])
         if self.in_room:
@@ -83,7 +85,7 @@ class FilmedVehicle:
         return np.asarray(place_m @ np.array([[c, s], [-s, c]]) + np.asarray(self.home_m))
 
     def heights_m(self) -> Array:
-        """Its height above its starting place in each tick."""
+        """Height above the take-off point in each tick."""
         z_m = self.flight.log.column("z_m")
         known_m = z_m[np.isfinite(z_m)]
         return np.asarray(z_m - known_m[0] if known_m.size else z_m)
@@ -96,8 +98,8 @@ def write_fleet_film(
     width_px: int = 960,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write the flight of a fleet as a film (.mp4 or .gif) at its own pace, and return its number
-    of images. `rate_hz`, `width_px`, `progress` and errors are those of
+    """Write the flight of a fleet as a real-time film (.mp4 or .gif), and return the film's number
+    of images. `rate_hz`, `width_px`, `progress` and errors are as in
     `perchctl.analysis.write_film`.
     """
     for vehicle in vehicles:
@@ -151,7 +153,7 @@ class _FleetStage:
         self._still = draw_still(self._figure)
 
     def drawn(self, t_s: float) -> Rgb:
-        """The image of this time of the fleet's clock, (height, width, 3)."""
+        """The film's image at this time on the fleet's clock, (height, width, 3)."""
         for each in self._shown:
             each.show(t_s)
         hanging = sum(each.hangs for each in self._shown)
@@ -202,7 +204,7 @@ class _FleetStage:
 
 
 class _ShownVehicle:
-    """The moving parts for one vehicle: its camera image, its texts, and its position in the
+    """The moving parts for one vehicle: its camera image, its text, and its position in the
     room."""
 
     def __init__(
@@ -223,7 +225,7 @@ class _ShownVehicle:
         self._place = add(room.plot([], [], color=colour, marker="P", markersize=9.0)[0])
 
     def show(self, t_s: float) -> None:
-        """Show this time of the fleet's clock."""
+        """Update the parts to this time on the fleet's clock."""
         index = self._vehicle.index_at(t_s)
         phase = "waits"
         if t_s >= self._vehicle.begin_s:

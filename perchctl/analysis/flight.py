@@ -1,4 +1,7 @@
-"""The analysis of one flight, as used by `log show`, `compare`, `plot` and `report`."""
+"""The analysis of one flight, as used by `log show`, `compare`, `plot` and `report`.
+
+Times are in seconds since the first turn, that is, the first iteration of the flight loop.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ _NUMBER = re.compile(r"[0-9.]+")
 
 @dataclass(frozen=True)
 class Hold:
-    """A period in which the vehicle held its position; times since the flight's first turn."""
+    """A period in which the vehicle held its position; times are since the flight's first turn."""
 
     start_s: float
     end_s: float
@@ -50,10 +53,10 @@ def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> 
 
 @dataclass(frozen=True)
 class Measures:
-    """Key figures of a flight; None is unknown.
+    """Key figures of a flight; None if unknown.
 
-    The settled errors (horizontal distance of gear and target, and heading) are RMS values over
-    the last `SETTLED_S` of the ascent before the last contact.
+    The settled errors (the horizontal distance between gear and target, and the heading error) are
+    RMS values over the last `SETTLED_S` seconds of the ascent before the last contact.
     """
 
     duration_s: float | None = _number("flight", "s", digits=1)
@@ -78,7 +81,8 @@ class Measures:
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
     def value_text(self, name: str) -> str:
-        """The figure `name` in its display unit, without the unit; ``-`` if unknown."""
+        """The value of the figure `name` in its display unit, without the unit; ``-`` if
+        unknown."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
         if value is None:
@@ -87,7 +91,7 @@ class Measures:
 
     @property
     def labels_and_texts(self) -> list[tuple[str, str]]:
-        """Label, and text with unit, of each known figure."""
+        """The label of each known figure, and its value as text with unit."""
         return [
             (f.metadata["label"], f"{self.value_text(f.name)} {f.metadata['unit']}".rstrip())
             for f in fields(self)
@@ -98,12 +102,12 @@ class Measures:
 class FlightAnalysis:
     """Analysis of one flight's log; each property is computed once, on first use.
 
-    `records` are the ticks, each with every field, `events` the flight's events, and
-    `column(field)` one field of all ticks, (n,), NaN where it is missing.
+    `records` contains all ticks with all their fields, and `events` the flight's events.
+    `column(field)` returns one field for all ticks, (n,), NaN where it is missing.
 
-    Times count from the flight's first turn. A property that meets an invalid value in the log
-    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError; within
-    `perchctl.record.wrap_log_errors` all of these become InvalidValue.
+    Times are measured from the first iteration of the flight loop. A property that meets an invalid
+    value in the log raises InvalidValue, TypeError, ValueError, LookupError or AttributeError;
+    within `perchctl.record.wrap_log_errors` all of these become InvalidValue.
     """
 
     def __init__(self, log: FlightLog) -> None:
@@ -130,8 +134,9 @@ class FlightAnalysis:
 
     @cached_property
     def position_holds(self) -> tuple[Hold, ...]:
-        """Periods in which the vehicle held its position in one phase for one reason. The numbers
-        in a reason may change; the text is that of the last turn."""
+        """Periods in which the vehicle held its position, each within one phase and for one reason.
+        The numbers in the reason may change meanwhile; the text is the one at the end of the
+        period."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -149,14 +154,14 @@ class FlightAnalysis:
 
     @property
     def notes(self) -> list[tuple[float, str]]:
-        """Time in s and text of each note in the log."""
+        """Time (s) and text of each note in the log."""
         return [
             (self.log.to_flight_s(float(event["t_s"])), str(event.get("reason") or ""))
             for event in self.log.events
             if event.get("event") == "note"
         ]
 
-    # --- sight and edges
+    # --- camera frames, target losses, takeovers and figures
 
     @cached_property
     def frames(self) -> Frames:
@@ -165,17 +170,18 @@ class FlightAnalysis:
 
     @cached_property
     def target_losses(self) -> tuple[TargetLoss, ...]:
-        """Intervals without the target in phases that need it."""
+        """Intervals in which the target was not seen, in phases that need it."""
         return target_losses(self.log, self.frames)
 
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
-        """Series of commands that were not sent by the flight loop."""
+        """Series of commands that were sent by anything other than the flight loop."""
         return group_takeovers(self.log)
 
     @cached_property
     def trim(self) -> Trim | None:
-        """The thrust demanded of each motor in level hover; None if the log does not contain it."""
+        """The thrust demanded from each motor in level hover; None if the log does not contain
+        it."""
         return estimate_trim(self.log, simulated=self.summary.simulated)
 
     @cached_property
@@ -234,7 +240,7 @@ class FlightAnalysis:
         return np.where(remembered, np.nan, self.log.column(log_field))
 
     def value_at(self, t_s: float, log_field: str) -> float:
-        """A log field's value in the tick at `t_s`; NaN if it is missing or not a number."""
+        """The value of a log field in the tick at `t_s`; NaN if it is missing or not a number."""
         records = self.log.records
         value = records[self.log.tick_index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -243,11 +249,11 @@ class FlightAnalysis:
 
 
 def read_log(path: Path | str) -> FlightAnalysis:
-    """Read a flight log, gzipped or not, and return its analysis: the ticks by `records`,
-    `column(field)` and `to_pandas()`, and `events`, `summary`, `measures`.
+    """Read a flight log, gzipped or not, and return its analysis. The ticks are available as
+    `records`, `column(field)` and `to_pandas()`; see also `events`, `summary` and `measures`.
 
     Raises:
-        NotFound: no such file. InvalidValue: it is no flight log, or damaged.
+        NotFound: there is no such file. InvalidValue: the file is damaged or not a flight log.
     """
     return FlightAnalysis(read_records(path))
 
@@ -262,7 +268,7 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-# --- what was sent in the loop's place ---
+# --- commands from senders other than the flight loop ---
 
 APART_S = 2.0
 """Time between two commands from one sender above which they belong to different series, s."""
@@ -273,7 +279,8 @@ _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 @dataclass(frozen=True)
 class Takeover:
     """A series of commands from a sender (`by`) other than the flight loop. Times are since the
-    flight's first turn; `commands`: their number by kind, as in ``position setpoint``."""
+    flight's first turn. `commands` is the number of commands of each kind, such as ``position
+    setpoint``."""
 
     by: str
     start_s: float
@@ -282,12 +289,12 @@ class Takeover:
 
     @property
     def text(self) -> str:
-        """Kinds and numbers of commands: ``position setpoint (14), land (2)``."""
+        """The kinds of commands and their numbers: ``position setpoint (14), land (2)``."""
         return ", ".join(f"{name} ({count})" for name, count in self.commands.items())
 
 
 def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
-    """Return the series of commands that were not sent by the flight loop, oldest first."""
+    """Return the series of commands from senders other than the flight loop, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None

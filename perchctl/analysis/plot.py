@@ -1,4 +1,4 @@
-"""The plot of a flight, which is written next to its log and shown on the report page."""
+"""Plot a flight. The plot is written next to the log and shown on the report page."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ TRACKS = (
 
 
 def plot_flight(log: FlightLog | FlightAnalysis, path: Path | str) -> None:
-    """Draw the flight into a .png, .pdf or .svg.
+    """Draw the flight as a .png, .pdf or .svg file.
 
-    Raises InvalidValue for a log without ticks or a file that cannot be written.
+    Raises InvalidValue if the log has no ticks or the file cannot be written.
     """
     flight = log if isinstance(log, FlightAnalysis) else FlightAnalysis(log)
     if not flight.records:
@@ -77,9 +77,9 @@ def flight_png(flight: FlightAnalysis) -> bytes:
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Draw detections and the filtered track (as figure 6 of the paper), height, thrust and
-    battery over time, with the phases named, and a close-up in mm of the last seconds with the
-    target. Frames without a detection are marked at the bottom."""
+    """Draw detections and the filtered track (as in figure 6 of the paper), height, thrust and
+    battery over time, with phase names, and a close-up (in mm) of the last seconds in which the
+    target was seen. Frames without a detection are marked at the bottom."""
     figure = new_figure(11.0, 14.0)
     *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
     for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
@@ -108,7 +108,7 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
 
 
 def figure_title(flight: FlightAnalysis) -> str:
-    """Return profile, seed, outcome, and the miss where it is known, as one line."""
+    """Return the profile, seed, outcome and, if known, the miss distance as a single line."""
     end = flight.summary
     parts = [flight.log.setup_text, end.outcome]
     if end.outcome != "perched" and end.reason:
@@ -124,8 +124,8 @@ def figure_title(flight: FlightAnalysis) -> str:
 def _draw_raw_and_filtered(
     ax: Axes, flight: FlightAnalysis, key: str, scale: float, label: str
 ) -> None:
-    # A frame is about 100 ms old when it is measured, while the estimate is extrapolated to the
-    # present.
+    # A frame is about 100 ms old when its target pose is measured, whereas the estimate is
+    # extrapolated to the present.
     log = flight.log
     frame_s = log.to_flight_s(log.column("frame_t_s"))
     for source, marker, colour, text in RAW:
@@ -167,7 +167,7 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
-    """Draw the commanded thrust in percent on a second y axis at the right; return that axis."""
+    """Draw the commanded thrust in percent on a second y axis on the right; return that axis."""
     thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(
@@ -178,8 +178,8 @@ def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
 
 
 def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
-    """Draw the approach in mm up to the last frame with the target. Return start and end of the
-    period."""
+    """Draw the approach in mm up to the last frame that shows the target. Return the start and end
+    of the period drawn."""
     log, frames = flight.log, flight.frames
     end_s = (
         float(frames.times_with_target_s[-1])

@@ -1,4 +1,7 @@
-"""One log replayed: as it was flown, or with another profile."""
+"""Replay one flight from its log, with the flown profile or with another one.
+
+A turn is one iteration of the flight loop.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ CAUTION = (
 
 @dataclass(frozen=True)
 class Difference:
-    """First field of one turn in which a replay differs from the log.
+    """The first field of one turn in which a replay differs from the log.
 
     `tick`: number of the turn since take-off, from 0; negative before take-off. `t_s`: since the
     first flown turn. `recorded`, `replayed`: the two values, in JSON types.
@@ -47,20 +50,20 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """A line: ``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
+        """One line, such as ``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``."""
         was, now = json.dumps(self.recorded), json.dumps(self.replayed)
         return f"tick {self.tick} at {self.t_s:.2f} s: {self.field} was {was}, the replay has {now}"
 
 
 @dataclass(frozen=True, eq=False)
 class PerceptionReplay:
-    """Result of replaying perception on the recorded images, telemetry and times.
+    """Result of replaying perception with the recorded images, telemetry and times.
 
     Attributes:
         turns: the replayed turns, up to the first missing image.
-        differences: the first difference of each turn whose poses or observation differ.
+        differences: the first difference in each turn whose poses or observation differ.
         frames_flown: number of frames that the flight processed.
-        missing: why the images ended the replay early, or None.
+        missing: why a missing or unreadable image ended the replay early, or None.
     """
 
     turns: Sequence[ReplayedInputs]
@@ -75,7 +78,7 @@ class PerceptionReplay:
 
     @property
     def end_reason(self) -> str:
-        """Why the replay ends before the flight does, or empty."""
+        """Why the replay ends before the flight does; empty if it does not."""
         return f"{self.missing}: what follows cannot be replayed" if self.missing else ""
 
     @property
@@ -93,10 +96,10 @@ class Replay:
 
     Attributes:
         decisions: the planner's replayed decisions, one for each turn.
-        differences: the first difference of each decision that differs from the log.
-        seen: replay of perception; None without images.
+        differences: the first difference in each decision that differs from the log.
+        seen: replay of perception; None if no images were recorded.
         changed_keys: profile keys that differ from the flown profile.
-        gap_text: sentence on turns missing from the log, or empty (`turns_and_gap_text`).
+        gap_text: sentence about turns missing from the log, or empty (see `turns_and_gap_text`).
     """
 
     log: FlightLog
@@ -108,12 +111,12 @@ class Replay:
 
     @property
     def ticks(self) -> int:
-        """Number of replayed turns that were flown."""
+        """Number of replayed turns in which the vehicle was flown."""
         return sum(each.turn.role == "flown" for each in self.decisions)
 
     @property
     def is_identical(self) -> bool:
-        """True if neither a decision nor a perception result differs."""
+        """True if no decision and no perception result differs."""
         return not self.differences and (self.seen is None or self.seen.is_identical)
 
     @property
@@ -121,12 +124,12 @@ class Replay:
         """Dotted names of the fields that the log does not contain and that are therefore not
         compared."""
         names = (field.path.removeprefix("observation.") for field in self.log.unknown_fields)
-        # A telemetry sample has the same fields wherever it occurs.
+        # Samples below `taken` have the same fields as the others, so their names are not repeated.
         return [name for name in names if not name.startswith("taken.")]
 
     @property
     def notes(self) -> list[str]:
-        """The limitations of the replay, one sentence each."""
+        """The limitations of this replay, one sentence each."""
         made_by, elsewhere = self.log.header.get("perchctl"), self.log.computer_differences
         found = []
         if made_by != perchctl.__version__:
@@ -160,9 +163,9 @@ class Replay:
     def record(self) -> dict[str, Any]:
         """The replay in JSON types.
 
-        `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
-        None without images; `changed` is empty for the flown profile; `not_compared` names the
-        fields that the log does not contain.
+        `ticks`, `differences` and `first_difference` concern the planner. `pictures` concerns
+        perception and is None if no images were recorded. `changed` is empty for the flown profile.
+        `not_compared` lists the fields that the log does not contain.
         """
         seen = self.seen
         pictures = seen and {
@@ -217,11 +220,11 @@ def replay(
 ) -> Replay:
     """Replay the flight with its own profile or, if given, with `profile`.
 
-    The planner gets the recorded observations; with another profile and `pictures`, those of the
-    replayed perception. Perception is compared separately. `pipeline`: by default the profile's,
-    with the flown calibration and mask. `tolerances`: permitted difference of the numbers in a
-    field, by the field's name without its owner; "" stands for all other fields. By default, every
-    bit is compared. Errors: InvalidValue, NotFound.
+    The planner gets the recorded observations; with another profile and `pictures`, it gets the
+    observations from the replayed perception. Perception is compared separately. The default
+    `pipeline` is the profile's, with the flown calibration and mask. `tolerances`: permitted
+    difference for the numbers in a field, keyed by field name without its owner; "" stands for all
+    other fields. By default, every bit is compared. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile
     turns, gap = turns_and_gap_text(log)
@@ -229,7 +232,7 @@ def replay(
     comparison = Comparison(unknown, tolerances or {})
     used = profile or flown
     changed = changed_keys(flown, used)
-    if not log.has_position_variance:  # fields that are unknown did not exist at that time
+    if not log.has_position_variance:  # a field missing from an old log did not exist yet
         used = used.with_({"link.unreported": ["variance", *used.link.unreported]})
     seen = None
     if pictures is not None:
@@ -257,13 +260,14 @@ def replay(
 
 
 def changed_keys(flown: Profile, replayed: Profile) -> tuple[str, ...]:
-    """The dotted keys in which two profiles differ, without name, description and date."""
+    """The dotted keys whose values differ between two profiles, except name, description and
+    date."""
     found = profile_differences(flown.model_dump(mode="json"), replayed.model_dump(mode="json"))
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
 def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
-    """The pipeline of `profile` with the flown calibration and mask, unless their keys are among
+    """The pipeline for `profile`, with the flown calibration and mask unless their keys are among
     the `changed` keys. Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
     if camera is None or "camera.calibration" in changed:

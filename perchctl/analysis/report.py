@@ -1,4 +1,5 @@
-"""A self-contained page that reports one flight, or several flights of a session."""
+"""Write a self-contained HTML page that reports on one flight or on several flights of a
+session."""
 
 from __future__ import annotations
 
@@ -45,10 +46,11 @@ def write_report(
     progress: Progress = lambda done, total: None,
 ) -> Report:
     """Write the HTML report of the logs atomically, and return its content. `with_film` embeds a
-    film of each flight. `names`: the vehicles of a fleet, by their logs. `progress` is called with
-    the number done and of all: after each flight, or with films after each image of a film.
+    film of each flight. `names`: the vehicle names in a fleet, keyed by log. `progress` is called
+    with the number done and the total, after each flight or, with films, after each image of a
+    film.
 
-    Raises NotFound and InvalidValue, as `read_log` and `write_files`.
+    Raises NotFound and InvalidValue, as `read_log` and `write_files` do.
     """
     of = names or {}
     report = Report(
@@ -60,13 +62,14 @@ def write_report(
 
 @dataclass(frozen=True)
 class Report:
-    """The flights on a report's page, at least one."""
+    """The flights on a report page, at least one."""
 
     flights: tuple[ReportedFlight, ...]
 
     @property
     def outcome_counts_text(self) -> str:
-        """Numbers of flights: ``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
+        """The number of flights by outcome: ``1 flight: 1 perched``, ``4 flights: 3 perched, 1
+        landed``."""
         outcomes = [told.outcome for told in self.flights]
         each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
         return f"{count_text(len(outcomes), 'flight')}: {each}"
@@ -88,8 +91,8 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class ReportedFlight:
-    """One flight of a report. `pictures` is None without a recording; `picture_problem` says why
-    images could not be read. `name`: the vehicle's, in a fleet."""
+    """One flight in a report. `pictures` is None if there is no recording; `picture_problem` says
+    why images could not be read. `name`: the vehicle's name in a fleet."""
 
     flight: FlightAnalysis
     pictures: tuple[DecisionPicture, ...] | None = None
@@ -103,15 +106,15 @@ class ReportedFlight:
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Sentences on the measured latency and mounting that the profile should contain, and on
-        the vehicle's motors and balance."""
+        """Sentences about the measured latency and mounting that the profile should contain, and
+        about the vehicle's motors and balance."""
         findings, trim = self.flight.summary.findings, self.flight.trim
         camera = () if findings is None else findings.advice
         return camera if trim is None else (*camera, *trim.advice)
 
     @property
     def outcome(self) -> str:
-        """How the flight ended; `UNFINISHED` for a log without its end."""
+        """How the flight ended; `UNFINISHED` if the log does not contain the end."""
         return UNFINISHED if self.flight.log.summary is None else self.flight.summary.outcome
 
     @property
@@ -133,13 +136,13 @@ class ReportedFlight:
 
     @property
     def start_text(self) -> str:
-        """When the flight began, in UTC; a simulated flight in lockstep has no date."""
+        """When the flight began, in UTC; a simulated flight in lockstep has no start date."""
         started = self.flight.log.header.get("started_utc")
         return utc_text(started) if started else "no date"
 
     @property
     def log_defects(self) -> list[str]:
-        """What is missing in the log, one sentence each."""
+        """What is missing from the log, one sentence each."""
         end, log = self.flight.summary, self.flight.log
         found = []
         if not log.records:
@@ -167,8 +170,8 @@ def report_html(
     with_film: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> str:
-    """The report of at least one flight as self-contained HTML. Raises InvalidValue for
-    invalid values in a log."""
+    """The report on at least one flight as self-contained HTML. Raises InvalidValue for invalid
+    values in a log."""
     articles = []
     for number, told in enumerate(flights, start=1):
         with wrap_log_errors(told.flight.log.path):
@@ -204,7 +207,7 @@ def _render(name: str, **values: Any) -> Markup:
 
 
 def mission_phases(log: FlightLog) -> list[str]:
-    """The phases of a log's mission in their order: the paper's seven, or those of a hover."""
+    """The phases of the mission in a log, in order: the paper's seven, or those of a hover."""
     seven = [phase.value for phase in tuple(Phase)[:7]]
     planner = (log.header.get("profile") or {}).get("planner") or {}
     return [*seven[:5], Phase.HOVER.value] if planner.get("hover") else seven
@@ -214,7 +217,7 @@ def film_url_and_problem(
     flight: FlightAnalysis, progress: Progress = lambda done, total: None
 ) -> tuple[str, str]:
     """The flight's film as a `data:` URL, and why the film or its camera images are
-    missing; each may be empty. The log has at least one tick."""
+    missing; each may be empty. The log must have at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
     recorded = [recorded_pictures(path)] if is_recorded else []
@@ -232,7 +235,7 @@ def film_url_and_problem(
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
-    """The error's text without folder names, because the page may be passed on."""
+    """The error's text without folder names, because the user may share the page."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 
@@ -256,7 +259,8 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 class DecisionPicture:
     """Last camera image before a phase change, as a JPEG with the detected markers drawn.
 
-    The caption gives the image's time, because the last centimetres are flown without images.
+    The caption gives the image's time, because the image can be much older than the decision: the
+    last centimetres are flown without images.
     """
 
     caption: str
@@ -268,10 +272,10 @@ class DecisionPicture:
 
 
 def read_reported_flight(log_path: Path) -> ReportedFlight:
-    """Read one flight from its log and from the recording beside it. If the recording cannot be
-    read, only the images are missing.
+    """Read one flight from its log and from the recording next to it. If the recording cannot be
+    read, the flight is returned without images.
 
-    Raises NotFound and InvalidValue for the log, as `read_log`.
+    Raises NotFound and InvalidValue for the log, as `read_log` does.
     """
     flight = FlightAnalysis(read_log(log_path))
     if not path_beside(log_path, ".mcap").is_file():
@@ -289,8 +293,8 @@ def read_reported_flight(log_path: Path) -> ReportedFlight:
 
 
 def captions_and_records(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
-    """Return, by frame number, the caption and the log record of the last frame before each phase
-    change."""
+    """Return the caption and the log record of the last frame before each phase change, keyed by
+    frame number."""
     log = flight.log
     found = {}
     for stay in log.phases:
@@ -310,7 +314,7 @@ def _jpeg(record: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
     drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     for key, colour in (("large_px", LARGE_BGR), ("small_px", SMALL_BGR)):
         if np.size(record.get(key) or ()) == 8:
-            # Pixel centres have integer coordinates, also in the reduced image.
+            # Pixel centres have integer coordinates in the reduced image as well.
             points = (np.array(record[key], dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
             fixed = np.round(points * 16).astype(np.int32)
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)

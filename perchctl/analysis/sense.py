@@ -1,7 +1,8 @@
-"""Replay the perception of a flight: pass the recorded telemetry and images to the loop's own
-inputs again.
+"""Replay the perception of a flight: process the recorded telemetry and images with the same code
+as the flight loop.
 
-On one thread, the same images, samples and times must give bit-identical poses.
+On one thread, the same images, samples and times must give bit-identical poses. A turn is one
+iteration of the flight loop.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ Picture = tuple[int, float, NDArray[np.uint8]]
 
 
 class PictureMissing(Exception):
-    """An image that the replay needs is missing (the message says why) or, with `is_different`, is
-    not the one that the flight processed."""
+    """Raised if an image that the replay needs is missing (the message says why) or, with
+    `is_different`, is not the one that the flight processed."""
 
     is_different = False
 
@@ -38,8 +39,8 @@ class _PictureIsAnother(PictureMissing):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedInputs:
-    """Replayed inputs of a turn: the markers' `poses` by name, and the recorded `observation` with
-    replayed perception, None for a turn without an observation."""
+    """The replayed inputs of a turn: the markers' `poses` by name, and the recorded `observation`
+    with the replayed perception in it (None for a turn without an observation)."""
 
     turn: TickRecord
     poses: dict[str, UnfilteredPose]
@@ -47,7 +48,7 @@ class ReplayedInputs:
 
 
 class _Given:
-    """Stand-in for link and source, which returns the recorded data turn by turn."""
+    """Stand-in for the link and the frame source, which returns the recorded data turn by turn."""
 
     def __init__(
         self, pictures: Iterable[Picture], size_px: tuple[int, int], delay_s: float
@@ -99,7 +100,7 @@ class _Given:
         return None
 
     def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        if self._taken.camera_problem is not None:  # no image was searched in this turn
+        if self._taken.camera_problem is not None:  # no image was processed in this turn
             return np.zeros((1, 1), np.uint8)
         image = self._repeated_picture(seen) if seen.is_repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
@@ -124,7 +125,7 @@ class _Given:
                 return image
             if index > seen.index:
                 break
-            # Otherwise the image belongs to a frame that no turn has used.
+            # An image of a smaller index belongs to a frame that no turn used, and is skipped.
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 
@@ -135,8 +136,8 @@ def replay_inputs(
     pictures: Iterable[Picture],
     delay_s: float = 0.0,
 ) -> Iterator[ReplayedInputs]:
-    """Replay perception turn by turn, from the first turn before take-off. `delay_s` is added to
-    the exposure times of a live source.
+    """Replay perception turn by turn, starting before take-off. `delay_s` is added to the exposure
+    times of a live source.
 
     Raises PictureMissing at the first image that is missing, differs or cannot be read, because the
     pipeline's state would differ from the flight's from then on.
@@ -159,9 +160,9 @@ def replay_inputs(
 
 
 def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
-    """Return the name of the flown source, taken from the camera problem that was reported when the
-    recording ended; the log does not contain it elsewhere. None if the problem is a different one,
-    so that the replay will differ from it."""
+    """Return the name of the flown frame source, taken from the camera problem that was reported
+    when a recorded source ended, because nothing else in the log contains it. Return None if the
+    problem was a different one; the replayed problem then differs from the log."""
     told = obs.camera_problem
     if told is None or taken.frame is not None or taken.camera_problem is not None:
         return None
@@ -170,8 +171,8 @@ def _ended_name(taken: TickInputs, obs: Observation) -> str | None:
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
-    """Yield the images. An unreadable image ends the sequence, but not the replay of the
-    planner."""
+    """Yield the images. The sequence ends at an unreadable image without raising an error, so that
+    the planner can still be replayed."""
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:

@@ -1,4 +1,4 @@
-"""The output of `perchctl log show` for a flight: lines of at most `COLUMNS` columns, or one
+"""The output of `perchctl log show` for a flight: text of at most `COLUMNS` columns, or one JSON
 record."""
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ _HANG = 11
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
-    """The content of `show_text` for JSON: SI units, times from the flight's first turn."""
+    """The content of `show_text` as a JSON object, in SI units. Times are measured from the first
+    iteration of the flight loop."""
     log, end, header = flight.log, flight.summary, flight.log.header
     return {
         "log": str(log.path),
@@ -101,8 +102,8 @@ def _origin(log: FlightLog) -> str:
 
 
 def _positions_text(log: FlightLog) -> str:
-    """Return what measured the position. A fault or an option may have replaced the profile's
-    method."""
+    """Return which positioning system measured the position. It may differ from the profile's,
+    because a fault or an option can replace it."""
     section = (log.header.get("profile") or {}).get("positioning") or {}
     return f"positions by {section['by']}" if "by" in section else ""
 
@@ -171,7 +172,8 @@ def _named(name: str, text: str) -> list[str]:
 
 
 def with_hanging_indent(prefix: str, text: str) -> list[str]:
-    """Wrap the text into lines: the first follows `prefix`, the others are indented by it."""
+    """Wrap the text into lines. The first line begins with `prefix`; the others are indented by its
+    width."""
     room = " " * len(prefix)
     lines = wrap(
         printable_text(text),

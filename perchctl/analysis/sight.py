@@ -1,4 +1,4 @@
-"""What the camera saw, according to a flight's log: frames, their quality, and losses of the
+"""What the camera saw, according to a flight's log: timing of the frames, and losses of the
 target."""
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def percentile(values: Array, percent: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Timing of the camera frames that the pipeline processed, in order.
+    """Timing of the camera frames that the pipeline processed, oldest first.
 
     Attributes:
-        t_s: (n,) times of exposure since the flight's first turn.
+        t_s: (n,) exposure times, measured from the first iteration of the flight loop.
         has_target: (n,) bool, True for the frames that showed the target.
         gaps_s: (k, 2) start and end of each gap without a usable frame.
-        rate_hz: 1 over the median time between two frames; NaN where it is unknown.
-        median_age_s: median age of an image when it was used; NaN where it is unknown.
+        rate_hz: 1 over the median time between two frames; NaN if unknown.
+        median_age_s: median age of an image when it was used; NaN if unknown.
     """
 
     t_s: Array
@@ -66,7 +66,8 @@ def read_frames(log: FlightLog) -> Frames:
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
     age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
     if records:
-        # A gap may also end with the flight, at its end minus the usual age of a frame.
+        # The last gap may end with the flight: there, the newest possible exposure is the flight's
+        # end minus the usual age of a frame.
         gaps_s = _gaps(log, np.append(times_s, max(log.end_s - age_s, times_s[-1])))
     between_s = np.diff(np.sort(times_s))
     return Frames(
@@ -79,7 +80,7 @@ def read_frames(log: FlightLog) -> Frames:
 
 
 def shows_target(record: Mapping[str, Any]) -> bool:
-    """True if, by the `record` of a tick, the target was detected and its pose accepted."""
+    """True if the `record` of a tick says that the target was detected and its pose accepted."""
     found = any(record.get(f"{source}x_m") is not None for source in "jls")
     return found and record.get("measured") is not False
 
@@ -104,11 +105,11 @@ AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 @dataclass(frozen=True)
 class TargetLoss:
-    """Interval without the target in a phase that needs it: from the last frame that showed the
-    target to the next such frame (`is_regained`), or to the flight's end.
+    """An interval in which the target was not seen, in a phase that needs it: from the last frame
+    that showed the target to the next such frame (`is_regained`), or to the end of the flight.
 
     Attributes:
-        frames_without_target: 0 if no image came at all.
+        frames_without_target: number of frames in the interval; 0 if none arrived at all.
     """
 
     start_s: float
@@ -122,7 +123,8 @@ class TargetLoss:
 
 
 def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
-    """All target losses, oldest first; none at the ceiling, where no images are evaluated."""
+    """All target losses, oldest first. There are none while the vehicle is at the ceiling, where
+    images are not evaluated."""
     stays = log.phases
     starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]
@@ -142,14 +144,14 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     """When the loss ended; None without a loss."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
-    at_s = start_s + LEAST_LOSS_S / 2  # the target may last have been seen just before the phase
+    at_s = start_s + LEAST_LOSS_S / 2  # last seen perhaps just before the phase
     phase = next((s.phase for s in reversed(stays) if s.start_s <= at_s), "")
     left = next(
         (s for s in stays if s.start_s > start_s and s.phase not in NEEDED_IN | {"SEARCH"}), None
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":
-            return None  # so close that no marker fits into the image, as intended
+            return None  # expected: so close that no marker fits into the image
         end_s = left.start_s
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None

@@ -1,4 +1,4 @@
-"""Tell a flight in sentences with times, from the log's events and ticks."""
+"""Describe a flight in sentences with times, from the log's events and ticks."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Sentence:
 
 
 def tell_story(flight: FlightAnalysis) -> tuple[Sentence, ...]:
-    """The events of a flight in order of time; empty for a log without ticks."""
+    """The events of a flight in chronological order; empty for a log without ticks."""
     if not flight.log.records:
         return ()
     told = [

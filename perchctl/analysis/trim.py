@@ -11,14 +11,15 @@ and to the side, three patterns:
     M3 back left     M2 back right
 
 - A centre of mass x forward and y left of the middle gives pitch = x / `MOTOR_OFFSET_M` and roll =
-  y / `MOTOR_OFFSET_M`. Weaker motors at the front, or on the left, give the same. In free flight,
-  both moments are always proportional to the thrust, so no flight can distinguish them.
+  y / `MOTOR_OFFSET_M`. Weaker motors at the front or on the left have the same effect. In free
+  flight, both moments are always proportional to the thrust, so no flight can distinguish them.
 - In still air, the centre of mass does not affect the yaw pattern, which shows unequal motors or
-propellers, or a tilted motor.
+  propellers, or a tilted motor.
 - A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the
-  wind. Its push beside the centre of mass (`DRAG_LEVER_M`) adds one to yaw, where the motors have
-  only `YAW_TORQUE_M`. The vehicle leans into a draught, but the estimated lean has a bias of the
-  same size. The lean is therefore only used to widen the intervals, not to correct the estimate.
+  wind. Because it pushes off-centre (`DRAG_LEVER_M`), it also adds a moment to yaw, where the
+  motors have only little authority (`YAW_TORQUE_M`). The vehicle leans into a draught, but the
+  estimated lean has a bias of the same size. The lean is therefore only used to widen the
+  intervals, not to correct the estimate.
 """
 
 from __future__ import annotations
@@ -82,14 +83,15 @@ _WAYS = (("forward", "backward"), ("to the left", "to the right"))
 
 @dataclass(frozen=True)
 class Trim:
-    """The thrust demanded of the motors in level hover. A margin is half of a 95 % interval.
+    """The thrust demanded from the motors in level hover. A margin is half the width of a 95 %
+    confidence interval.
 
     Attributes:
-        hover_s: time in hover that was used.
-        shares: thrust demanded of M1..M4, relative to the mean of the four.
-        shift_m: forward and left, where the centre of mass would lie if the motors were equal.
-        yaw_imbalance: by which fraction the thrust demanded of the front-left and back-right motors
-            exceeds the mean; for the other two motors, it is lower by the same fraction.
+        hover_s: total time in hover that the estimate is based on.
+        shares: thrust demanded from M1..M4, relative to the mean of the four.
+        shift_m: offset of the centre of mass, forward and left, if all motors are equal.
+        yaw_imbalance: fraction by which the thrust demanded from the front-left and back-right
+            motors exceeds the mean; the other two motors are below the mean by the same fraction.
         advice: sentences with advice; none for a simulated vehicle, or if no interval excludes its
             harmless range.
     """
@@ -116,7 +118,7 @@ class Trim:
 
     @property
     def balance_text(self) -> str:
-        """The shift in words, and which causes a flight cannot distinguish."""
+        """The shift in words, and the possible causes, which a flight cannot tell apart."""
         parts = zip(self.shift_m, self.shift_margin_m, _WAYS, strict=True)
         return (
             f"centre of mass {' and '.join(_shift(*part) for part in parts)}, if the motors are "
@@ -125,7 +127,8 @@ class Trim:
 
     @property
     def yaw_text(self) -> str:
-        """The yaw imbalance in words, for the pair of motors with more thrust, and its causes."""
+        """The yaw imbalance in words, for the pair of motors with more thrust, and its possible
+        causes."""
         pair, more = _yaw_pair(self.yaw_imbalance)
         return (
             f"{pair} {_percent(more, self.yaw_margin)}; caused by unequal motors or propellers, or "
@@ -136,20 +139,21 @@ class Trim:
 def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
     """Estimate the motors' trim from the level hover in a flight's log.
 
-    A sample is a log packet with duty cycles and voltage while the vehicle is in the air, slow,
-    level, and away from floor and target. The interval takes the memory of the noise into account
-    (`mean_and_margin`). The estimate is wrong for a load that swings, and near full duty, where a
-    motor cannot give what is asked. The thrust curve is that of a Crazyflie 2.1; at the voltage at
-    which a Brushless of 40 to 48 g hovers, both curves have the same relative slope within 7 %, and
-    by so much of itself the distance of a share from 1 is wrong.
+    A sample is a log packet with duty cycles and voltage, received while the vehicle is in the air,
+    slow, level, and away from the floor and the target. The interval takes the noise's
+    autocorrelation into account (`mean_and_margin`). The estimate is wrong for a swinging load, and
+    near full duty, where a motor cannot deliver the demanded thrust. The thrust curve is that of a
+    Crazyflie 2.1. At the voltage at which a Brushless of 40 to 48 g hovers, the relative slopes of
+    the two vehicles' curves agree to 7 %, so a share's difference from 1 is also accurate to 7 %.
 
-    Returns None for a log without duty cycles, as an older perchctl wrote it, and for less than 2 s
-    of hover. Raises InvalidValue for a value that is no number. `simulated`: give no advice.
+    Returns None for less than 2 s of hover, and for a log without duty cycles, as written by older
+    versions of perchctl. Raises InvalidValue for a value that is not a number. `simulated`: give no
+    advice.
     """
     duties = np.stack([log.column(f"duty_m{motor}") for motor in (1, 2, 3, 4)], axis=1)
     volts = log.column("battery_v")
     is_known = np.all(duties <= MOST_DUTY, axis=1) & (volts <= MOST_CELL_V)
-    # Identical numbers come from the same packet, because a tick contains the newest one.
+    # Each tick contains the newest packet, so successive identical numbers come from one packet.
     is_new = np.any(np.diff(duties, axis=0, prepend=np.nan) != 0.0, axis=1)
     packets = np.flatnonzero(is_known & is_new)
     motor_v = duties[packets] / MOST_DUTY * volts[packets, np.newaxis]
@@ -185,14 +189,15 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
 
 
 def mean_and_margin(series: Array, chosen: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the mean of the chosen values of a regular series, and half of its 95 % interval.
+    """Return the mean of the chosen values in an evenly sampled series, and half the width of its
+    95 % confidence interval.
 
-    The variance of the mean is by Newey and West (Econometrica 55, 1987): autocovariances up to
-    `CORRELATED_SAMPLES`, with weights that fall linearly. In a short series it comes out too small;
-    its quantile makes up for that (Kiefer and Vogelsang, Econometric Theory 21, 2005, table 1). The
-    interval is at least Student's for independent values, although the attitude control makes
-    neighbours oppose each other. Too narrow for noise with a longer memory. `chosen`: (n,)
-    booleans, at least `LEAST_SAMPLES` of them True.
+    The variance of the mean follows Newey and West (Econometrica 55, 1987), with autocovariances up
+    to `CORRELATED_SAMPLES` and linearly decreasing weights. In a short series this variance is too
+    small, which the quantile of Kiefer and Vogelsang compensates for (Econometric Theory 21, 2005,
+    table 1). The interval is never narrower than Student's for independent values, although
+    attitude control makes successive values negatively correlated. It is too narrow for noise with
+    a longer correlation time. `chosen`: (n,) booleans, at least `LEAST_SAMPLES` of them True.
     """
     count = int(np.count_nonzero(chosen))
     mean = float(np.mean(series[chosen]))
