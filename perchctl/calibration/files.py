@@ -20,13 +20,14 @@ from perchctl.vision import CameraModel
 
 
 def profile_camera(config: CameraConfig) -> CameraModel:
-    """The calibrated camera of a profile. Raises as `load_calibration`."""
+    """The calibrated camera of a profile. Raises the errors of `load_calibration`."""
     return load_calibration(config.calibration)
 
 
 @dataclass(frozen=True)
 class CalibrationNotes:
-    """The notes of a perchctl calibration on its origin; empty for files of other programs.
+    """The notes in a calibration made by perchctl about its origin; empty for files of other
+    programs.
 
     Attributes:
         board: the board's notation.
@@ -38,7 +39,7 @@ class CalibrationNotes:
 
 
 def load_notes(path: Path) -> CalibrationNotes:
-    """Read a calibration file's notes. Raises as `load_calibration`."""
+    """Read the notes in a calibration file. Raises the errors of `load_calibration`."""
     _, values = _parsed(path)
     return CalibrationNotes(
         board=str(values.get("board") or ""),
@@ -47,10 +48,10 @@ def load_notes(path: Path) -> CalibrationNotes:
 
 
 def load_calibration(file: Path | str) -> CameraModel:
-    """Read a camera model from a file, or by the name of one in `calib/`.
+    """Read a camera model from a file, given by path or by name in `calib/`.
 
     Raises:
-        NotFound: no file. InvalidValue: wrong content.
+        NotFound: there is no such file. InvalidValue: its content is invalid.
     """
     camera, _ = _parsed(find_calibration(file) if isinstance(file, str) else file)
     return camera
@@ -68,8 +69,8 @@ def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file in UTF-8 or, as some editors write it, UTF-16 or Latin-1. Raises
-    NotFound, and InvalidValue for bytes that are no text."""
+    """Return the text of a file in UTF-8 or, as written by some editors, UTF-16 or Latin-1. Raises
+    NotFound, and InvalidValue if the content is not text."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -92,7 +93,7 @@ def _text(path: Path) -> str:
 
 
 def _checked(lens: Lens) -> CameraModel:
-    """Return the camera of a lens. Raises InvalidValue for an implausible camera matrix."""
+    """Return the camera model for a lens. Raises InvalidValue for an implausible camera matrix."""
     camera = CameraModel(lens.size_px, lens.K, lens.distortion, lens.model)
     K = lens.K.copy()
     K[0, 1] = 0.0  # a skew that `CameraModel` allows, but no computation uses
@@ -112,7 +113,7 @@ def _checked(lens: Lens) -> CameraModel:
 def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """The text of a calibration file; `name` is the camera's.
+    """The text of a calibration file; `name` is the camera's name.
 
     `notes` are further keys, ignored by ROS readers, with numbers, texts or arrays (n, m).
     """
@@ -142,8 +143,8 @@ def calibration_text(
 
 
 def _number(value: float | int) -> str:
-    """Return text that reads back as exactly the same number. It contains a point, because PyYAML
-    would read it as text without one."""
+    """Return text that reads back as exactly the same number. It contains a decimal point, because
+    PyYAML would otherwise read it as text."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

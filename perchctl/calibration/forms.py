@@ -4,14 +4,15 @@ Confusing two lens models moves the target by centimetres while its standard dev
 millimetres, and no later check detects this. Each form therefore has a table of its keys:
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
-- keys that must be neutral, as another value would change the projection (binning, xi, ...);
-- notes, which do not concern the projection of the camera's own images: those in the table, and
-  keys that consist of words about boards, images, errors and dates.
+- keys that must have a neutral value, since any other would change the projection (binning, xi,
+...);
+- notes, which do not affect the projection of the camera's own images: those in the table, and keys
+that consist of words about boards, images, errors and dates.
 
 A key that is not in the table might change the projection, so the file is refused, unless the value
-is 0 or empty, which disables any term of a lens model. Among the notes are `rectification_matrix`
-and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified images, while K and D
-belong to the camera's own.
+is 0 or empty, which disables any term of a lens model. `rectification_matrix` and
+`projection_matrix` are among the notes: according to sensor_msgs/CameraInfo, they describe
+rectified images, whereas K and D describe the camera's own images.
 
 Known forms that are not supported are refused by name.
 """
@@ -42,9 +43,10 @@ class Form:
 
     Attributes:
         name: the form's name in messages.
-        read: the keys of each meaning. The keys of ``lens`` must agree; of the others one is there.
-        neutral: keys that change the projection, and their values that do not.
-        notes: keys that say nothing about the projection.
+        read: the keys for each meaning. All keys for ``lens`` must agree; for any other meaning, a
+            file contains only one.
+        neutral: keys that can change the projection, each with the values at which it does not.
+        notes: keys that do not affect the projection.
     """
 
     name: str
@@ -218,7 +220,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     return _camera_lens(values, CAMERA_MESSAGE if is_message else CAMERA_FILE), values
 
 
-# --- From text to values ---
+# --- Parse text to values ---
 
 
 def _values(text: str) -> dict[str, Any]:
@@ -283,7 +285,7 @@ def _node_value(node: Any) -> Any:
     return None if node.isNone() else node.real()
 
 
-# --- From values to a lens ---
+# --- Interpret values as a lens ---
 
 
 def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
@@ -332,7 +334,8 @@ _Found = dict[str, list[tuple[str, Any]]]
 
 
 def _plain_key(key: str) -> str:
-    """Return a key without underscores and upper case, in which programs and versions differ."""
+    """Return a key in lower case without underscores, since programs and versions differ in
+    these."""
     return key.replace("_", "").lower()
 
 
@@ -343,8 +346,8 @@ def _is_note(key: str) -> bool:
 
 
 def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) -> _Found:
-    """The values of the keys that are read. Raises InvalidValue for a key that is missing, not
-    neutral or in no table."""
+    """The values of the keys that are read. Raises InvalidValue for a key that is missing, that has
+    no neutral value although it must, or that is in no table."""
     meanings = {_plain_key(k): meaning for meaning, keys in form.read.items() for k in keys}
     neutral = {_plain_key(k): allowed for k, allowed in form.neutral.items()}
     notes = {_plain_key(k) for k in form.notes}
@@ -400,7 +403,7 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
 
 
 def _check_region(found: _Found) -> None:
-    """Raise InvalidValue if the images are a cropped part of the calibrated ones."""
+    """Raise InvalidValue if the file describes images that are cropped from the calibrated ones."""
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
             raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")

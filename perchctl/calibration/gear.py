@@ -21,9 +21,9 @@ LIVE_S = 20.0
 """Recording time with a live camera, s."""
 LEAST_PICTURES = 20
 MOST_GEAR_SHARE = 0.6
-_LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the moving room
+_LEAST_MOTION_GREY = 8.0  # least spread over time of a pixel that sees the moving room
 _STILL_RATIO = 0.3  # share of that spread below which a pixel belongs to the gear
-_LEAST_BLOB_SHARE = 5e-4  # least share of the image for a part of the gear
+_LEAST_BLOB_SHARE = 5e-4  # smallest part of the gear, as a share of the image
 _CLOSED_PX = 7  # width of gaps that are filled; larger: pixels between two parts are covered, too
 _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered than the gear hides
 
@@ -31,8 +31,8 @@ _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered tha
 def learn_gear_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of the pixels that the vehicle covers, from the images of a
-    recording, or of a live camera for `LIVE_S` or until `stopped`.
+    """Return the mask (h, w) of the pixels that the vehicle covers. The images come from a
+    recording, or from a live camera for `LIVE_S` or until `stopped` returns True.
 
     Raises:
         InvalidValue: too few images, unequal sizes, too little motion, or nothing found.

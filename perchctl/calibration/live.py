@@ -1,4 +1,4 @@
-"""A live camera in a guided measurement: its frames, and what is shown to the person."""
+"""A live camera in a guided measurement: its frames, and what is shown to the user."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class GuidedFrame:
 
     Attributes:
         index, image: the frame's number and image (h, w).
-        outlines: kind and corners (n, 2) px of each detection.
-        rows: name, text and bar (None: no bar) of each value to show.
+        outlines: kind and corners, (n, 2) px, of each detection.
+        rows: name, text and bar (or None) of each value to show.
         advice: what to do now.
         status_line: the state in one line, for output to a pipe.
-        taken: True if the recording keeps this frame.
+        taken: True if the measurement uses this frame.
     """
 
     index: int
@@ -50,7 +50,7 @@ def poll_frames(
 ) -> Iterator[tuple[float, Frame | None]]:
     """Poll a source until it has ended; yield the time of each poll with the new frame, or None.
 
-    Raises TimedOut if the source reports a problem and has given no frame for `GONE_AFTER_S`.
+    Raises TimedOut if the source reports a problem and has delivered no frame for `GONE_AFTER_S`.
     """
     last_s = clock()
     while True:

@@ -1,4 +1,5 @@
-"""The camera and all board poses by OpenCV's bundle adjustment; outliers; lens uncertainty."""
+"""Fit the camera and all board poses by OpenCV's bundle adjustment, reject outliers, and estimate
+the uncertainty of the lens."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ class CameraFit:
 
     Attributes:
         poses: rvec and tvec of each view's board in the camera frame, (v, 6).
-        residuals: found minus modelled corners of each view, (n, 2) px each.
+        residuals: detected minus modelled corner positions of each view, (n, 2) px each.
     """
 
     camera: CameraModel
@@ -69,8 +70,8 @@ def lens_parameters(camera: CameraModel) -> Array:
 
 
 def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
-    """The camera of lens `model` (one of `MODEL_NAMES`) and the board poses with the least
-    squared residuals.
+    """Fit the camera with the lens `model` (one of `MODEL_NAMES`) and the board poses by least
+    squares.
 
     Raises NoSolution.
     """
@@ -92,7 +93,7 @@ def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
 
 
 def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | None:
-    """Fit the board poses for a fixed camera; None if a board is not in its view."""
+    """Fit the board poses for a fixed camera; None if a board is outside its field of view."""
     poses = []
     for view in views:
         seen = undistort_to_normalised(view.corners_px, camera)
@@ -117,8 +118,9 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """The Jacobians of the pixels of board points (n, 3) for the board's pose (6,), rvec and tvec,
-    with respect to the lens parameters, (2 n, p), and to the pose, (2 n, 6)."""
+    """The Jacobians of the projections (px) of board points (n, 3), with respect to the lens
+    parameters, (2 n, p), and to the board's pose, (2 n, 6). The pose (6,) consists of rvec and
+    tvec."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
     p = len(lens_parameters(camera))
@@ -145,10 +147,10 @@ def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
 
 
 # --- Outliers ---
-# A corner is left out when it is off by more than 5 times the spread of its view (at least that of
-# all views) and by more than 0.3 px. A view is left out when the RMS of its remaining corners is
-# above 2.5 times the median view's and above 0.1 px, when more than a quarter of its corners are
-# out, or when fewer than 6 remain. The worst views go first, until nothing changes.
+# A corner is rejected if its residual exceeds 0.3 px and 5 times the spread of its view (or of all
+# views, if that is larger). A view is rejected if the RMS of its remaining corners exceeds 0.1 px
+# and 2.5 times that of the median view, if more than a quarter of its corners were rejected, or if
+# fewer than 6 remain. The worst views are rejected first, until nothing changes.
 
 
 CORNER_FACTOR = 5.0
@@ -166,7 +168,7 @@ _REJECTION_ROUNDS = 10
 def reject_outliers(
     views: Sequence[BoardView], fit: CameraFit
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """The fit without outliers, the views used, and the rejected views and corners.
+    """Return the fit without outliers, the views used, and the rejected views and corners.
 
     Raises:
         InvalidValue: too many views do not fit one camera. NoSolution.
@@ -242,8 +244,8 @@ def jackknife_covariance(
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """The covariance (p, p) of a least-squares solution: the inverse information, enlarged
-    to the variances of the delete-one-block jackknife where these are larger.
+    """The covariance (p, p) of a least-squares solution: the inverse of the information matrix,
+    with variances enlarged to those of the delete-one-block jackknife where the latter are larger.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.

@@ -1,4 +1,5 @@
-"""Views of a board from images, a video or a live camera, and the similarity of two views."""
+"""Collect views of a board from images, a video or a live camera, and measure how similar two views
+are."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ def find_views(
     board: Board,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Detect the board in image files. Images that are broken or show no board are returned
+    """Detect the board in image files. Images that are damaged or show no board are returned
     separately. `progress` is called with the number of images done and their total number.
 
     Raises InvalidValue, before the search, if the images differ in size.
@@ -83,7 +84,7 @@ def _picture_size(path: Path) -> tuple[int, int] | None:
 
 
 def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
-    """Raise InvalidValue, which names all images that differ in size from most."""
+    """Raise InvalidValue, naming all images whose size differs from that of the majority."""
     counts = Counter(size for size in sizes.values() if size)
     if len(counts) < 2:
         return
@@ -97,8 +98,8 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
 
 
 def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Rejection]]:
-    """Return the views of the layout that most images show, and reject the others: there is only
-    one board."""
+    """Return the views with the layout that most images show, and reject the others, because there
+    is only one board."""
     legacy = 2 * sum(view.legacy for view in views) > len(views)
     reason = "its markers have a different layout from those in most images"
     others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
@@ -121,9 +122,9 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Return how a view shows the board, (5,): the corners' centre x, y and the board's size,
-    relative to the image, and the tilts: how much farther away the right side is than the left,
-    and the lower side than the upper."""
+    """Describe how a view shows the board by five numbers, (5,): x and y of the corners' centre and
+    the size of the board, relative to the image, and two tilts. The tilts say how much farther away
+    the right side is than the left one, and the lower side than the upper one."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
     squares = view.corners_m[:, :2] / board.square_m
@@ -141,23 +142,23 @@ def view_signature(view: BoardView, board: Board) -> Array:
 
 
 def signature_distance(signature: Array, other: Array) -> float:
-    """Return the weighted distance of two view signatures (5,); a view farther than `NEW_BEYOND`
-    from all others is new."""
+    """Return the weighted distance between two view signatures (5,). A view is new if its distance
+    to all others exceeds `NEW_BEYOND`."""
     return float(np.abs(signature - other) @ _WEIGHTS)
 
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
-    """For each of `COVERAGE_AXES`, the spread of the view signatures over its goal, at most 1; skew
-    is the mean of both tilts."""
+    """For each of `COVERAGE_AXES`, the spread of the view signatures divided by the required
+    spread, at most 1. Skew is the mean of both tilts."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spreads = zip(COVERAGE_AXES, (x, y, size, sum(tilts) / 2.0), strict=True)
     return {axis: float(min(1.0, spread / GOALS[axis])) for axis, spread in spreads}
 
 
 def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
-    """The bar of each of `COVERAGE_AXES`. Those of the positions and the size reach from the least
-    to the most in the view signatures, in shares of the image, so a gap shows what is missing.
-    That of the skew is its share of the goal."""
+    """The bar for each of `COVERAGE_AXES`. The bars for positions and size reach from the smallest
+    to the largest value in the view signatures, as fractions of the image, so that a gap shows what
+    is missing. The bar for the skew is its share of the required spread."""
     shares = covered_shares(signatures)
     reach = dict.fromkeys(COVERAGE_AXES, (0.0, 0.0))
     if signatures:
@@ -173,7 +174,7 @@ def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
 # --- Guided capture ---
 
 
-_STILL_SHARE = 1.5 / 640.0  # share of the width, between two frames
+_STILL_SHARE = 1.5 / 640.0  # largest motion between two still frames, in image widths
 _BLUR_SHARE = 2.5 / 640.0
 _UNSEEN_EVERY = 15
 """One in this many frames without the board is kept, to find out which board they show."""
@@ -196,9 +197,9 @@ def capture_views(
     stopped: Callable[[], bool] = lambda: False,
 ) -> FoundViews:
     """Collect new, sharp, still views of the board from a video or live camera, until they vary
-    enough, the source ends, or `stopped` returns True. `show` is called on each frame.
+    enough, the source ends, or `stopped` returns True. `show` is called for each frame.
 
-    Raises TimedOut: the camera is lost before there are `MIN_VIEWS` views.
+    Raises TimedOut if the camera is lost before there are `MIN_VIEWS` views.
     """
     capture = GuidedCapture(board, source.live)
     unseen: list[Grey] = []
@@ -227,8 +228,8 @@ def capture_views(
 
 
 class GuidedCapture:
-    """State of a guided capture: the views `taken`, `advice` on the next view (with a recording,
-    the result of the frame), and `counts` of the results of all frames."""
+    """State of a guided capture: the views `taken`, `advice` on the next view (for a recording, the
+    result of the current frame), and `counts`, the results of all frames."""
 
     def __init__(self, board: Board, live: bool = True) -> None:
         self._board = board
@@ -249,7 +250,7 @@ class GuidedCapture:
         self._count("repeated")
 
     def update(self, view_or_reason: BoardView | str) -> bool:
-        """Process the next image: extract its view of the board, or determine why there is none.
+        """Process the next image: extract its view of the board, or find out why there is none.
 
         Return True if the view was taken because it is new, sharp and still.
         """
@@ -312,8 +313,8 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """Return how to move or tilt the board next, in directions of the image: towards what the
-    view `signatures` cover least."""
+    """Return how to move or tilt the board next, towards what the view `signatures` cover least.
+    Directions are those in the image."""
     done = covered_shares(signatures)
     least = min(COVERAGE_AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
@@ -322,8 +323,8 @@ def next_advice(signatures: Sequence[Array]) -> str:
 
 
 def axis_advice(signatures: Sequence[Array], axis: str) -> str:
-    """Return how to move or tilt the board so that the view signatures, at least one, spread more
-    along one of `COVERAGE_AXES`."""
+    """Return how to move or tilt the board so that the view signatures (at least one) spread more
+    widely along one of `COVERAGE_AXES`."""
     k = COVERAGE_AXES.index(axis)
     if axis == "skew":
         across, down = np.ptp(signatures, axis=0)[3:]

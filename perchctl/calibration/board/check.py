@@ -1,16 +1,17 @@
 """Check an existing calibration against new images.
 
-The camera of the file, with only the poses of the boards fitted, is compared with a camera fitted
-to the new views. Its reprojection error reveals a wrong lens. The poses absorb a wrong focal
-length, however, so the target positions that follow from the two cameras are compared as well. The
-check fails
+The camera in the file, for which only the board poses are fitted, is compared with a camera that is
+fully fitted to the new views. The reprojection error of the former reveals a wrong lens. The poses
+can absorb a wrong focal length, however, so the target positions that follow from the two cameras
+are compared as well. The check fails
 
-- when the file's RMS is more than twice that of the free camera and above 0.3 px, or
-- when these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
-  distance) and by more than the 95 % bound of the new images.
+- if the RMS error of the camera in the file is more than twice that of the fitted camera and above
+  0.3 px, or
+- if these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
+  distance) and by more than the 95 % uncertainty of the fitted camera.
 
-If the 95 % bound of the new images is above twice the limit, the images are not accurate enough,
-and the check is refused.
+If that 95 % uncertainty is above twice the limit, the new images are not accurate enough, and the
+check is refused.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Deviation:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Verdict on a calibration by new images, and its `reason`.
+    """Verdict on a calibration, based on new images, and the `reason` for it.
 
     rms_px: reprojection error of the checked camera (infinite if boards are out of its view);
     best_rms_px: error of the camera refitted to the images; rejections: outliers left out.

@@ -23,7 +23,7 @@ _HASH_BYTES = 6
 """Length of an image's hash, bytes. With a shorter one, the probability that two of a thousand
 images have the same hash by chance would exceed 1 in 10^8."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-# an exhaustive search would take a second in an image without a board
+# no exhaustive search, because it takes a second in an image without a board
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
@@ -38,8 +38,8 @@ class BoardView:
         corners_m: corner positions on the board, z = 0, (n, 3).
         corners_px: corner positions in the image, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
-        legacy: the layout that was seen, as in `perchctl.target.Board`.
-        picture_hash: equal for images of the same pixels, whatever their file; empty if unknown.
+        legacy: which layout was detected, as in `perchctl.target.Board`.
+        picture_hash: equal for images with the same pixels, whatever their files; empty if unknown.
     """
 
     name: str
@@ -66,7 +66,8 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A rejected view, by name, or rejected corners of the view, if `corner_ids` has any."""
+    """A rejected view, given by name or, if `corner_ids` is not empty, the rejected corners of a
+    view."""
 
     view: str
     reason: str
@@ -75,16 +76,17 @@ class Rejection:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames of a video or a camera were examined, and why some of them gave no view.
+    """How many frames from a video or a camera were examined, and why some of them gave no view.
 
     Attributes:
         live: a camera, whose user can be asked to hold still; otherwise a recording.
         taken: frames that became views.
-        without_board: frames without a board, or with too little of it.
-        moved: the board moved by more than `still_px` from the frame before, or was not in it.
-        blurred: too blurred for the corners to be found.
-        alike: similar to a view that was already taken.
-        repeated: frames that the source gave twice.
+        without_board: frames that show no board, or too little of it.
+        moved: frames in which the board had moved by more than `still_px` since the previous frame,
+            or whose previous frame did not show it.
+        blurred: frames too blurred for the corners to be found.
+        alike: frames similar to a view that was already taken.
+        repeated: frames that the source delivered twice.
     """
 
     live: bool
@@ -103,7 +105,7 @@ class FrameCounts:
 
     @property
     def text(self) -> str:
-        """The results of the frames, in words."""
+        """The counts in words."""
         reasons = (
             (self.taken, "taken"),
             (self.moved, f"moved by more than {self.still_px:.2g} px since the previous frame"),
@@ -116,8 +118,8 @@ class FrameCounts:
 
     @property
     def advice(self) -> str:
-        """Advice on how to get more views; empty if the board only needs to be shown, or shown in
-        another place."""
+        """Advice on how to get more views; empty if it is enough to show the board, or to move it
+        elsewhere."""
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
@@ -134,9 +136,9 @@ class FoundViews:
 
     Attributes:
         without_board: images without a board, each with the reason.
-        frames: the results of a video's or camera's frames; None for images.
-        other_board: if there are no views, the board that the images show instead; empty without
-            one.
+        frames: the counts of frames from a video or camera; None for image files.
+        other_board: if there are no views, the board that the images show instead; empty if there
+            is none.
     """
 
     views: tuple[BoardView, ...]
@@ -145,7 +147,7 @@ class FoundViews:
     other_board: str = ""
 
     def layout_of(self, board: Board) -> Board:
-        """The named board, in the layout that was seen."""
+        """The named board, with the layout that was detected."""
         return replace(board, legacy=self.views[0].legacy) if self.views else board
 
 
@@ -185,10 +187,10 @@ layout."""
 
 
 def _charuco(image: Grey, board: Board) -> _Corners | str:
-    """The corners of a ChArUco board in either layout, or why there are none.
+    """Return the corners of a ChArUco board in either layout, or the reason why there are none.
 
-    The two layouts of a board have the same corners, but their markers are in other squares. With
-    the wrong layout no corner is found, since neighbouring markers contradict each other.
+    The two layouts of a board have the same corners, but their markers are in different squares.
+    With the wrong layout no corner is found, since neighbouring markers contradict each other.
     """
     numbers, corners, markers = charuco_corners(image, board)
     # The right layout gives more corners than markers, unless only little of the board is visible.
@@ -214,8 +216,7 @@ def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array,
     finding.minMarkerPerimeterRate = 0.01
     finding.minDistanceToBorder = 0
     detector.setDetectorParameters(finding)
-    # Markers that were missed at first are searched for where the board has them: this yields far
-    # more corners.
+    # Search for missed markers where the board must have them, which yields far more corners.
     completing = detector.getCharucoParameters()
     completing.tryRefineMarkers = True
     detector.setCharucoParameters(completing)
@@ -237,8 +238,8 @@ def _chessboard(image: Grey, board: Board) -> _Corners | str:
 
 
 def _without_board(image: Grey) -> str:
-    """Return why an image shows no board. It may show the perching target instead, which the user
-    also has at hand."""
+    """Return why no board was found in an image. It may show the perching target instead, which is
+    a likely mistake."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
@@ -256,7 +257,7 @@ def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
 
 
 def _local_axes(cells: Array, corners: Array) -> Array:
-    """Return the two sides of a square at each corner, the columns of (n, 2, 2), px.
+    """Return the two sides of a square at each corner, as the columns of (n, 2, 2), px.
 
     They are the derivative of the homography, which smooths out single bad corners.
     """
@@ -310,13 +311,13 @@ def fit_saddles(
     Args:
         image: grey image (h, w).
         corners_px: first guess, good to a fifth of a square, (n, 2).
-        axes_px: in the image, the vectors from each corner to its two neighbours on the board,
-            as the columns of (n, 2, 2).
+        axes_px: the vectors in the image from each corner to its two neighbours on the board, as
+            the columns of (n, 2, 2).
         white_rim: width of the blank rim of the white squares, in squares (1: no markers inside).
     """
     start = np.asarray(corners_px, dtype=np.float64)
     area = np.abs(np.linalg.det(axes_px))
-    # The smaller height of the parallelogram that a square forms.
+    # The smaller of the two heights of the parallelogram that a square forms in the image.
     size_px = np.maximum(area / np.linalg.norm(axes_px, axis=1).max(axis=1), 1e-6)
     reach = np.clip(REACH, MIN_REACH_PX / size_px, MAX_REACH_PX / size_px)
     t = np.linspace(-1.0, 1.0, WINDOW_SAMPLES)
@@ -352,7 +353,7 @@ def fit_saddles(
 
 
 def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The grey levels (n, m) at places (n, m, 2), and which of these are in the image."""
+    """Return the grey levels (n, m) at places (n, m, 2), and which of these are in the image."""
     h, w = image.shape
     inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)
@@ -361,7 +362,8 @@ def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.
 
 
 def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
-    """Return 0 at what is printed in the white squares and in its blur, otherwise 1, (n, m)."""
+    """Return 0 where there is print inside the white squares, including its blur, and 1 elsewhere,
+    (n, m)."""
     if white >= REACH:
         return np.ones(grey.shape)
     positive = uv[..., 0] * uv[..., 1] > 0.0

@@ -2,9 +2,10 @@
 
 The solved pose absorbs a part of a wrong calibration. The error at the target is therefore not the
 error of the ray times the distance, but the change of the solved position. For a target at some
-place, let J be the derivative of its corners with respect to its pose, and L with respect to the
-lens. A lens error d then moves the solved pose by -(J'J)^-1 J'L d. The translation of this step is
-the error at the target's centre, and the covariance of the parameters gives its 95 % bound.
+place, let J be the derivative of its corners with respect to its pose, and L their derivative with
+respect to the lens parameters. A lens error d then moves the solved pose by -(J'J)^-1 J'L d. The
+translation of this step is the error at the target's centre, and the covariance of the parameters
+gives its 95 % bound.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ _LIMIT_FLOOR_MM = 1.0
 
 @dataclass(frozen=True)
 class ErrorAtRange:
-    """95 % bound of the target's position error at distance z_m.
+    """95 % bound on the target's position error at distance z_m.
 
-    mm95: largest over the part of the image that the calibration boards covered and that shows a
-    whole marker; axis_mm95: straight ahead.
+    mm95: the largest bound over the part of the image that the calibration boards covered and in
+    which a whole marker is visible; axis_mm95: the bound straight ahead.
     """
 
     z_m: float
@@ -72,7 +73,8 @@ def predict_errors(
         for place in _places(camera, z_m, covered):
             corners_m = _marker_m(camera, z_m)
             lens, pose = projection_derivatives(camera, np.concatenate([_FACING, place]), corners_m)
-            # The corners stay where they are, so the pose moves against the error of the lens.
+            # The corners in the image are fixed, so the pose changes to compensate for the lens
+            # error.
             moved = np.linalg.lstsq(pose, lens, rcond=None)[0][3:]
             lines_mm.append(1e3 * SIGMAS_95 * np.sqrt(np.trace(moved @ covariance @ moved.T)))
         result.append(ErrorAtRange(z_m, float(max(lines_mm)), float(lines_mm[0])))
@@ -82,10 +84,10 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Return the position errors (n,) that result from evaluating images of a target that were
-    taken with the camera `truth` by the model `camera` (inf if out of its view). The n targets at
-    distance z_m lie on a grid within the `covered` cells of the image (None: all); the first is
-    on the axis."""
+    """Return the position errors (n,) that result if images of a target are taken with the camera
+    `truth` but evaluated with the model `camera` (inf if the target is outside its field of view).
+    The n targets at distance z_m lie on a grid within the `covered` cells of the image (None: all);
+    the first is on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
     views = [

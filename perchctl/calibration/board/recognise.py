@@ -45,8 +45,8 @@ _GRID_FLAGS = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
-    """Return the board in the grey images and its notation; empty if none is clearly visible, or
-    if it is the board that was named."""
+    """Describe the board in the grey images and give its notation; empty if no board is clearly
+    visible, or if it is the board that was named."""
     images = [_small(picture) for picture in pictures[:MOST_PICTURES]]
     if not images:
         return ""

@@ -1,9 +1,9 @@
-"""The report of a calibration: what the views cover, how well the camera model fits them, and what
+"""The report on a calibration: what the views cover, how well the camera model fits them, and what
 to add.
 
-A residual is the found corner minus the corner that the camera model predicts. Residuals in random
-directions come from image noise. If neighbouring residuals point in the same direction in many
-views, the model does not describe the lens, or the board is not flat.
+A residual is the detected corner position minus the one that the camera model predicts. Residuals
+in random directions come from image noise. If neighbouring residuals point in the same direction in
+many views, the model does not describe the lens, or the board is not flat.
 """
 
 from __future__ import annotations
@@ -47,14 +47,15 @@ _STEPS = (1.0, 2.0, 5.0)
 
 @dataclass(frozen=True, eq=False)
 class ReportedView:
-    """One view that the camera was computed from.
+    """One view used to compute the camera model.
 
     Attributes:
         outline_px: the convex hull of its corners, (n, 2).
-        predicted_px, residuals_px: its corners by the camera model, and the found ones minus those.
-        distance_m: of the board's middle from the camera.
-        tilt_deg: between the board and the image plane.
-        facing: unit vector (2,) in the image, right and down, of the side that the board faces.
+        predicted_px, residuals_px: its corners according to the camera model, and the detected
+            corners minus those.
+        distance_m: distance of the board's centre from the camera.
+        tilt_deg: angle between the board and the image plane.
+        facing: unit vector (2,) in the image (right, down) towards the side that the board faces.
         rejected_corners: number of corners that were rejected as outliers.
     """
 
@@ -75,11 +76,11 @@ class ReportedView:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """What the page of a calibration shows.
+    """The content of a calibration's report page.
 
     Attributes:
-        name: of the calibration file.
-        date: in ISO 8601, UTC.
+        name: name of the calibration file.
+        date: date and time in ISO 8601, UTC.
     """
 
     result: Calibration
@@ -128,7 +129,7 @@ class CalibrationReport:
 
     @property
     def bars(self) -> dict[str, tuple[GuidanceBar, float]]:
-        """The bars of the capture, each with its share of the goal."""
+        """The coverage bars, as during the capture, each with its share of the goal."""
         shares = covered_shares(self._signatures)
         return {axis: (bar, shares[axis]) for axis, bar in coverage_bars(self._signatures).items()}
 
@@ -175,18 +176,19 @@ class CalibrationReport:
 
     @property
     def key_px(self) -> float:
-        """A round residual that is drawn as the key, about as long as a long one."""
+        """Length of the scale arrow in the drawing: a round number of px, close to the longest
+        residuals."""
         return round_down(_LONG_SHARE * self.result.camera.size_px[0] / self.enlargement)
 
     @property
     def largest_px(self) -> float:
-        """The longest residual."""
+        """Length of the longest residual."""
         return float(np.linalg.norm(np.concatenate(self.result.fit.residuals), axis=1).max())
 
     @property
     def uncovered_boxes_px(self) -> list[tuple[float, float, float, float]]:
-        """Left, top, width and height of the parts of the image that no board covered: the runs
-        of empty cells in each row of the grid."""
+        """Left, top, width and height of each part of the image that no board covered. Adjacent
+        empty cells in a row of the grid are combined."""
         w, h = self.result.camera.size_px
         rows, columns = CELLS
         boxes = []
@@ -199,22 +201,22 @@ class CalibrationReport:
 
     @property
     def distance_ticks_m(self) -> list[float]:
-        """Round distances from 0 to beyond the farthest view."""
+        """Axis ticks at round distances, from 0 to beyond the farthest view."""
         farthest_m = max(view.distance_m for view in self.views)
         step_m = round_down(farthest_m / _LEAST_STEPS)
         return [step_m * k for k in range(int(np.ceil(farthest_m / step_m)) + 1)]
 
     @property
     def parameters(self) -> list[tuple[str, float, float]]:
-        """Name, value and standard deviation of focal length and centre, px."""
+        """Name, value and standard deviation of each focal length and centre coordinate, px."""
         names, result = ("fx", "fy", "cx", "cy"), self.result
         values, std = result.fit.parameters.tolist(), result.parameter_std.tolist()
         return list(zip(names, values[:4], std[:4], strict=True))
 
 
 def calibration_report(result: Calibration, name: str, date: str) -> str:
-    """The report of a calibration as one self-contained HTML page; `name` is the calibration
-    file's, and `date` is in ISO 8601."""
+    """The report on a calibration as a self-contained HTML page. `name` is the name of the
+    calibration file; `date` is in ISO 8601."""
     return render_template(
         "perchctl.calibration",
         "calibration.html",

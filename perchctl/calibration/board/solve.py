@@ -40,7 +40,7 @@ TITLES: dict[Level, str] = {
 }
 CARE_FACTOR = 3.0
 ASIDE_FACTOR = 2.0
-_EASIER = 0.95  # largest share of the simpler model's spread that a richer model may leave
+_EASIER = 0.95  # a richer model is used only if it reduces the spread at least to this share
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,11 @@ class Calibration:
         covariance: covariance (p, p) of the p lens parameters.
         views: the views used, without rejected corners.
         without_board: images without a board, and why.
-        errors: predicted position error of the target, by distance.
+        errors: predicted position error of the target at each distance.
         covered_cells: mask (rows, columns) of the image's grid cells that boards covered.
-        defects: sentences about defects of the views, with remedies; any defect rules out the best
-            verdict.
-        frames: the results of a video's or camera's frames; None for images.
+        defects: sentences about shortcomings of the views, with remedies; any of them rules out the
+            best verdict.
+        frames: the counts of frames from a video or camera; None for image files.
     """
 
     board: str
@@ -82,8 +82,8 @@ class Calibration:
 
     @property
     def verdict(self) -> Level:
-        """The verdict, from the defects and the predicted error straight ahead, where perching
-        happens. Off the axis, twice the limit is accepted."""
+        """The verdict, based on the defects and on the predicted error straight ahead, where the
+        target is during a perch. Off the axis, twice the limit is accepted."""
         ahead = max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.defects:
@@ -176,12 +176,12 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
     """Fit the camera without outliers, and predict the position error at the target.
 
     Args:
-        board: notation of the board, for the file.
-        model: ``plumb_bob`` or ``fisheye``; ``auto`` for the simplest one that follows the lens.
+        board: notation of the board, to be written to the file.
+        model: ``plumb_bob`` or ``fisheye``; ``auto`` for the simplest one that describes the lens.
 
     Raises:
-        InvalidValue: too few views, all frontal, most of the image empty, focal length
-        not fixed, or too many views that fit no camera.
+        InvalidValue: there are too few views, all views are frontal, most of the image is empty,
+            the views do not determine the focal length, or too many views fit no camera.
     """
     _check_count(found.views, found)
     models = MODEL_NAMES if model == "auto" else (model,)
@@ -244,7 +244,7 @@ def _is_usable(camera: CameraModel) -> bool:
     return bool(np.abs(again - pixels).max() < 0.05)
 
 
-# --- Whether the views are enough for a calibration and, if not, what to add ---
+# --- Check that the views are enough for a calibration and, if not, say what to add ---
 
 
 MIN_VIEWS, GOOD_VIEWS = 5, 10
@@ -260,7 +260,7 @@ _NAMES = (
 
 
 def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
-    """Raises InvalidValue if the usable `views` are too few."""
+    """Raise InvalidValue if there are too few usable `views`."""
     if len(views) >= MIN_VIEWS:
         return
     missing = MIN_VIEWS - len(views)
@@ -283,7 +283,7 @@ def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
 
 
 def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
-    """Raises InvalidValue if all views are frontal or most of the image is empty."""
+    """Raise InvalidValue if all views are frontal or most of the image is empty."""
     tilts = tilts_deg(fit.poses)
     tilted = int((tilts >= MIN_TILT_DEG).sum())
     if tilted < MIN_TILTED:
@@ -325,7 +325,7 @@ def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
 
 
 def tilts_deg(poses: Array) -> Array:
-    """The tilts (v,) of boards against the image plane, from their poses (v, 6)."""
+    """The angles (v,) between the boards and the image plane, from the boards' poses (v, 6)."""
     normals = np.array([cv2.Rodrigues(pose[:3])[0][2, 2] for pose in poses])
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 

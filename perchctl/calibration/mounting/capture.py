@@ -50,7 +50,8 @@ def record_mounting(
         problem: returns the vehicle's problem at a time, or None.
 
     Raises:
-        TimedOut: camera or vehicle are lost; the recording keeps the data until then.
+        TimedOut: the camera or the vehicle is lost; the recording contains the data up to that
+            time.
         InvalidValue: the image is mirrored.
     """
     oldest_s = clock() - BEFORE_S

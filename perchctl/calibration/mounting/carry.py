@@ -1,9 +1,10 @@
-"""The carry: find the camera's rotation and latency from the rotations of vehicle and target.
+"""The carry: find the camera's rotation and latency while the vehicle is turned by hand.
 
 One rotation chain holds at each image's exposure: ``R_cam_target = R_body_cam^T R_world_body(t -
-latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body, in the world that
-is the body frame at the first sample. The solution contains the rotations of camera and target, the
-latency, the bias and scale error of the gyroscope, and a random walk of the integrated rotation.
+latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body, where the world
+frame is the body frame at the first sample. The solution contains the rotations of camera and
+target, the latency, the bias and scale error of the gyroscope, and a random walk of the integrated
+rotation.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ LATENCY, KNOTS = 12, 13
 
 @dataclass(frozen=True, eq=False)
 class RotationSolution:
-    """Camera rotation and latency from the carry recording; value +- 1.96 sigma is a 95 % interval.
+    """Camera rotation and latency from a carry recording; value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
         rotation_cov_rad2: covariance (3, 3) of a small rotation of R_body_cam in body axes.
-        latency_s: from exposure to the image's timestamp; positive if images are late.
+        latency_s: time from the exposure to the image's timestamp; positive if images are late.
     """
 
     R_body_cam: Array
@@ -122,7 +123,8 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
 
 
 def _known(knots_s: Array) -> Array:
-    """The prior information (p, p) on the sensor's errors and the knots' walk."""
+    """The prior information matrix (p, p) for the sensor's errors and the random walk of the
+    knots."""
     steps = np.diff(np.eye(len(knots_s)), axis=0)[:, 1:]
     steps /= GYRO_WALK_RAD * np.sqrt(np.diff(knots_s))[:, None]
     p = KNOTS + 3 * (len(knots_s) - 1)
@@ -136,7 +138,7 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """Return the target's rotation in the world, the middle one of all images."""
+    """Return the target's rotation in the world: the median of those from all images."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam
@@ -185,7 +187,7 @@ class GyroRotation:
     """The vehicle's rotation (n, 3, 3) at n times, integrated from its corrected rates (n, 3).
 
     `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the rotation vector, in world
-    axes, by the gyroscope's bias (rad/s) and scale error.
+    axes, with respect to the gyroscope's bias (rad/s) and scale error.
     """
 
     t_s: Array
@@ -196,9 +198,10 @@ class GyroRotation:
 
 
 def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) -> GyroRotation:
-    """Integrate the gyroscope (n, 3), corrected to rate = (gyro - bias) (1 + scale), both (3,).
+    """Integrate the gyroscope's rates (n, 3), corrected to rate = (gyro - bias) (1 + scale); bias
+    and scale are (3,).
 
-    The rate is taken as linear between samples; the method is of fourth order (Magnus).
+    The rate is assumed to be linear between samples; the method is of fourth order (Magnus).
     """
     unbiased = gyro_radps - bias_radps
     rate = unbiased * (1.0 + scale)
@@ -216,7 +219,8 @@ def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Arra
 
 
 def _integral(values: Array, dt: Array) -> Array:
-    """Return the integral (n, 3, 3) from the first sample on, by the trapezoid rule."""
+    """Return the integral (n, 3, 3) from the first sample to each sample, by the trapezoidal
+    rule."""
     steps = 0.5 * dt[:, :, None] * (values[1:] + values[:-1])
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
@@ -255,8 +259,8 @@ def _vectors(R: Array) -> Array:
 
 # --- The camera's rotation and latency without an initial guess ---
 # Between two images, the camera rotates by the same rotation as the body, expressed in its own
-# axes: ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid, the best
-# R_body_cam follows in closed form; the latency with the smallest misfit is used.
+# axes: ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency on a grid, the best
+# R_body_cam has a closed-form solution; the latency with the smallest misfit is used.
 
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
@@ -318,7 +322,7 @@ JACKKNIFE_BLOCKS = 15
 MOST_LEFT_OUT = 0.4
 _COUNTS_LITTLE = 0.2
 _JITTERS_S = 1e-3 * np.concatenate([np.arange(0.0, 12.0), np.geomspace(13.0, 30.0, 4)])
-_MEDIAN_OF_CHI2 = 2.366  # with three degrees of freedom
+_MEDIAN_OF_CHI2 = 2.366  # median of chi-squared with three degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,13 +343,14 @@ class PoseResiduals:
 
     @property
     def rejected_share(self) -> float:
-        """Return the share of the poses whose robust weight is nearly 0."""
+        """Return the share of poses whose robust weight is nearly 0."""
         return float((self.robust_weights < _COUNTS_LITTLE).mean())
 
     def normal_equations(
         self, poses: slice | NDArray[np.intp] = slice(None)
     ) -> tuple[Array, Array]:
-        """Return the information (p, p) and gradient (p,) of the poses with the indices `poses`."""
+        """Return the information matrix (p, p) and gradient (p,) for the poses with the indices
+        `poses`."""
         p = self.jacobian.shape[2]
         jacobian = self.jacobian[poses]
         weights = self.robust_weights[poses, None, None]
@@ -383,7 +388,7 @@ def weight_residuals(
     prior: Array,
     delay_jacobian: Array | None = None,
 ) -> PoseResiduals:
-    """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor.
+    """Weight the residuals of poses by their covariances (n, 3, 3) times an estimated factor.
 
     With `delay_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and
     added.

@@ -1,4 +1,4 @@
-"""The pivot: find the position of the gear's tip, which stands on one point while the vehicle is
+"""The pivot: find the position of the gear's tip, which stays on one point while the vehicle is
 tilted around it.
 
 The point c in the target's frame and the tip in the camera's frame are the same in every image:
@@ -28,15 +28,15 @@ MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
 """Size of a jump, m, and the share of the misfit that it must explain to count as a slip. If the
 tip stays in place, a jump explains 4 % at most."""
-TIP_SIGMA_FLOOR_M = 5e-5  # standard deviation of the tip on its point
+TIP_SIGMA_FLOOR_M = 5e-5  # smallest standard deviation of the tip on its point
 _PIVOT_ITERATIONS = 12  # iterations of the least squares for the tip; more: takes longer
-_SPLITS = 19  # moments at which a jump of the tip is tried; fewer: its moment may be missed
-_SLIP_ITERATIONS = 4  # iterations of the least squares for each moment; more: takes longer
+_SPLITS = 19  # number of times at which a slip of the tip is tested; fewer: a slip may be missed
+_SLIP_ITERATIONS = 4  # iterations of the least squares for each of these; more: takes longer
 
 
 @dataclass(frozen=True, eq=False)
 class PivotSolution:
-    """Gear tip from the pivot recording; value +- 1.96 sigma is a 95 % interval.
+    """Gear tip from a pivot recording; value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
         gear_cam_m: tip of the gear in the camera frame, (3,), with covariance_m2 (3, 3).
@@ -100,10 +100,10 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
 
 
 def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
-    """Raises InvalidValue if the tip jumped from one point to another at some moment.
+    """Raise InvalidValue if the tip slipped from one point to another during the recording.
 
-    Each of several moments throughout the recording is tried with one point before and another
-    point after it. The moment with the smallest robust misfit is used.
+    For each of several times throughout the recording, one point is fitted before it and another
+    point after it. The time with the smallest robust misfit is used.
     """
     n, alone = len(rows.misfit), _size(rows)
     explains, moved_m, at_s = 0.0, 0.0, 0.0
@@ -129,5 +129,5 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
 
 
 def _size(rows: PoseResiduals) -> float:
-    """Return the total size of all misfits, to which single outliers add little."""
+    """Return the total size of all misfits, in which single outliers count little."""
     return float(np.log1p(rows.chi2 / 3.0).mean())

@@ -1,5 +1,5 @@
-"""Recordings of poses and attitudes of a vehicle that is moved by hand: the required motion, and
-the file format (JSON lines).
+"""Recordings of poses and attitudes while a vehicle is moved by hand: the required motion, and the
+file format (JSON lines).
 
 Each part begins with a line ``{"part": "carry", ...}``. One line per sample follows, first all
 attitudes, then all poses. A file holds one part or both.
@@ -31,7 +31,8 @@ _POSE_SHAPES: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class AttitudeSample:
-    """The vehicle's estimated attitude at `t_s` on its own clock, right-handed (pitch nose down).
+    """The vehicle's estimated attitude at `t_s` on the vehicle's clock, right-handed (positive
+    pitch is nose down).
 
     gyro_radps (3,) is in body axes.
     """
@@ -47,8 +48,9 @@ class AttitudeSample:
 class TargetPose:
     """The target in the camera's frame.
 
-    `t_s` is the camera's timestamp, not corrected for latency. `covariance` (6, 6): a small
-    rotation in camera axes (rad, left of `rotation_cam_target`), then the position (m).
+    `t_s` is the camera's timestamp, not corrected for latency. `covariance` (6, 6) is that of a
+    small rotation in camera axes (rad, multiplied from the left to `rotation_cam_target`), then of
+    the position (m).
     """
 
     t_s: float
@@ -59,8 +61,8 @@ class TargetPose:
 
 @dataclass(eq=False)
 class MountingRecording:
-    """Recording of one part (carry or pivot), appended to while it runs. `mirrored_pictures` counts
-    the images with only a mirrored target."""
+    """Recording of one part (carry or pivot), to which data is appended while it runs.
+    `mirrored_pictures` counts the images that show only a mirrored target."""
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
@@ -84,11 +86,11 @@ class MountingRecording:
 
     @staticmethod
     def read(path: Path) -> list[MountingRecording]:
-        """The recordings of a file, in its order.
+        """Read the recordings in a file, in the file's order.
 
         Raises:
-            NotFound: no such file.
-            InvalidValue: not a file of `write`; names the bad line.
+            NotFound: there is no such file.
+            InvalidValue: the file was not written by `write`; names the invalid line.
         """
         try:
             text = path.read_text(encoding="utf-8")
@@ -125,7 +127,7 @@ class MountingRecording:
 
 
 def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
-    """A key's numbers, a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
+    """The numbers of a key, or a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{key} must hold {math.prod(shape)} numbers")
@@ -134,7 +136,7 @@ def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class PoseArrays:
-    """Poses by time: t_s (n,), R_cam_target (n, 3, 3), p_cam_target_m (n, 3), and their
+    """Poses in order of time: t_s (n,), R_cam_target (n, 3, 3), p_cam_target_m (n, 3), and their
     covariances cov (n, 6, 6), rotation first."""
 
     t_s: Array
@@ -144,7 +146,7 @@ class PoseArrays:
 
 
 def pose_arrays(recording: MountingRecording) -> PoseArrays:
-    """The poses of a recording as arrays, by time."""
+    """The poses of a recording as arrays, in order of time."""
     poses = sorted(recording.poses, key=lambda pose: pose.t_s)
     return PoseArrays(
         t_s=np.array([p.t_s for p in poses]),
@@ -176,7 +178,8 @@ MOST_LATE_S = 1.0
 
 
 def check_recording(recording: MountingRecording, part: MountingPart) -> None:
-    """Raises InvalidValue, with advice, unless the recording is of `part` and can be solved."""
+    """Raise InvalidValue, with advice, unless the recording is of the given `part` and can be
+    solved."""
     attitudes = recording.attitudes
     poses = recording.poses
     if recording.part != part:

@@ -19,8 +19,8 @@ from perchctl.profile import Profile
 
 @dataclass(frozen=True, eq=False)
 class _Value:
-    """One measured number or three; `written` is the profile's, or None. Lines show them `scale`
-    times as large, in `unit`."""
+    """One or three measured numbers. `written` is the value in the profile, or None. For display,
+    numbers are multiplied by `scale`, in `unit`."""
 
     name: str
     key: str
@@ -74,8 +74,8 @@ class MountingReport:
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
     def new_profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """The measured values to write into the profile, by dotted key, without the latency
-        if the profile leaves it to be measured in each flight."""
+        """The measured values to write into the profile, by dotted key. The latency is left out if
+        the profile says that it is measured in each flight."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.rotation is not None:
             values["camera.mount.rpy_deg"] = _rounded(self.rotation.rpy_deg, 2)
@@ -111,8 +111,8 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """The JSON object of `calibrate mount`: measured values, sigmas, the profile's
-        values, and its new ones."""
+        """The JSON object of `calibrate mount`: measured values, sigmas, and the old and new values
+        in the profile."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
             "sigma": {v.key: v.sigma.tolist() for v in values},
