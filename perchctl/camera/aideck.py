@@ -4,10 +4,11 @@ frame.
 HOST is 192.168.4.1 if the deck is its own access point. The deck's GAP8 must run Bitcraze's example
 `wifi-img-streamer`, which sends raw or JPEG images of 324x244.
 
-The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then one
-byte of routing, one of function, and the data. An image is a packet with its header, ``<BHHBBI``:
-magic 0xBC, width, height, depth, format, size; then packets of chunks until `size` bytes have come.
-(cflib's own reader blocks forever if the deck disappears.)
+The stream consists of packets in Bitcraze's CPX format: 16 bits for the length of the rest of the
+packet, one byte for routing, one byte for the function, and the data. An image is sent as one
+packet with a header, ``<BHHBBI`` (magic 0xBC, width, height, depth, format, size), and further
+packets with the image data until `size` bytes have arrived. (cflib's own reader blocks forever if
+the deck disappears.)
 """
 
 from __future__ import annotations
@@ -32,8 +33,7 @@ MAX_PACKET_BYTES = 1022
 """Largest packet length, bytes: the size of the deck's buffers (its MTU)."""
 MOST_SIDE_PX = 1024
 
-# A small buffer, because data that waits while the reader stalls gets a late time stamp when it is
-# read.
+# A small buffer: data that waits in it while the reader stalls gets too late a time stamp.
 _RECEIVE_BYTES = 131072
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
@@ -44,7 +44,7 @@ _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 
 @dataclass
 class _Picture:
-    """A partly received image: the content of its header, and the `data` so far.
+    """A partly received image: the content of its header, and the `data` received so far.
 
     `began_s` is the arrival time of its first byte.
     """
@@ -57,8 +57,8 @@ class _Picture:
     data: bytearray
 
     def decode(self) -> tuple[NDArray[np.uint8], bytes | None] | str:
-        """Return the grey image (h, w), and its JPEG if it was sent as one; or the reason why it
-        cannot be used. Bytes after the end of a JPEG are padding."""
+        """Return the grey image (h, w), and its JPEG if it was sent as a JPEG; or return the reason
+        why it cannot be used. Bytes after the end of a JPEG are padding."""
         shape, data = (self.height, self.width), bytes(self.data)
         if not self.is_jpeg:
             if len(data) != self.size:
@@ -82,10 +82,10 @@ class _Picture:
 class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG images.
 
-    An image's time is its first byte's arrival minus `latency_s`, as the deck sends the header on
-    exposure; the transfer takes 60 ms and more for a raw image. Its arrival time is that of
-    the last byte. Incomplete images are dropped; an invalid packet ends the connection, and the
-    source reconnects.
+    An image's time is the arrival time of its first byte minus `latency_s`, because the deck sends
+    the header at the exposure; the transfer of a raw image takes 60 ms or more. Its arrival time is
+    that of the last byte. Incomplete images are dropped; an invalid packet ends the connection, and
+    the source reconnects.
     """
 
     unreached_advice = (

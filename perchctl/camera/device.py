@@ -1,4 +1,5 @@
-"""Cameras of this computer: ``camera:N`` is /dev/videoN, read by a thread through OpenCV."""
+"""Cameras connected to this computer: ``camera:N`` is /dev/videoN, read by a thread through
+OpenCV."""
 
 from __future__ import annotations
 
@@ -65,10 +66,11 @@ def configure_capture(
 
 
 class DeviceSource(LiveSource):
-    """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
+    """A camera connected to this computer. Only the newest frame is kept; its time stamp is the
+    time at which the grab returns.
 
-    Bad images are dropped. After `LOST_AFTER_FAILURES` bad images in succession, the camera counts
-    as lost: it is released, and reopened once it is available again. `opener` returns a
+    Bad images are dropped. After `LOST_AFTER_FAILURES` successive bad images, the camera counts as
+    lost: it is released, and reopened once it is available again. `opener` returns a
     cv2.VideoCapture.
     """
 
@@ -112,7 +114,7 @@ class DeviceSource(LiveSource):
             capture.release()
 
 
-# --- The cameras of this computer: their numbers, names and permanent paths
+# --- The connected cameras: their numbers, names and permanent paths
 
 
 DEVICES = Path("/dev")
@@ -121,7 +123,7 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """A camera of this computer.
+    """A camera connected to this computer.
 
     `stable_path`: a link that does not depend on the USB port, or empty; `problem`: why the camera
     cannot be opened, or empty.
@@ -139,8 +141,9 @@ class ConnectedCamera:
 
 
 def find_cameras() -> list[ConnectedCamera]:
-    """Return this computer's cameras in order of number. Nothing is opened. Errors: NotFound if
-    none is known: the computer has none, or its system does not list them as Linux does."""
+    """Return the connected cameras in order of number. Nothing is opened. Errors: NotFound if none
+    is found, because there is none, or because the operating system does not list cameras as Linux
+    does."""
     if cameras := _known_cameras(DEVICES, NAMES):
         return cameras
     raise _no_camera()
@@ -155,7 +158,8 @@ def _no_camera() -> NotFound:
 
 
 def _known_cameras(devices: Path, names: Path) -> list[ConnectedCamera]:
-    """List each camera once, with its first video node, since the others often give no images."""
+    """List each camera once, with its first video node, since its other nodes often deliver no
+    images."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):
@@ -183,8 +187,8 @@ def _of_system(number: int, attribute: str, names: Path) -> str:
 
 
 def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> int:
-    """Return the number of the camera that the text after ``camera:`` names. The text is a number,
-    a name or part of a name (quotes and case do not matter), or a device path.
+    """Return the number of the camera named by the text after ``camera:``. The text is a number, a
+    name or part of a name (quotes and case do not matter), or a device path.
 
     Errors: InvalidValue if several cameras match; NotFound.
     """

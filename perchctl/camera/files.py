@@ -24,8 +24,8 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 class RecordedSource:
     """Base of the recorded sources; `_read` returns the next image and its time, or None.
 
-    `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
-    the files of images, in the order of their frames' indices; empty for a video.
+    `rate_hz` is the nominal frame rate; `count` is the number of frames, or None if unknown.
+    `paths`: the image files, in the order of their frames' indices; empty for a video.
     """
 
     live = False
@@ -36,7 +36,7 @@ class RecordedSource:
         self._name = name
         self._latency_s = latency_s
         self._index = 0
-        # reads one image ahead, so that size and end are known in time
+        # one image ahead, so that the image size and the end are known before they are needed
         self._ahead = self._read()
         if self._ahead is None:
             raise InvalidValue(
@@ -50,7 +50,7 @@ class RecordedSource:
         return self._ahead is None
 
     def poll(self, now_s: float) -> Frame | None:
-        """Return the next frame, with the recording's own time; None at the end."""
+        """Return the next frame, with its time in the recording; None at the end."""
         if self._ahead is None:
             return None
         image, t_s = self._ahead
@@ -73,16 +73,16 @@ class RecordedSource:
 
 
 class VideoSource(RecordedSource):
-    """A video file. Times are those in the container if they increase; otherwise they follow from
-    the frame rate."""
+    """A video file. Frame times are those in the container if they increase; otherwise they are
+    computed from the frame rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
             raise NotFound(f"video file {without_password(str(path))} was not found")
-        # perchctl reports the error in one sentence, so OpenCV must not print anything
+        # perchctl reports errors itself, in one sentence, so OpenCV must not print anything
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        # keeps the sensor's grid, as with images
+        # do not rotate the image: calibration and mask refer to the sensor's pixels
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0
@@ -112,7 +112,7 @@ class VideoSource(RecordedSource):
 
 
 class ImagesSource(RecordedSource):
-    """The images of a folder or a glob, or those named one by one, in natural order (2
+    """The images in a folder, those that match a glob, or those in a list, in natural order (2
     before 10), at `rate_hz`."""
 
     def __init__(
@@ -156,8 +156,8 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
-    """Return the files in a folder, glob or list, without duplicates, in natural order. Raises
-    NotFound."""
+    """Return the files given by a folder, glob or list, without duplicates, in natural order.
+    Raises NotFound."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)
     folder = Path(where)

@@ -1,5 +1,5 @@
-"""Decide whether a frame can be used as a measurement, or is frozen, snow, uniform, dark or
-repeated."""
+"""Decide whether a frame can be used as a measurement, or whether it is frozen, snow, uniform, dark
+or repeated."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class FrameHealth:
         """Classify the next frame; only "ok" frames are measurements.
 
         Noise makes each live image differ from the last one, so identical bytes mean that the
-        receiver or the stream repeats an image. `Frame.repeated` frames count as repeated, too,
-        but not as frozen. In recordings (`live` False) identical images are accepted.
+        receiver or the stream repeats an image. Frames marked `Frame.repeated` count as repeated as
+        well, but not as frozen. In recordings (`live` is False), identical images are accepted.
         """
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):
@@ -84,8 +84,8 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 
 # --- Images that a receiver repeats because no new one has arrived ---
-# In a stream of 60 images a second, a receiver of 25 images a second repeats each two or three
-# times. A repetition is not a new measurement, and its time is that of the first copy.
+# If a receiver gets 25 images per second but outputs 60, it repeats each image two or three times.
+# A repetition is not a new measurement, and its time is that of the first copy.
 
 
 Grey = NDArray[np.uint8]

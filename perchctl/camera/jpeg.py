@@ -1,8 +1,8 @@
-"""The structure of a JPEG: its end, its declared size and its pixels; and the pixels of any
-image. Pure.
+"""Find the end and the declared size of a JPEG in a byte stream, and decode any image to pixels.
+Pure.
 
-Data from a radio may be damaged anywhere. Two wrong bytes that declare a size of 32000x32000 would
-cost a decoder gigabytes and minutes, so the size is checked before an image from a stream is
+Data from a radio may be damaged anywhere. If two wrong bytes declare a size of 32000x32000,
+decoding takes gigabytes and minutes, so the size is checked before an image from a stream is
 decoded.
 """
 
@@ -30,11 +30,11 @@ _FRAME_HEADER_CODES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
-    """The length of the JPEG at the start of `data`, and its width and height; None if it is
+    """Return the length of the JPEG at the start of `data`, and its width and height; None if it is
     incomplete.
 
-    For a damaged JPEG (a marker is missing, or another image begins) return the offset of the
-    damage, and (0, 0) as size.
+    For a damaged JPEG (a marker is missing, or another image begins), return the offset of the
+    damage, and (0, 0) as the size.
     """
     at, size_px, in_scan = 2, (0, 0), False
     while True:
@@ -65,16 +65,16 @@ def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | 
 class JpegSplitter:
     """Cuts a byte stream into whole JPEG images.
 
-    It follows the structure of the JPEGs, not the multipart headers, so wrong lengths and bad or
-    missing headers do no harm, and an image is complete with its last byte.
+    It follows the structure of the JPEGs, not the multipart headers. Wrong lengths and bad or
+    missing headers therefore do no harm, and an image is complete as soon as its last byte arrives.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[bytes, tuple[int, int]]]:
-        """Append bytes; return the images completed by them, oldest first, each as JPEG bytes and
-        (width, height)."""
+        """Append bytes and return the images that they complete, oldest first, each as JPEG bytes
+        and (width, height)."""
         self._buffer += data
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
@@ -88,7 +88,7 @@ class JpegSplitter:
             end, size_px = extent
             if all(size_px):
                 pictures.append((bytes(self._buffer[:end]), size_px))
-            # The beginning of the next image may be what interrupted the structure of this one.
+            # The damage may be the beginning of the next image, so the search continues from there.
             del self._buffer[:end]
         else:
             del self._buffer[:-2]  # the next start marker may be cut in half here
@@ -96,7 +96,7 @@ class JpegSplitter:
         return pictures
 
     def _bound(self) -> None:
-        """Drop an image that exceeds the size limit without ending."""
+        """Drop the buffered image if it exceeds the size limit before its end has arrived."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
 
@@ -123,8 +123,8 @@ _TIFF_ORIENTATION = 274
 
 
 def _as_stored(data: bytes) -> bytes:
-    """Return a TIFF with its orientation tag set to 1, since OpenCV's reader rotates it in spite of
-    the flag; return any other image unchanged."""
+    """Return a TIFF with its orientation tag set to 1, since OpenCV's TIFF reader rotates the image
+    despite the flag to ignore that tag; return any other image unchanged."""
     order = _TIFF_BYTE_ORDER.get(bytes(data[:4]))
     if order is None:
         return data

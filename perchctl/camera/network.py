@@ -1,7 +1,7 @@
 """Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
 
-PyAV's mpjpeg reader is not used for Motion-JPEG: if no length precedes an image, the reader
-returns it only with the next one's first bytes, a whole period late.
+PyAV's mpjpeg reader is not used for Motion-JPEG: if no length precedes an image, the reader returns
+the image only when the next one begins, a whole period late.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    The source gives up at once if the server rejects name and password, which are sent only when
-    the camera asks for them (digest with MD5, or basic), and never to a redirected address. Proxy
-    settings are ignored.
+    The source gives up at once if the server rejects the user name and password. They are sent only
+    when the camera asks for them (digest with MD5, or basic), and never to a redirected address.
+    Proxy settings are ignored.
     """
 
     silent_advice = "close other programs that use it: many cameras serve only one at a time"
@@ -73,8 +73,8 @@ class MjpegSource(LiveSource):
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """Return the response. Credentials are sent once, when they are asked for, because cameras
-        lock out clients that repeat them."""
+        """Return the server's response. Credentials are sent only once, when the camera asks for
+        them, because cameras lock out clients that send them repeatedly."""
         opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
         response: HTTPResponse
         try:
@@ -90,8 +90,8 @@ class MjpegSource(LiveSource):
         return response
 
     def _answer(self, asked: str, request: Request) -> str | None:
-        """Return the Authorization header, with a digest if the camera accepts one, since basic
-        authentication reveals the password; None if the library knows none of the camera's
+        """Return the Authorization header: a digest if the camera accepts one, since basic
+        authentication reveals the password. None if the library supports none of the camera's
         digests."""
         digests = _DIGEST.split(asked)[1:]
         if not digests:
@@ -132,7 +132,7 @@ class MjpegSource(LiveSource):
 
 
 # --- RTSP, decoded by PyAV ---
-# Its open and read have timeouts and report why they failed, unlike those of OpenCV's FFmpeg.
+# PyAV's open and read have timeouts and report why they failed, unlike OpenCV's FFmpeg backend.
 
 
 MAX_DAMAGED = 100
@@ -142,7 +142,7 @@ CLOCK_SLOW = 0.02
 """Relative rate by which a camera's clock may run slow before its images seem to become older."""
 
 _OPTIONS = {
-    "rtsp_flags": "prefer_tcp",  # a lost packet costs every image up to the next whole one
+    "rtsp_flags": "prefer_tcp",  # by UDP, a lost packet spoils all images up to the next keyframe
     "fflags": "nobuffer",
     "flags": "low_delay",
     "max_delay": "0",
@@ -155,10 +155,10 @@ _OPTIONS = {
 
 
 class TransferDelay:
-    """Estimates an image's extra transfer time over the fastest image of the last 10 s.
+    """Estimates how much longer an image's transfer took than the fastest one in the last 10 s.
 
-    The delay is found from the camera's timestamps. Without it, images that arrive in a burst
-    after a radio stall would seem to be new.
+    The delay is computed from the camera's timestamps. Without it, old images that arrive in a
+    burst after a radio stall would seem to be new.
     """
 
     def __init__(self) -> None:
@@ -168,8 +168,8 @@ class TransferDelay:
         )  # arrival times with their transfer times `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
-        """The transfer time beyond the fastest image's, s; 0 without `camera_s`, the camera's
-        timestamp."""
+        """The transfer time in excess of the fastest image's, s; 0 if `camera_s`, the camera's
+        timestamp, is None."""
         if camera_s is None:
             return 0.0
         if camera_s < self._camera_s:
@@ -177,7 +177,7 @@ class TransferDelay:
         self._camera_s = camera_s
         way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
-            self._ways.pop()  # minimum over a window: none of these can become the minimum any more
+            self._ways.pop()  # sliding minimum: none of these can become the minimum any more
         self._ways.append((arrival_s, way_s))
         while self._ways[0][0] < arrival_s - DELAY_WINDOW_S:
             self._ways.popleft()
@@ -185,9 +185,9 @@ class TransferDelay:
 
 
 class RtspSource(LiveSource):
-    """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
+    """An RTSP stream with any codec that FFmpeg decodes, over TCP if the camera supports it.
 
-    The source gives up at once if the camera rejects name and password.
+    The source gives up at once if the camera rejects the user name and password.
     """
 
     connect_timeout_s = 5.0
@@ -209,7 +209,7 @@ class RtspSource(LiveSource):
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            # Not the whole text of the error, which contains the URL with its password.
+            # Leave out the error's text, because it contains the URL with the password.
             name = type(error).__name__
             reason = str(_REASONS.get(name) or getattr(error, "strerror", None) or name)
             if name in _FINAL:
@@ -217,7 +217,7 @@ class RtspSource(LiveSource):
             return reason
 
     def _read(self, stream: Any) -> str:
-        """Read one connection until it ends, and return why. Raises PyAV's errors."""
+        """Read from one connection until it ends, and return why it ended. Raises PyAV's errors."""
         import av.error
 
         if not stream.streams.video:
@@ -228,7 +228,8 @@ class RtspSource(LiveSource):
             return "the stream carries no video"
         self._connected()
         video = stream.streams.video[0]
-        # One thread per frame would delay the images by as many frames as there are threads.
+        # With one decoder thread per frame, images would be delayed by as many frames as there are
+        # threads.
         video.thread_type = "NONE"
         video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
         delay, damaged = TransferDelay(), 0

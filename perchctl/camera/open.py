@@ -44,7 +44,7 @@ FIRST_FRAME_WITHIN_S = 8.0
 @dataclass(frozen=True)
 class SourceName:
     """A parsed source text. `scheme`: one of `SCHEMES`; `place`: the text after the colon. `str()`
-    of it shows no password."""
+    leaves out the password."""
 
     scheme: str
     place: str
@@ -66,8 +66,8 @@ class SourceName:
 
     @property
     def device(self) -> str:
-        """Return the same text for all names of one camera of this computer: its number, its name
-        or a path. A camera that is not connected keeps its own text. Nothing is opened."""
+        """Return the same text for all names of a connected camera (its number, its name, or a
+        path). If the camera is not connected, return the given text. Nothing is opened."""
         if self.scheme != "camera":
             return str(self)
         try:
@@ -80,8 +80,8 @@ class SourceName:
 
 
 def parse_source(text: str) -> SourceName:
-    """The source of a text: a scheme in either case and its place, a bare path of video, image,
-    pattern or folder, or a camera of your own, ``my_module:MyCamera``. Nothing is opened.
+    """Parse a source text: a scheme (in upper or lower case) and a place, the bare path of a video,
+    image, pattern or folder, or a camera of your own, ``my_module:MyCamera``. Nothing is opened.
 
     Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
     that does not exist.
@@ -140,21 +140,24 @@ def open_camera(
     """Open any source and wait for its first frame.
 
     Args:
-        source: a text that `parse_source` takes, or image files one by one. ``sim:`` belongs
-            to the simulated vehicle, whose stream's address the caller gives instead. Of
-            ``my_module:MyCamera`` the class is called with `clock` and `config`.
-        clock: of the frames' times, s.
-        config: the profile's camera. Its latency is subtracted from the times of live frames, its
-            format and rate are requested from ``camera:``, and mirrored images are flipped back.
-        size_px: wanted width and height (requested of ``camera:`` only).
-        latency_s: from exposure to arrival, instead of the profile's (0 without one).
-        pictures_hz: images count as taken at this rate (``images:`` only; 30 by default).
-        timeout_s: timeout for the first frame of a live source, instead of the profile's.
+        source: a text for `parse_source`, or a list of image files. ``sim:`` is not allowed: the
+            caller passes the address of the simulated vehicle's stream instead. For
+            ``my_module:MyCamera``, the class is called with `clock` and `config`.
+        clock: the clock for the frames' times, s.
+        config: the profile's section `camera`. Its latency is subtracted from the times of live
+            frames, its format and rate are requested from a ``camera:`` source, and mirrored images
+            are flipped back.
+        size_px: width and height to request (``camera:`` only).
+        latency_s: time from exposure to arrival, instead of the one in `config` (0 without a
+            `config`).
+        pictures_hz: rate at which the images are assumed to have been taken (``images:`` only; 30
+            by default).
+        timeout_s: time limit for the first frame of a live source, instead of the profile's.
 
     Raises:
-        NotFound: there is no such camera, file or stream, or it cannot be reached. InvalidValue:
-            unknown
-        scheme, unreadable content. TimedOut: no first frame in time.
+        NotFound: there is no such camera, file or stream, or it cannot be reached.
+        InvalidValue: the scheme is unknown, or the content is unreadable.
+        TimedOut: no frame arrived in time.
     """
     if latency_s is None:
         latency_s = 0.0 if config is None else config.start_latency_s
@@ -200,8 +203,7 @@ def _live(
 
 
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:
-    """Wait for the first frame. If the source fails, closes it and raises its error, or
-    TimedOut."""
+    """Wait for the first frame. If the source fails, close it and raise its error, or TimedOut."""
     source.begin()
     if source.wait_first_frame(timeout_s):
         return source

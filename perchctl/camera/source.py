@@ -1,4 +1,4 @@
-"""The interface of all frame sources, and what live and recorded sources share."""
+"""The interface of all frame sources, and the code that live and recorded sources share."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ _SILENT = "connected, but it sends no data"
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A source of frames. Your own class is called with the loop's clock and the profile's section
-    `camera`; an error that it raises counts as a lost camera.
+    """A source of frames. Your own class is constructed with the loop's clock and the profile's
+    section `camera`. Any error that it raises counts as a lost camera.
 
-    A live source gives only the newest frame; its `t_s` is the arrival less
-    `config.start_latency_s`. A recorded source gives every frame once, at the pace it is polled,
-    with the times of the recording. perchctl converts colour to grey, and unmirrors frames.
+    A live source returns only the newest frame; its `t_s` is the arrival time minus
+    `config.start_latency_s`. A recorded source returns one frame per poll, in order, with the times
+    in the recording. perchctl converts colour to grey, and flips mirrored frames back.
     """
 
     @property
@@ -87,11 +87,11 @@ class FrameSource(Protocol):
         not block: a camera that blocks needs its own thread."""
 
     def problem(self, now_s: float) -> str | None:
-        """Return a sentence if the source does not work at `now_s`; otherwise None. For -inf, only
-        report a permanent failure. perchctl itself detects missing frames."""
+        """Return None if the source works at `now_s`, otherwise a sentence with the problem. If
+        `now_s` is -inf, report only a permanent failure. perchctl itself detects missing frames."""
 
     def describe(self) -> str:
-        """Name and size in a sentence: ``camera:0 (640x480 px)``."""
+        """Name and size as text: ``camera:0 (640x480 px)``."""
 
     def close(self) -> None: ...
 
@@ -112,7 +112,7 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
 
 
 def describe_error(error: Exception) -> str:
-    """Describe an unforeseen error by class and text, without passwords."""
+    """Describe an unforeseen error by its class and its text, without passwords."""
     if isinstance(error, URLError) and isinstance(error.reason, Exception):
         error = error.reason
     if isinstance(error, TimeoutError):
@@ -130,9 +130,9 @@ class LiveSource:
     is reopened after `reconnect_wait_s`, until `max_failures` connections in succession have
     brought no image.
 
-    The message of a source that gives no image names only causes that the source has observed:
-    whether it connected (`_connected`), whether anything came (`_note`), and whether images came
-    and were dropped (`_drop`).
+    If a source delivers no image, its message only names causes that the source has observed: it
+    did or did not connect (`_connected`), something other than an image arrived (`_note`), or
+    images arrived but were dropped (`_drop`).
     """
 
     live = True
@@ -152,7 +152,7 @@ class LiveSource:
         self._clock = clock
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._first = threading.Event()  # set by the first frame, or by failing before it
+        self._first = threading.Event()  # set by the first frame, or by a failure before it
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
@@ -183,7 +183,7 @@ class LiveSource:
         return None
 
     def no_first_frame(self, timeout_s: float) -> PerchError:
-        """The error of a source that has given no frame within `timeout_s`."""
+        """The error for a source that has delivered no frame within `timeout_s`."""
         finding, advice = self._finding_and_advice()
         late = f"{self._name}: no first frame within {timeout_s:g} s"
         found = f"{late}: {finding}" if finding else late
@@ -205,7 +205,8 @@ class LiveSource:
         self._thread.start()
 
     def wait_first_frame(self, timeout_s: float) -> bool:
-        """Wait for the first frame; False if the source fails or the time is over."""
+        """Wait for the first frame; return False if the source fails or the time limit is
+        exceeded."""
         self._first.wait(timeout_s)
         return self._arrived > 0
 
@@ -275,8 +276,8 @@ class LiveSource:
     ) -> None:
         """Keep an image that has arrived now.
 
-        `waited_s`: by how much its transfer was slower than usual. `began_s`: start of its arrival;
-        the latency counts from there. `encoded`: as in `Frame`.
+        `waited_s`: by how much its transfer took longer than usual. `began_s`: arrival time of its
+        first byte, from which the latency is subtracted. `encoded`: as in `Frame`.
         """
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
@@ -295,8 +296,8 @@ class LiveSource:
 
 
 class WrappedSource:
-    """Wrapper of a source. Each frame from the inner source is passed to `change`, which must not
-    raise and may return another frame instead. Everything else comes from the inner source."""
+    """Wrapper around a source. Each frame from the inner source is passed to `change`, which must
+    not raise an exception and may return another frame. Everything else is passed through."""
 
     def __init__(
         self, source: FrameSource, change: Callable[[Frame], Frame | None] = lambda frame: None
@@ -341,13 +342,13 @@ class GuardedSource:
         self._source, self._name, self._clock = source, name, clock
         self._first: Frame | None = None
         self._newest_s, self._count = -math.inf, 0
-        self._empty_since_s: float | None = None  # first poll without a frame since the last frame
+        self._empty_since_s: float | None = None  # first poll without a frame since the last one
         self._failure: str | None = None
         self.live, self.size_px = bool(source.live), source.size_px
 
     def wait_first_frame(self, timeout_s: float) -> None:
-        """Wait for the first frame from a camera. Raises ConnectionFailed or TimedOut after closing
-        it."""
+        """Wait for a camera's first frame. If none arrives, close the camera and raise
+        ConnectionFailed or TimedOut."""
         end_s = time.monotonic() + timeout_s
         while self.live and (frame := self.poll(self._clock())) is None:
             if self._failure is None and time.monotonic() <= end_s:
@@ -411,7 +412,7 @@ class GuardedSource:
 
 
 def mirrored_problem(config: CameraConfig) -> Problem:
-    """Return the problem that the image is mirrored, with advice on the profile's `config`."""
+    """Return the message that the image is mirrored, with advice that depends on the `config`."""
     advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror it, so remove camera.mirrored from the profile"
@@ -436,7 +437,7 @@ _SECRET = re.compile(
 
 def without_password(text: str) -> str:
     """Return the text without user names and passwords in URLs, and without the values of
-    ``password=`` and similar keys. If in doubt, too much is removed."""
+    ``password=`` and similar keys. In doubt, more is removed rather than less."""
     if start := _URL.match(text):  # treat all of it as one URL, including spaces in the password
         text = start.group() + _without_name(text[start.end() :])
     else:
@@ -453,8 +454,8 @@ def _without_name(rest: str) -> str:
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Return all keys of the profile for JSON, with passwords removed. A profile read back from it
-    cannot open a camera that needs a password."""
+    """Return all keys of the profile for JSON, with passwords removed. A profile that is read back
+    from this record cannot open a camera that needs a password."""
     record = profile.model_dump(mode="json")
     record["camera"]["source"] = without_password(profile.camera.source)
     return record | {"description": without_password(profile.description)}
