@@ -1,5 +1,5 @@
-"""Campaigns: fly many seeds in lockstep, in processes or on a cluster, and count and compare the
-outcomes."""
+"""Campaigns: fly many seeded flights in lockstep, in processes or on a cluster, and count and
+compare their outcomes."""
 
 import lazy_loader
 

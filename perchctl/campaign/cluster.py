@@ -1,6 +1,6 @@
-"""The workers of a dask cluster as an executor of flights, by dask's own executor.
+"""Run flights on the workers of a dask cluster, through dask's own executor.
 
-A flight on another computer has the same result only with the same program, libraries and data.
+A flight has the same result on another computer only if program, libraries and data are the same.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ names, is compared separately."""
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What each worker of a campaign must have; sent with each flight. `campaign_id` is unique;
-    `environment`: versions and hashes by name, which must be those of this computer."""
+    """What each worker of a campaign must have; sent with each flight. `campaign_id` is unique.
+    `environment` contains versions and hashes by name, which must equal those of this computer."""
 
     campaign_id: str
     profiles: tuple[Profile, ...]
@@ -56,8 +56,8 @@ class WorkerRequirements:
 
 
 def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return what a flight's result depends on, by name: versions of perchctl and its libraries,
-    hashes of the `profiles`, and the number of `threads`."""
+    """Return everything that a flight's result depends on, by name: versions of perchctl and its
+    libraries, hashes of the `profiles`, and the number of `threads`."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),
@@ -69,7 +69,7 @@ def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, s
 
 
 def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
-    """Return the requirements for a campaign that starts now."""
+    """Return the requirements for a campaign that is about to start."""
     state = flight_environment(profiles, threads=1)
     return WorkerRequirements(secrets.token_hex(16), tuple(profiles), state)
 
@@ -80,7 +80,7 @@ empty without any."""
 
 
 def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
-    """Run the pickled call of a flight, after verifying this worker once per campaign.
+    """Run a flight, given as a pickled call, after verifying this worker once per campaign.
 
     Errors: InvalidValue if the worker differs from `requirements`; the flight's own errors.
     """
@@ -105,9 +105,10 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
 
 
 class ClusterExecutor(Executor):
-    """An executor of flights on the workers of a dask cluster, which repeats the flights of a lost
-    worker. A future fails with an error of `lost` if its workers were lost too often, with
-    InvalidValue if its worker lacks the requirements; the scheduler's end cancels it."""
+    """An executor that flies on the workers of a dask cluster, and repeats the flights of a lost
+    worker. A future fails with an exception in `lost` if its workers were lost too often, and with
+    InvalidValue if its worker does not meet the requirements. It is cancelled if the scheduler
+    ends."""
 
     lost = (KilledWorker,)
 
@@ -157,7 +158,7 @@ def _connected(address: str) -> Client:
             f"no dask scheduler answers at {address} within {SCHEDULER_TIMEOUT_S:.0f} s "
             f"({type(error).__name__}): start a dask scheduler there, or correct the address"
         )
-    gc.collect()  # a client that did not connect is closed as long as its loop runs
+    gc.collect()  # close a client that did not connect while its event loop still runs
     raise problem
 
 

@@ -1,8 +1,9 @@
 """Fly the same seeds with several profiles, and find out which differences are significant.
 
-A figure's difference is the mean over the pairs of flights of one seed, with Student's interval;
-success is compared by the pairs in which only one of both succeeded (McNemar's exact test). The 5 %
-significance level applies to all questions together and is divided among them (Bonferroni).
+The two flights with the same seed form a pair. The difference in a figure is the mean over all
+pairs, with Student's interval. Success is compared by the pairs in which only one of the two
+flights succeeded (McNemar's exact test). The 5 % significance level applies to all questions
+together and is divided among them (Bonferroni).
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def fly_variants(
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
 ) -> list[FlightResult]:
-    """Fly each seed with all profiles, then the next seed; other parameters: see `fly_all`."""
+    """Fly each seed with all profiles before the next seed; for the other parameters, see
+    `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
@@ -51,7 +53,8 @@ def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResul
 def results_by_seed(
     results: Iterable[FlightResult], profile_count: int
 ) -> list[tuple[FlightResult, ...]]:
-    """Return, in order of seed, the results (by profile) of seeds flown with all profiles."""
+    """Return the results of all seeds that were flown with every profile, in order of seed; for
+    each seed, one result per profile."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
         by_seed.setdefault(each.seed, {})[each.variant] = each
@@ -94,14 +97,14 @@ MISS = ("miss_m",)
 
 
 def compare_variants(results: Iterable[FlightResult]) -> Comparison:
-    """The comparison of two profiles over the seeds flown with both."""
+    """The comparison of two profiles over the seeds that were flown with both."""
     return compare_pairs([(a, b) for a, b in results_by_seed(results, 2)])
 
 
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """The comparison of two flights per seed by `figures` (keys of `FIGURES`).
+    """The comparison of two flights per seed with respect to `figures` (keys of `FIGURES`).
 
     `comparisons`: number of comparisons that share the 5 % significance level.
     """
@@ -153,7 +156,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """The comparison `found` as a table with verdicts; `names`: how A and B are called."""
+    """The comparison `found` as a table with verdicts; `names`: the names of A and B."""
     flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B - A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
@@ -187,7 +190,7 @@ def _verdict(better: str | None, by: str = "") -> str:
     return NOT_PROVEN if better is None else f"{better} is better{by}"
 
 
-# --- A key of a profile at several values ---
+# --- Sweep: several values of one profile key ---
 
 
 @dataclass(frozen=True)
@@ -219,7 +222,8 @@ class Sweep:
         return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
-        """A sweep's `record` as a table, and the comparison of the best value with the original."""
+        """The `record` of a sweep as a table, and the comparison of the best value with the
+        original."""
         rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
         for cell in record["cells"]:
             misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
@@ -234,8 +238,8 @@ class Sweep:
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
-    """The sweep of `profile` by the text ``key=value,value``, values as in its file. Errors:
-    UsageError, InvalidValue."""
+    """The sweep of `profile` given by the text ``key=value,value``, with values as in a profile's
+    file. Errors: UsageError, InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
         texts = list(split_values(text))

@@ -1,4 +1,4 @@
-"""Seeded flights over randomised scenarios, one lockstep flight a seed."""
+"""Fly seeded flights over randomised scenarios, one lockstep flight per seed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
     """Call `fly` on one core with the scenario drawn from `seed`, and return its result (a
-    dataclass) with CPU time and scenario filled in. Frees the flight's memory."""
+    dataclass) with the CPU time and the scenario filled in. Frees the flight's memory."""
 
     def fly_drawn() -> R:
         scenario = draw_scenario(profile, seed)
@@ -59,8 +59,8 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
 
 
 def run_measured(job: Callable[[], R]) -> R:
-    """Call `job`, a unit of a campaign's work, on one core, and return its result (a dataclass)
-    with its CPU time filled in. Frees its memory."""
+    """Call `job`, one unit of a campaign's work, on one core, and return its result (a dataclass)
+    with the CPU time filled in. Frees the memory that it used."""
     cv2.setNumThreads(1)  # each job uses one core, so that rates are per core
     cpu_began_s = time.process_time()
     result: Any = job()
@@ -71,17 +71,19 @@ def run_measured(job: Callable[[], R]) -> R:
 
 
 def _give_back_memory() -> None:
-    """Free a flight's memory, whose objects refer to each other, at once."""
+    """Free a flight's memory at once; its objects refer to each other, so Python would free them
+    late."""
     gc.collect()
     if not gc.get_freeze_count():
-        # The remaining objects are kept for all flights; scanning them takes as long as 30 images.
+        # The remaining objects are used by all flights; scanning them each time takes as long as 30
+        # images.
         gc.freeze()
 
 
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
-    """Fly one seed of the profile's scenario; any executor can send this function to a worker.
+    """Fly one seed of the profile's scenario. Any executor can send this function to a worker.
 
     `record` writes the images beside the log. A refused flight is a result, too, without a log.
     Errors: NotFound, InvalidValue (calibration, log).
@@ -113,7 +115,7 @@ def fly_seed(
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
-    """The path of a seed's log in `log_dir`."""
+    """The path of the log of a seed's flight in `log_dir`."""
     return log_dir / f"flight_seed{seed}.jsonl"
 
 
@@ -121,7 +123,7 @@ def seed_log_path(seed: int, log_dir: Path) -> Path:
 
 
 def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
-    """Fly a seed as `fly_seed` does, with its log in the folder `log_dir` unless None."""
+    """Fly a seed as `fly_seed` does, with a log in the folder `log_dir` unless that is None."""
     log_path = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_seed(profile, seed, log_path, record)
 
@@ -132,12 +134,12 @@ def fly_all(
     executor: Executor | None = None,
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
-    """Call `fly` on each seed; return the results in the order of the seeds. `on_result` is called
-    with each result once its flight ends.
+    """Call `fly` on each seed, and return the results in the order of the seeds. `on_result` is
+    called with each result as soon as the flight has ended.
 
     `executor`: as in `concurrent.futures`, or None for this process; its optional attribute `lost`
-    lists the exceptions of a future whose flight was lost with its process. Errors: PerchError, as
-    soon as one flight fails.
+    lists the exceptions with which a future fails if its flight was lost with its process. Errors:
+    PerchError, as soon as one flight fails.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}
@@ -163,20 +165,25 @@ def simulate(
     *,
     log_dir: Path | str | None = None,
 ) -> list[FlightResult]:
-    """Fly each distinct seed of the scenario in lockstep; return the results in their order.
+    """Fly each distinct seed of the profile's scenario in lockstep, and return the results in the
+    order of the seeds.
 
     Args:
-        profile: a profile, its name or its file.
+        profile: a profile, its name, or its file.
         seeds: integers from 0 on. The same seed always gives the same flight.
-        jobs: processes; with more than one a script needs ``if __name__ == "__main__":``.
-        executor: flies instead of `jobs`: any of `concurrent.futures`' kind, such as dask's.
-        log_dir: folder for the flight logs; none are written without it.
+        jobs: number of processes; with more than one, a script needs ``if __name__ ==
+            "__main__":``.
+        executor: used instead of `jobs` processes; any executor as in `concurrent.futures`, such as
+            dask's.
+        log_dir: folder for the flight logs; None: no logs are written.
 
     A result has `seed`, `outcome` (perched, landed, aborted, refused), `reason`, `miss_m` (None if
-    it did not perch), `time_s`, `attempts`, `fell`, `locked`, `log` and the drawn `scenario`.
+    the vehicle did not perch), `time_s`, `attempts`, `fell`, `locked`, `log` and the drawn
+    `scenario`.
 
     Raises:
-        NotFound, InvalidValue: profile or seeds. UsageError: no simulator is installed.
+        NotFound, InvalidValue: the profile or the seeds are invalid. UsageError: no simulator is
+            installed.
     """
     profile, seeds = load_profile(profile), list(seeds)
     for value in (*seeds, jobs):

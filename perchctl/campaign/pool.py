@@ -24,7 +24,8 @@ class FlightProcesses(ProcessPoolExecutor):
 
     def __init__(self, count: int) -> None:
         super().__init__(count, _CONTEXT, end_with_parent)
-        # started here, because starting it clears the signal mask of the calling thread
+        # started outside the masked block, because its start clears the calling thread's signal
+        # mask
         resource_tracker.ensure_running()
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
@@ -51,9 +52,9 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Defer Ctrl-C and SIGTERM to the end of the block. Threads and processes started in the block
-    never receive these signals. Python's handlers are also replaced, because a library's thread may
-    receive a signal."""
+    """Defer Ctrl-C and SIGTERM to the end of the block. Threads and processes that are started in
+    the block never receive these signals. Python's handlers are replaced as well, because a thread
+    started earlier by a library may still receive a signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}

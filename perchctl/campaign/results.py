@@ -1,4 +1,4 @@
-"""How flights ended: one flight's result, the figures of a campaign, and rates with intervals."""
+"""Results: how one flight ended, the figures of a campaign, and rates with confidence intervals."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ WORST_FLIGHTS = 5
 
 @dataclass(frozen=True)
 class CampaignFlight:
-    """Result of one flight: the fields that campaigns of all kinds share.
+    """Result of one flight: the fields that all kinds of campaigns have in common.
 
     Attributes:
-        log, log_problem: path of the flight's log, and why it is incomplete; or None.
+        log, log_problem: the path of the flight's log, and why it is incomplete; each may be None.
         cpu_s: CPU time of the flight, s.
         scenario: the scenario drawn from the seed.
     """
@@ -49,13 +49,13 @@ class FlightResult(CampaignFlight):
     """One simulated flight.
 
     Attributes:
-        outcome: the terminal phase, in small letters, or refused: the vehicle never took off.
-        miss_m: horizontal distance of the gear from the target's centre in the
-            simulation's truth; None if the vehicle did not perch.
-        time_s: duration of the flight in the loop's time.
-        attempts: perching attempts, the successful one included.
-        locked: the supervisor had locked the vehicle at the end.
-        fell: the vehicle hit the floor other than by landing.
+        outcome: the final phase, in lower case, or ``refused`` if the vehicle never took off.
+        miss_m: true horizontal distance of the gear from the target's centre in the simulation;
+            None if the vehicle did not perch.
+        time_s: duration of the flight on the loop's clock.
+        attempts: number of perching attempts, including the successful one.
+        locked: True if the firmware's supervisor had locked the vehicle by the end.
+        fell: True if the vehicle hit the floor other than by landing.
         variant: index of the flown profile, if several are compared.
     """
 
@@ -75,10 +75,10 @@ class FlightResult(CampaignFlight):
 
 
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """A campaign's figures, ready for JSON.
+    """The figures of a campaign as a JSON object.
 
-    `rates` are shares with intervals. `miss_m`: median, p95 (interpolated) and max over perched
-    flights, None without any. `worst_seeds` names at most `WORST_FLIGHTS` bad flights.
+    `rates` are rates with intervals. `miss_m`: median, p95 (interpolated) and max over all flights
+    that perched; None if none did. `worst_seeds` lists at most `WORST_FLIGHTS` bad flights.
     """
     ends: dict[str, int] = {end: sum(r.outcome == end for r in results) for end in ENDS}
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
@@ -94,7 +94,8 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
 
 
 def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
-    """The `median` and the 95th percentile `p95` of misses for JSON; None without any."""
+    """The `median` and 95th percentile `p95` of the miss distances for JSON; None if there are
+    none."""
     if not misses_m:
         return {"median": None, "p95": None}
     median_m, p95_m = np.percentile(misses_m, (50, 95)).round(6).tolist()
@@ -102,14 +103,14 @@ def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
-    """The bad flights, in order of outcome (aborted, landed, refused, perched) and seed."""
+    """The bad flights, sorted by outcome (aborted, landed, refused, perched) and seed."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
 
 
 def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
-    """The error of a campaign whose flights were all refused (so the seeds are not the
-    cause); None for any other campaign."""
+    """The error for a campaign in which every flight was refused, so that the seeds cannot be the
+    cause; None for any other campaign."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
     first = min(results, key=lambda r: r.seed)
@@ -131,7 +132,7 @@ def campaign_table(results: Sequence[FlightResult]) -> str:
 
 
 def align_columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return rows of cells as lines with aligned columns; the first row is the head."""
+    """Return rows of cells as lines with aligned columns; the first row is the heading."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -173,8 +174,8 @@ LEVEL = 0.95
 
 
 def rate_interval(count: int, total: int, level: float = LEVEL) -> tuple[float, float]:
-    """The exact two-sided confidence interval of the rate `count` / `total` (Clopper and
-    Pearson, 1934): it contains the true rate in at least `level` of all campaigns."""
+    """The exact two-sided confidence interval for the rate `count` / `total` (Clopper and Pearson,
+    1934). It contains the true rate in at least a share `level` of all campaigns."""
     found = binomtest(count, total).proportion_ci(level, method="exact")
     return float(found.low), float(found.high)
 

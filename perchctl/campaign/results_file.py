@@ -1,6 +1,6 @@
-"""The persistent results of a campaign: a file that grows line by line, and logs.
+"""The results of a campaign on disk: a file that grows by one line per flight, and the logs.
 
-Line 1 of the file is a header that describes what is flown. One record per flight follows.
+Line 1 of the file is a header that describes the campaign. One record per flight follows.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ R = TypeVar("R", bound=CampaignFlight)
 
 
 class CampaignResults(Generic[R]):
-    """The results file of a campaign: `earlier` are the results read from it, `remaining` the seeds
-    still to be flown."""
+    """The results file of a campaign. `earlier` contains the results read from it, and `remaining`
+    the seeds that have not been flown yet."""
 
     def __init__(
         self,
@@ -64,10 +64,10 @@ def campaign_results(
 ) -> Iterator[CampaignResults[R]]:
     """Yield the results (of class `result_type`) of a campaign, appended to the file `out`.
 
-    An existing file is refused, replaced with `force`, or continued with `resume`: then program,
-    profile, faults and `fleet` (a hash of what a fleet flies; None without one) must be the same.
-    Errors: InvalidValue, also for a `log_dir` that is not
-    writable.
+    An existing file is an error unless it is to be replaced (`force`) or continued (`resume`). To
+    continue it, program, profile, faults and `fleet` (a hash of everything that affects a fleet's
+    flight; None for single flights) must be the same. Errors: InvalidValue, also if `log_dir` is
+    not writable.
     """
     if log_dir is not None:
         check_writable(log_dir / "flight.jsonl", force=True)
@@ -117,8 +117,8 @@ def campaign_header(
 
     `perchctl` is the version, `source` the hash of the source code, `profile` the profile's name,
     `profile_sha256` the hash of calibration and profile without name and description. `faults`:
-    names of the faults to draw from, or None. `fleet_sha256`: only of a fleet, the hash of all its
-    vehicles.
+    names of the faults to draw from, or None. `fleet_sha256`: the hash of all vehicles of a fleet;
+    absent for single flights.
     """
     return {
         **_FORM,
@@ -140,8 +140,8 @@ def profile_sha256(profile: Profile) -> str:
 
 @cache
 def source_sha256(root: Path = SOURCE) -> str:
-    """The SHA-256 of names and content of all modules below `root`; cached, so later changes
-    of the files do not count."""
+    """The SHA-256 of the names and contents of all modules below `root`; cached, so that later
+    changes to the files have no effect."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         whole.update(f"{path.relative_to(root).as_posix()}\n".encode())
@@ -163,8 +163,9 @@ def _write(file: BinaryIO, record: dict[str, Any]) -> None:
 
 
 def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dict[int, R]) -> int:
-    """Add the flights of a file to `earlier` by their seeds, and return the length of its whole
-    lines. Errors: InvalidValue if it is no file of results, or of another campaign."""
+    """Add the flights in a file to `earlier`, keyed by seed, and return the total length of its
+    complete lines. Errors: InvalidValue if it is not a results file, or belongs to another
+    campaign."""
     data = path.read_bytes()
     good = data[: data.rfind(b"\n") + 1]
     if not good and json_line(header).startswith(data):
