@@ -1,4 +1,4 @@
-"""The check on the ground before a flight: one row for each question."""
+"""The checks on the ground before a flight; each check reports one row."""
 
 import lazy_loader
 

@@ -1,4 +1,5 @@
-"""Rows on the camera and the target in its images, from a rehearsal. Pure.
+"""Check rows about the camera and the target in its images, from a rehearsal (the flight loop's
+perception, run for a few seconds on the ground). Pure.
 
 If the target is the positioning system, one more row says whether it is in view.
 """
@@ -68,7 +69,8 @@ _ADVICE = {
 
 
 def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list[Row]:
-    """Return the rows of a camera `source` that fails: the first one failed, the others skipped."""
+    """Return the rows for a camera `source` that failed: the first row fails, the others are
+    skipped."""
     advice = error.advice or "see docs/check.md"
     if not error.advice and source.startswith("camera:"):
         advice += "; perchctl check --cameras lists the cameras"
@@ -77,7 +79,7 @@ def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
-    """Compare the size of the images (None: unknown) with the calibration's."""
+    """Compare the image size (None: unknown) with that of the calibration."""
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
@@ -86,7 +88,8 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """The rows of `picture_row_names` for a rehearsal. The first one fails if no image arrived."""
+    """The rows named by `picture_row_names` for a rehearsal. The first one fails if no image
+    arrived."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture arrived during the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -207,8 +210,8 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """Check whether the target is in view from where the vehicle stands and during the climb. The
-    row fails if `fly` would refuse the flight."""
+    """Check that the target is in view from where the vehicle stands and during the climb. The row
+    fails if `fly` would refuse the flight."""
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
@@ -222,7 +225,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
-    # The world of a level vehicle that stands at the origin and faces along x.
+    # World frame: the vehicle stands level at the origin and faces along x.
     gear_m = np.asarray(profile.vehicle.gear_body_m)
     place = Place(np.array(feet) + rehearsal.target.e_m + gear_m, rehearsal.target.e_yaw_rad)
     problem = view_problem(place, feet, 0.0, profile, camera)
@@ -235,7 +238,7 @@ IN_VIEW = "in view"
 
 
 def picture_row_names(profile: Profile) -> tuple[str, ...]:
-    """The names of the rows of checks on images, in order."""
+    """The names of the rows about images, in order."""
     return (*PICTURES, *([IN_VIEW] if profile.positioning.source.is_target else ()))
 
 
@@ -243,7 +246,8 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Check the loop's processing time per image and its late ticks; skipped for None."""
+    """Check the loop's processing time per image and the lateness of its ticks; skipped if there
+    was no rehearsal."""
     if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

@@ -1,14 +1,16 @@
-"""Rows on the motion capture that measures a vehicle's position: answer, body, rate, noise and
-axes. Pure.
+"""Check rows about the motion-capture system that measures a vehicle's position: connection, rigid
+body, rate, noise and axes. Pure.
 
-Let R_own be the vehicle's attitude by its own estimate, and R_seen by the capture. Let A be the
-rotation of the capture's world, and B that of the rigid body's axes; both should be the identity:
+Let R_own be the vehicle's attitude as estimated by the vehicle, and R_seen as measured by the
+motion-capture system. Let A be the rotation of the system's world frame, and B that of the rigid
+body's axes; both should be the identity:
 
     R_seen = A R_own B
 
-A rotation between two moments that the vehicle measures as ``w`` in its world is ``A w`` in the
-capture's world. One that it measures as ``v`` in its own axes is ``B^T v`` in those of the rigid
-body. A and B are therefore two rotations between sets of vectors.
+Between two times, the vehicle rotates by a rotation vector. If the vehicle measures it as ``w`` in
+its world frame, the system measures ``A w`` in the system's. If the vehicle measures it as ``v`` in
+its body axes, it is ``B^T v`` in those of the rigid body. A and B are therefore found as the
+rotations that align two sets of vectors.
 """
 
 from __future__ import annotations
@@ -62,15 +64,16 @@ WILD_M = 0.1
 
 @dataclass(frozen=True)
 class CaptureSamples:
-    """Samples of one listening period: the vehicle's telemetry, the motion capture's frames, and
-    the motion capture's problem as an error, or None."""
+    """Samples from one listening period: the vehicle's telemetry, the frames from the
+    motion-capture system, and that system's problem as an error, or None."""
 
     telemetry: tuple[Telemetry, ...] = ()
     frames: tuple[CaptureFrame, ...] = ()
     error: PerchError | None = None
 
     def body_poses(self, config: PositioningConfig) -> list[VehiclePose]:
-        """The vehicle's poses by the motion capture, corrected for latency, oldest first."""
+        """The vehicle's poses as measured by the motion-capture system, corrected for latency,
+        oldest first."""
         return [
             VehiclePose.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame in self.frames
@@ -85,7 +88,8 @@ def collect_samples(
     wait: Callable[[float], None],
     duration_s: float = CAPTURE_S,
 ) -> CaptureSamples:
-    """Collect the vehicle's telemetry and the capture's frames for `duration_s` seconds."""
+    """Collect the vehicle's telemetry and the motion-capture system's frames for `duration_s`
+    seconds."""
     began_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
@@ -115,7 +119,7 @@ BODY_ROWS = ("body", "body place")
 
 
 def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Row]:
-    """The rows for a motion capture that cannot be opened or sends nothing."""
+    """The rows for a motion-capture system that cannot be opened or sends nothing."""
     advice = error.advice or (
         "check that it streams, that positioning.host is right, and that no firewall blocks it"
     )
@@ -124,7 +128,7 @@ def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Ro
 
 
 def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
-    """Check samples from a motion capture that were taken while the vehicle stood still."""
+    """Check samples from a motion-capture system that were taken while the vehicle stood still."""
     config = profile.positioning
     if not samples.frames:
         error = samples.error or PerchError(f"{config.label} sends no frames")
@@ -179,7 +183,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
 
 
 def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
-    """Check the position by the criteria of `fly`."""
+    """Check the position by the same criteria as `fly`."""
     newest = samples.telemetry[-1] if samples.telemetry else None
     place = places[-1].to_external(attitude=True)
     if newest is None:
@@ -235,11 +239,11 @@ body."""
 
 @dataclass(frozen=True, eq=False)
 class PairedMotion:
-    """Motion at n common times.
+    """The motion as seen by vehicle and motion-capture system at n common times.
 
     Attributes:
-        R_vehicle, R_capture: attitudes, n each, by the vehicle and by the capture.
-        positions_m: positions (n, 3) by the capture.
+        R_vehicle, R_capture: n attitudes each, from the vehicle and from the motion-capture system.
+        positions_m: positions (n, 3) from the motion-capture system.
         max_deviation_g: the accelerometer's largest deviation from 1 g.
     """
 
@@ -277,8 +281,8 @@ class FrameAlignment:
 def pair_motion(
     telemetry: Sequence[Telemetry], capture_poses: Sequence[VehiclePose]
 ) -> PairedMotion | None:
-    """Pair poses of the motion capture, `POSE_PAIR_PERIOD_S` apart, with the vehicle's attitudes at
-    their times; None for fewer than three pairs."""
+    """Pair motion-capture poses, `POSE_PAIR_PERIOD_S` apart, with the vehicle's attitudes at the
+    same times; None for fewer than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
@@ -306,8 +310,8 @@ def pair_motion(
 
 
 def solve_alignment(motion: PairedMotion) -> FrameAlignment | None:
-    """The alignment by all pairs of times between which the vehicle turned; None if the vehicle
-    turned about fewer than two axes."""
+    """Solve for the alignment from all pairs of times between which the vehicle rotated; None if
+    the vehicle rotated about fewer than two axes."""
     i, j = np.triu_indices(len(motion.R_vehicle), 1)
     size = (motion.R_vehicle[j] * motion.R_vehicle[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
@@ -329,19 +333,19 @@ def solve_alignment(motion: PairedMotion) -> FrameAlignment | None:
 
 
 def _has_many_axes(turns: Array) -> bool:
-    """Rotations are vectors (n, 3)."""
+    """True if the rotation vectors (n, 3) are about more than one axis."""
     axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # the largest eigenvalue comes last
     aside_rad = np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1)
     return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
 
 
 def _turned_rad(attitudes: Rotation) -> Array:
-    """Each attitude's rotation from the first one, (n,)."""
+    """The angle of each attitude's rotation from the first one, (n,)."""
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
 def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Check whether vehicle and capture agree on the motion; skipped for None."""
+    """Check that vehicle and motion-capture system agree on the motion; skipped for None."""
     if motion is None:
         return skipped(
             "the reports of the vehicle and the motion-capture system do not overlap in time",
@@ -375,8 +379,9 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
 
 
 def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
-    """Return the displacement (3,) from the first position to the one that is farthest along the
-    capture's vertical or, if that is too close for a lift, to the farthest of all."""
+    """Return the displacement (3,) from the first position to the one that is farthest from it
+    along the motion-capture system's vertical or, if that is too close for a lift, to the farthest
+    one in any direction."""
     displacements_m = motion.displacements_m
     risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
     if float(np.linalg.norm(risen_m)) < LEAST_RISE_M:
@@ -385,8 +390,8 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
-    """Return what is wrong with the capture's world: it is tilted or mirrored, or its axes are
-    swapped. Its positions may use different axes than its attitudes."""
+    """Find what is wrong with the motion-capture system's world frame: it may be tilted or
+    mirrored, or its axes may be swapped. Positions may be in other axes than attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
         found, axis = (
@@ -433,7 +438,7 @@ def _body_finding(
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
-# --- The result of the comparison by hand, saved for `fly` ---
+# --- The result of the lift comparison, saved for `fly` ---
 
 COMPARED = "compared"
 
@@ -441,8 +446,8 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """One row on whether `fly` finds a saved lift comparison with this motion capture; none
-    without a motion capture, or for the simulated vehicle."""
+    """One row that says if there is a saved lift comparison with this motion-capture system, as
+    `fly` requires. No row without motion capture, or for the simulated vehicle."""
     if not config.source.is_mocap or simulated:
         return []
     return [_record_row(config, uri, now)]
@@ -451,8 +456,8 @@ def comparison_rows(
 def save_comparison_row(
     finding: Finding, config: PositioningConfig, uri: str, now: datetime
 ) -> Row:
-    """Save the finding of a lift comparison for `fly`, unless it was skipped, and return the row on
-    the saved comparison."""
+    """Save the finding of a lift comparison for `fly`, unless it was skipped, and return the row
+    about the saved comparison."""
     passes, vehicle = finding.verdict is Verdict.PASS, vehicle_uri(uri)
     if finding.verdict is Verdict.SKIPPED:
         return _record_row(config, uri, now)

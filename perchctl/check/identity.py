@@ -1,15 +1,14 @@
-"""Check that vehicle, motion-capture body and camera belong to the same home. The rows are for one
-of several vehicles on the floor.
+"""Check that vehicle, motion-capture body and camera belong to the same home, that is, to the same
+starting place of a fleet. The rows are for one of several vehicles on the floor.
 
 ```
 vehicle  its LEDs blink, and somebody sees them blink at this home
 body     the motion capture sees its rigid body at this home
-target   its camera sees its target where it must be from this home
-```
+target   its camera sees its target where it must be as seen from this home ```
 
 Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
-camera would show the same, or if the target is not in view, perchctl asks the user to cover the
-lens. The camera is identified by its image going dark. Nothing is armed, and no motor turns.
+camera would show the same image, or if the target is not in view, perchctl asks the user to cover
+the lens, and identifies the camera whose image goes dark. Nothing is armed, and no motor turns.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class Stand:
 
     Attributes:
         home_text: its home in words, in room axes.
-        homes: of the other vehicles.
+        homes: the homes of the other vehicles.
         views: where the target of each other vehicle would appear to be if its camera were taken
             for this vehicle's.
         lookalikes: vehicles whose cameras would show a target at the position at which this
@@ -75,11 +74,11 @@ class Stand:
 
 
 def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask) -> Iterator[Row]:
-    """Yield a vehicle's rows as soon as they are known: address, vehicle, body (with motion
-    capture), camera and target. A failed row does not identify anything. Errors: those of
+    """Yield the rows about a vehicle as soon as they are known: address, vehicle, body (with motion
+    capture), camera and target. A row that fails leaves that part unidentified. Errors: those of
     `perchctl.check.check`.
 
-    A simulated vehicle has its own simulator and camera, so nobody is asked.
+    For a simulated vehicle, which has its own simulator and camera, perchctl asks nothing.
     """
     calibrated = profile_camera(options.profile.camera)
     with contextlib.ExitStack() as stack:
@@ -191,7 +190,7 @@ class View:
     scope: CheckScope
 
     def rehearse(self, profile: Profile | None = None) -> Rehearsal:
-        """Process a few seconds of images. With `profile`, look for another target."""
+        """Process a few seconds of images. If `profile` is given, look for its target instead."""
         flown = profile or self.profile
         pipeline = make_pipeline(flown, self.calibrated)
         seconds = self.scope.rehearse_s
@@ -222,7 +221,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     own = view.rehearse()
     place_m = _target_place(own)
     away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
-    # Single images may be within the limit although the target is not.
+    # Report a distance beyond the limit even if single images are within it.
     if away_m <= target.expected_within_m:
         found = f"its camera sees its target {away_m:.2f} m from its expected position"
         if ask is None or not stand.lookalikes:

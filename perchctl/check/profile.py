@@ -1,4 +1,4 @@
-"""Rows on a profile and the computer's disk, which need no connection."""
+"""Check rows about the profile and the computer's disk, which need no connection."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
 
 
 def offline_rows(options: FlyOptions) -> list[Row]:
-    """The rows on the computer's disk and the profile, without opening a link or camera."""
+    """The rows about the computer's disk and the profile, without opening a link or camera."""
     return [
         evaluate_row("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),

@@ -40,7 +40,7 @@ TakeTelemetry = Callable[[], list[Telemetry]]
 
 @dataclass(frozen=True)
 class PictureProblem:
-    """A problem of an image. `kind` is its name in `FrameHealth`, or ``mirrored``; None for any
+    """A problem with an image. `kind` is its name in `FrameHealth`, or ``mirrored``; None for any
     other problem."""
 
     text: str
@@ -54,10 +54,13 @@ class Rehearsal:
     Attributes:
         arrivals: index and arrival time of each image.
         repeats: number of repeated images, which other counts leave out.
-        processing_s: time for each tick with an image; tick_delays_s: lateness of each tick.
-        ages_s: time from each image's exposure, by `camera.latency_s`, to its result.
-        problem: the camera's at the end, or empty; problems: number of images by problem.
-        newest_outputs: the last few; target_pictures: number of images with a target.
+        processing_s: processing time of each tick with an image; tick_delays_s: lateness of each
+            tick.
+        ages_s: time from each image's exposure (computed with `camera.latency_s`) to its result.
+        problem: the camera's problem at the end, or empty; problems: number of images with each
+            problem.
+        newest_outputs: the last few pipeline outputs; target_pictures: number of images with a
+            target.
         silent_s: time without an image at the end.
         target: the final estimate; None if the target was not in view.
         target_places: time and place of the target, m, in each image that measured it since the
@@ -104,8 +107,8 @@ class Rehearsal:
 
 @dataclass(frozen=True)
 class _TelemetryOnly:
-    """Stand-in link. If `feet_m` is given, the vehicle is assumed to stand there, because its
-    estimate diverges without positions."""
+    """Stand-in for a link that only returns telemetry. If `feet_m` is given, the vehicle is assumed
+    to stand there, because its estimate diverges if it is sent no positions."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None
@@ -118,7 +121,7 @@ class _TelemetryOnly:
 
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """A stand-in for the link, which passes a rehearsal the telemetry that `take` returns."""
+    """A stand-in for the link that gives a rehearsal the telemetry returned by `take`."""
     by_target = profile.positioning.source.is_target
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
@@ -137,7 +140,7 @@ def rehearse(
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """
-    polled: list[Frame] = []  # frame of this turn, at most one
+    polled: list[Frame] = []  # frame of this loop iteration, at most one
     telemetry = rehearsal_telemetry(take, profile)
     senses = FlightInputs(telemetry, source, pipeline, profile, on_frame=polled.append)
     done = Rehearsal(source.live)
@@ -154,9 +157,7 @@ def rehearse(
             _note(done, frame, senses, prints, work_s, began_s)
         due_s += period_s
         if due_s < clock.now():
-            due_s = (
-                clock.now()
-            )  # as in the flight loop, missed turns are not made up for with a burst
+            due_s = clock.now()  # as in the flight loop, missed iterations are not made up for
         clock.wait_until(due_s)
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""
@@ -205,7 +206,7 @@ def _note(
 def _blur_px(
     newest_outputs: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline
 ) -> float | None:
-    """None if the target was not seen."""
+    """The sigma of the marker's edges, px; None if the target was not seen."""
     found_px = []
     for frame, output in newest_outputs:
         for name in MARKERS:

@@ -1,4 +1,4 @@
-"""A row of the check: a question, its verdict, the finding and advice."""
+"""A row of a check's output: the check's name, its verdict, the finding and advice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Row:
-    """Result of a check: what it `found`, with units, and `advice`, or empty."""
+    """Result of a check: what it `found`, with units, and `advice` (may be empty)."""
 
     name: str
     verdict: Verdict
@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Unanswerable(Exception):
-    """Raised if a check cannot be made; `finding` is the skipped finding to report."""
+    """Raised if a check cannot be carried out; `finding` is the skipped finding to report."""
 
     def __init__(self, why: str, advice: str = "") -> None:
         super().__init__(why)

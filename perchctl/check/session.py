@@ -1,5 +1,5 @@
-"""The complete check of vehicle, camera, computer and profile. It yields each row as soon as it is
-known."""
+"""The complete check of vehicle, camera, computer and profile, which yields each row as soon as it
+is known."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from perchctl.vision import CameraModel, Pipeline, make_pipeline
 class CheckScope:
     """Extent of a check: whether the vehicle is lifted by hand, and the duration of each part.
 
-    `announce` is called with a sentence about each step; `open_capture` opens a motion capture.
+    `announce` is called with a sentence about each step; `open_capture` connects to a
+    motion-capture system.
     """
 
     with_lift: bool = False
@@ -41,8 +42,8 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """Return the rows of `--scan`: the vehicles that answer at the default address and at `uri` (if
-    not None). Errors: InvalidValue."""
+    """Return the rows for `--scan`: the vehicles that answer at the default address and at `uri`
+    (if not None). Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.radio_scan_rows(*find_uris_and_problem(uri or ""))
@@ -116,7 +117,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
     try:
         opened = scope.open_capture(config)
     except UsageError:
-        raise  # a library that cannot be loaded is an error on the computer, as in `fly`
+        raise  # a library that cannot be loaded is an error, as in `fly`
     except PerchError as error:
         return error
     stack.callback(opened.close)
@@ -125,7 +126,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
 
 @dataclass(frozen=True)
 class VehicleChecks:
-    """Checks of a vehicle and its motion capture.
+    """Checks of a vehicle and of its motion-capture system, if any.
 
     `uri`: the given address; `probe` may open that of a simulated vehicle instead.
     """
@@ -137,7 +138,8 @@ class VehicleChecks:
     scope: CheckScope
 
     def rows(self) -> Generator[Row, None, TakeTelemetry]:
-        """Yield the rows; return the function that takes telemetry (none if nothing answers)."""
+        """Yield the rows; return the function that takes new telemetry (None if no vehicle
+        answers)."""
         self.scope.announce(f"connecting to {self.uri}")
         try:
             self.probe.connect()
@@ -159,7 +161,7 @@ class VehicleChecks:
         return self.probe.telemetry
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
-        """Empty with decks."""
+        """The rows about the motion-capture system; none if decks measure the position."""
         config = self.profile.positioning
         if self.mocap is None:
             return []
@@ -220,7 +222,7 @@ def _camera_rows(
     scope: CheckScope,
     scheme: str,
 ) -> Generator[Row, None, Rehearsal | None]:
-    """Yield the rows; return the rehearsal, None if there could be none."""
+    """Yield the rows; return the rehearsal, or None if none was possible."""
     size = camera.size_finding(source.size_px, pipeline.camera.size_px)
     yield Row("size", *size)
     if size.verdict is not Verdict.PASS:

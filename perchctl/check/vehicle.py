@@ -1,4 +1,4 @@
-"""Rows on the connected vehicle: its answers, its firmware and decks, and its telemetry at rest."""
+"""Check rows about the connected vehicle: radio, firmware, decks, and telemetry at rest."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ ADDRESS_ADVICE = {
 
 
 def unanswered_row(error: ConnectionFailed, uri: str) -> Row:
-    """The row of a vehicle that does not answer."""
+    """The row for a vehicle that does not answer."""
     scheme = uri.partition("://")[0]
     advice = ADDRESS_ADVICE[scheme]
     if error.advice and scheme != "sim":
@@ -85,10 +85,10 @@ class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
     `device_type`: the vehicle type reported by the firmware; None if it does not answer.
-    `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
-    infinite if lost, and meanwhile `wake_delays_s` of a thread of this computer; `telemetry`:
-    newest sample, `age_s` old; `displacement_m`: drift at rest; `samples`: all samples received,
-    oldest first.
+    `missing_variables`: log variables that the firmware lacks. `round_trips_s`: round-trip times of
+    test packets, infinite if lost. `wake_delays_s`: how late a sleeping thread on this computer
+    woke up meanwhile. `telemetry`: newest sample, `age_s` old. `displacement_m`: drift at rest.
+    `samples`: all samples received, oldest first.
     """
 
     uri: str
@@ -155,8 +155,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
 
 @contextlib.contextmanager
 def wake_delays() -> Iterator[list[float]]:
-    """While the block runs, measure the delays, s, with which this computer wakes a sleeping
-    thread."""
+    """While the block runs, measure how late this computer wakes up a sleeping thread, s."""
     delays_s: list[float] = []
     ended = threading.Event()
 
@@ -180,7 +179,7 @@ def wake_delays() -> Iterator[list[float]]:
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     """Check the echo packets and, for a radio, the link quality. If this computer itself was late,
-    a slow packet says nothing about the link."""
+    a slow packet is not blamed on the link."""
     sent, quality = len(vehicle.round_trips_s), vehicle.link_quality
     back_s = sorted(filter(math.isfinite, vehicle.round_trips_s))
     advice = LINK_ADVICE.get(vehicle.link_scheme, BUSY_ADVICE)
@@ -199,7 +198,7 @@ def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     return worst_finding(
         limits_finding(lost, 0.01, 0.05, found, advice),
         limits_finding(p95_s, slow_s, limit_s, found, slow_advice),
-        # A radio repeats lost packets automatically, so losses only show in the link quality.
+        # A radio repeats lost packets automatically, so losses show only in the link quality.
         limits_finding(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
     )
 
@@ -272,7 +271,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not profile.positioning.source.is_deck:
         if not vehicle.position_decks(profile):
             return skipped(BY_FLY)
-        judged = profile.with_({"positioning.by": "deck"})  # until fly sends positions
+        judged = profile.with_({"positioning.by": "deck"})  # positions are sent only by fly
     criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:
@@ -363,7 +362,7 @@ of it."""
 
 
 def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:
-    """Return the vehicle's telemetry over `duration_s`, while somebody lifts it by hand."""
+    """Return the vehicle's telemetry over `duration_s`, while the user lifts it by hand."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(duration_s / 0.1))):
         wait(0.1)
@@ -372,7 +371,7 @@ def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list
 
 
 def lift_finding(samples: Sequence[Telemetry]) -> Finding:
-    """Check whether the estimated position followed the lift by hand."""
+    """Check that the estimated position followed the lift by hand."""
     if not samples:
         return skipped("no telemetry")
     heights_m = [t.position_m[2] for t in samples]
