@@ -5,9 +5,9 @@ millimetres, and no later check detects this. Each form therefore has a table of
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must have a neutral value, since any other would change the projection (binning, xi,
-...);
+  ...);
 - notes, which do not affect the projection of the camera's own images: those in the table, and keys
-that consist of words about boards, images, errors and dates.
+  that consist of words about boards, images, errors and dates.
 
 A key that is not in the table might change the projection, so the file is refused, unless the value
 is 0 or empty, which disables any term of a lens model. `rectification_matrix` and
