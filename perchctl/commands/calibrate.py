@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -100,8 +100,8 @@ def camera(
     layout = targets.Board.parse(board)
 
     def checked_file(size_px: tuple[int, int]) -> Path:
-        """Return the path for the calibration file. Raises now, before the user has done any work,
-        if it cannot be written."""
+        """Return the path for the calibration file. If it cannot be written, raise an error now,
+        before the user has done any work."""
         file = _file(output, size_px)
         _check_camera_output(file, force)
         return file
@@ -242,7 +242,8 @@ def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
 
 
 def _check_camera_output(file: Path, force: bool) -> None:
-    """Check a calibration file and its report. Raises InvalidValue, as `check_output`."""
+    """Check that a calibration file and its report can be written. Raises InvalidValue, as
+    `check_output` does."""
     report, makes_folder = file.with_suffix(REPORT_SUFFIX), file.parent == FOLDER
     check_output(file, SUFFIXES, force, CONTENT, makes_folder=makes_folder)
     check_output(report, (REPORT_SUFFIX,), force, "a report", makes_folder=makes_folder)
@@ -256,7 +257,7 @@ def _now() -> str:
 
 
 def _source(text: str, view: bool = False) -> str:
-    """Return the source for `open_camera`. Raises NotFound, InvalidValue, UsageError."""
+    """Return the source to pass to `open_camera`. Raises NotFound, InvalidValue, UsageError."""
     source = cameras.parse_source(text)
     if view and not source.live:
         raise UsageError(f"{source} is not a live camera, so --view does not apply: leave it out")
@@ -276,8 +277,8 @@ def _find_views(
     """Return the views, at least one, and the images without a board.
 
     Args:
-        view: with the live page of a live camera.
-        check: called with a live camera's image size before the person begins.
+        view: serve the live page, if the source is a live camera.
+        check: called with a live camera's image size before the user starts.
     """
     source = cameras.parse_source(spec)
     if source.scheme != "images":
@@ -308,9 +309,10 @@ def _find_views(
 def capture_live_views(
     source: cameras.FrameSource, board: targets.Board, view: bool
 ) -> calibrations.FoundViews:
-    """Take views from a video or live camera until they cover everything, or Ctrl-C.
+    """Take views from a video or live camera until they cover everything, or until Ctrl-C is
+    pressed.
 
-    Raises InvalidValue if no view was taken; else as `capture_views`.
+    Raises InvalidValue if no view was taken, and the errors of `capture_views`.
     """
     import numpy as np
 
@@ -337,7 +339,7 @@ def capture_live_views(
 
 
 def _no_view_text(found: calibrations.FoundViews) -> str:
-    """Return why a video or camera gave no view of the board, and what to do."""
+    """Return why there is no view of the board from a video or camera, and what to do."""
     if found.other_board:
         return f"it shows {found.other_board}"
     if found.frames is None:

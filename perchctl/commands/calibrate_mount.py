@@ -17,7 +17,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -137,7 +137,7 @@ def mount(
     return 0 if problem is None else problem.exit_code
 
 
-# --- What is checked before anything is recorded ---
+# --- Checks before anything is recorded ---
 
 
 def _live_sources(
@@ -164,7 +164,7 @@ def _live_sources(
 
 
 def _free_place(name: str) -> Path:
-    """Return the next unused path for a live recording, and check that it can be written."""
+    """Return the next unused path for a live recording, after checking that it can be written."""
     stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
     check_writable(place, force=False)
@@ -175,7 +175,8 @@ def _free_place(name: str) -> Path:
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[calibrations.MountingRecording]:
-    """Return the last recording of `part`, or of each part. Errors: NotFound, InvalidValue."""
+    """Return the last recording of `part` or, if that is None, of each part. Errors: NotFound,
+    InvalidValue."""
     held = [recording for path in logs for recording in calibrations.MountingRecording.read(path)]
     found = {each.part: each for each in held if part in (None, each.part)}
     if not found:
@@ -188,7 +189,7 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[calibrations.Mou
 
 
 def _check_unchanged(name: str, then: profiles.Profile) -> None:
-    """Raise InvalidValue if the values on which the results depend have changed in the profile;
+    """Raise InvalidValue if any value that the results depend on has changed in the profile, and
     NotFound if the profile is gone."""
     now = profiles.load_profile(name)
     if (now.camera, now.vehicle) != (then.camera, then.vehicle):
@@ -215,18 +216,18 @@ def _record_live(
     early.
 
     Args:
-        uri: None: no vehicle is asked. view: with the live page.
+        uri: the vehicle's URI; None to connect to no vehicle. view: serve the live page.
 
     Raises:
-        Interrupted: Ctrl-C. SafetyAbort: the motors turn.
-        Those of `open_camera`, `AttitudeLink.connect` and `record_mounting`.
+        Interrupted: the user pressed Ctrl-C. SafetyAbort: the motors turn.
+        The errors of `open_camera`, `AttitudeLink.connect` and `record_mounting`.
     """
     from perchctl.commands.progress import guidance_display
 
     recordings: list[calibrations.MountingRecording] = []
     with contextlib.ExitStack() as stack:
-        # No latency is subtracted from the images' times, because the latency is what is being
-        # measured.
+        # No latency is subtracted from the images' times, because this measurement determines the
+        # latency.
         frames = cameras.open_camera(
             source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
         )
@@ -241,7 +242,7 @@ def _record_live(
         stack.callback(_keep, recordings, log)
         for part in parts:
             say(HOW[part])
-            if sys.stdin.isatty():  # Ctrl-C ends at once here
+            if sys.stdin.isatty():  # during this question, Ctrl-C ends the command at once
                 with contextlib.suppress(EOFError):  # Ctrl-D continues, as Enter does
                     if ask("press Enter when it is in place:").strip().lower() in NO:
                         raise UsageError("not confirmed: nothing was measured")
@@ -249,7 +250,7 @@ def _record_live(
             recordings.append(recording)
             reader = calibrations.PoseReader(profile, camera, frames.live)
             if frames.live:
-                frames.poll(time.monotonic())  # from earlier
+                frames.poll(time.monotonic())  # discard an earlier frame
             with Stopper().as_handler() as stop, guidance_display(page) as show:
                 stopped = stop.requested.is_set
                 calibrations.record_mounting(
@@ -268,8 +269,8 @@ def _record_live(
 
 @contextlib.contextmanager
 def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
-    """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors
-    turn or may turn."""
+    """Connect to the vehicle, and yield two functions that return its samples and its problem.
+    Raises SafetyAbort if its motors turn or may turn."""
     link = links.AttitudeLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, only to read from it")
     link.connect()
@@ -288,7 +289,7 @@ def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
 
 
 def _keep(recordings: Sequence[calibrations.MountingRecording], log: Path) -> None:
-    """Write the recording. Never raises, because the results are still needed."""
+    """Write the recording. Never raises an exception, because the results must still be printed."""
     held = [recording for recording in recordings if recording.attitudes or recording.poses]
     if not held:
         return

@@ -1,4 +1,5 @@
-"""`perchctl check`: everything that can be checked on the ground, as a table or JSON."""
+"""`perchctl check`: check everything that can be checked on the ground, and print a table or
+JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import camera as cameras
 from perchctl import check as checks
 from perchctl.commands.command_line import (
@@ -97,8 +98,8 @@ def check(
 
 
 def print_rows(rows: Iterable[checks.Row], as_json: bool) -> int:
-    """Print the rows as they come, so that none is lost on Ctrl-C or an error, and return the exit
-    code."""
+    """Print each row as soon as it is known, so that none is lost on Ctrl-C or an error, and return
+    the exit code."""
     found: list[checks.Row] = []
     interrupted = False
     try:
@@ -123,7 +124,7 @@ def print_rows(rows: Iterable[checks.Row], as_json: bool) -> int:
 
 
 def exit_code(rows: Sequence[checks.Row]) -> int:
-    """Return the exit code of the first failing row; 0 if nothing fails."""
+    """Return the exit code for the first failing row; 0 if no row fails."""
     for row in rows:
         if row.verdict is checks.Verdict.FAIL:
             return EXIT_CODE_OF.get(row.name, SafetyAbort.exit_code)
@@ -131,8 +132,8 @@ def exit_code(rows: Sequence[checks.Row]) -> int:
 
 
 def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
-    """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. If the
-    check did not finish, there is no positive summary."""
+    """Return the rows as text of 80 columns: verdict, name and finding, with the advice below. If
+    the check did not finish, the summary does not say that all is well."""
     lines = [line for row in _folded(rows) for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in checks.Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
@@ -175,8 +176,8 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def camera_rows() -> Iterator[checks.Row]:
-    """Yield a row for each camera, without changing settings or taking images. Errors: NotFound if
-    there is none."""
+    """Yield a row for each camera, without changing its settings or taking images. Errors: NotFound
+    if there is no camera."""
     for camera in cameras.find_cameras():
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)

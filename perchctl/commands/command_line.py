@@ -1,4 +1,5 @@
-"""What the subcommands share: the application, its failures as sentences, common options."""
+"""Code shared by the subcommands: the application, common options, and errors reported as
+sentences."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ from perchctl.errors import (
 )
 from perchctl.startup import failure_record, restore_ctrl_c
 
-# \b keeps the line breaks in a paragraph.
+# \b makes click keep the line breaks of the paragraph.
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
     f"{code:>5}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
 )
@@ -78,13 +79,16 @@ _CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
 class Group(TyperGroup):
-    """A group of subcommands. The first one is the main subcommand, which runs if none is named."""
+    """A group of subcommands. The first is the main subcommand, which runs if the user names
+    none."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = (*self.commands, *_CONTEXT_SETTINGS["help_option_names"])
-        # Shell completion asks for the possible words and must not get the main subcommand.
+        # For shell completion, do not insert the main subcommand, so that all subcommands are
+        # offered.
         if not ctx.resilient_parsing and (not args or args[0] not in named):
-            # The name of a file or source contains more than letters.
+            # A word of letters only is meant as a subcommand; a file or source has other
+            # characters.
             word = args[0] if args and args[0].isalpha() and not os.path.exists(args[0]) else ""
             if meant := difflib.get_close_matches(word, self.commands, 1, _CLOSE):
                 raise UsageError(
@@ -95,7 +99,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of the main subcommand, with the others listed below it."""
+        """Write the help text of the main subcommand, followed by a list of the others."""
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(
             main_command, info_name=ctx.info_name, parent=ctx.parent, **_CONTEXT_SETTINGS
@@ -108,7 +112,7 @@ class Group(TyperGroup):
 
 
 class _Unloaded(TyperCommand):
-    """A subcommand whose file is loaded on use."""
+    """A subcommand whose module is loaded when it is used."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         module = importlib.import_module(f"perchctl.commands.{(self.name or '').replace('-', '_')}")
@@ -122,7 +126,7 @@ class _Commands(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        # Show the whole sentence: by default, the list of commands truncates it.
+        # Show the whole sentence, which the list of commands truncates by default.
         self.commands = {name: _Unloaded(name, short_help=COMMANDS[name]) for name in COMMANDS}
 
     def invoke(self, ctx: Any) -> Any:
@@ -131,8 +135,8 @@ class _Commands(TyperGroup):
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
-    """Return the application of a subcommand, or with `cls=Group` of a group of them."""
-    # Without rich's panels, which truncate text in narrow cells.
+    """Return the application for a subcommand or, with `cls=Group`, for a group of subcommands."""
+    # Do not use rich's panels, because they truncate text in narrow cells.
     return typer.Typer(
         cls=cls,
         add_completion=cls is _Commands,
@@ -151,8 +155,9 @@ P = ParamSpec("P")
 def command(
     group: typer.Typer, *examples: str, ending: str = "", **settings: Any
 ) -> Callable[[Callable[P, int | None]], Callable[P, None]]:
-    """Return the decorator for a subcommand of `group`, whose help ends with `examples` and
-    `ending`. The function returns the exit code (None: 0). `settings` are typer's."""
+    """Return the decorator for a subcommand of `group`, whose help text ends with `examples` and
+    `ending`. The decorated function returns the exit code (None: 0). `settings` are passed to
+    typer."""
     # \b keeps the line breaks.
     lines = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])
     epilog = f"{lines}\n\n{ending}"
@@ -162,7 +167,7 @@ def command(
         def do(*args: P.args, **kwargs: P.kwargs) -> None:
             restore_ctrl_c()
             code = run(*args, **kwargs)
-            sys.stdout.flush()  # report a full disk or a closed pipe here, not after the last line
+            sys.stdout.flush()  # report a full disk or a closed pipe here rather than at exit
             raise typer.Exit(code or 0)
 
         return group.command(epilog=epilog, **settings)(do)
@@ -219,7 +224,7 @@ def main() -> Any:
     try:
         with (
             report_failures()
-        ):  # failures outside of a subcommand, such as printing the help to a full disk
+        ):  # for failures outside a subcommand, such as printing the help to a full disk
             try:
                 app()
             finally:
@@ -235,8 +240,8 @@ def main() -> Any:
 
 @contextlib.contextmanager
 def report_failures(as_json: bool = False) -> Iterator[None]:
-    """Report each failure of the block as a sentence on stderr, with `as_json` also as an object on
-    stdout, and exit with its code; print each note on the profile as a sentence."""
+    """Report a failure in the block as a sentence on stderr (with `as_json`, also as an object on
+    stdout), and exit with its exit code. Print each note on the profile as a sentence."""
     try:
         with _notes():
             yield
@@ -250,13 +255,13 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
         discard_output(sys.stdout)
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
-        if hasattr(error, "format_message"):  # wrong usage, which typer prints
+        if hasattr(error, "format_message"):  # a usage error, which typer prints
             if as_json:
                 _print_failure(error.format_message(), UsageError.exit_code)
             raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        # Without a path, the disk of stdout is full, or a device is refused.
+        # Without a path, a full disk is that of stdout; any other refusal may concern a device.
         is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
         if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import positioning as positionings
@@ -205,7 +205,8 @@ def _collect_with_person(
 
 
 def _open_capture(profile: profiles.Profile, target_body: str) -> weights.MocapPoses:
-    """Return the profile's motion capture, connected. Errors: UsageError, those of connecting."""
+    """Connect to the profile's motion-capture system and return it. Errors: UsageError, and those
+    of connecting."""
     if not profile.positioning.source.is_mocap:
         raise UsageError(
             "--truth mocap needs a profile with its motion capture, as in "

@@ -1,5 +1,5 @@
-"""`perchctl fleet`: the plan of a fleet's flight, the flight, its simulation, and fleet files from
-other programs' lists."""
+"""`perchctl fleet`: plan, fly and simulate a fleet, and make fleet files from other programs'
+lists."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import campaign as campaigns
 from perchctl import check as checks
 from perchctl import fleet as fleets
@@ -122,8 +122,8 @@ def check(
 
 
 def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
-    """Print the plan, and each vehicle's rows as they are known; return the exit code of the first
-    vehicle with a failing row. Asks on the terminal at each real vehicle."""
+    """Print the plan, and each vehicle's rows as soon as they are known; return the exit code of
+    the first vehicle with a failing row. For each real vehicle, ask the user on the terminal."""
     real = [vehicle for vehicle in plan.fleet.vehicles if not vehicle.simulated]
     if real and not sys.stdin.isatty():
         raise UsageError(

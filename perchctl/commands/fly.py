@@ -1,4 +1,4 @@
-"""`perchctl fly`: options in, a flight, its log, plot and exit code out."""
+"""`perchctl fly`: resolve the options, fly, write log and plot, and return the exit code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import check as checks
@@ -108,7 +108,7 @@ def fly(
 
 
 def refuse_hover(profile: profiles.Profile) -> None:
-    """Raise InvalidValue for a profile whose mission hovers, for a command that perches."""
+    """Raise InvalidValue if the profile's mission is a hover; called by commands that perch."""
     if profile.planner.hover is not None:
         raise InvalidValue(
             "planner.hover is set, so the vehicle would hover instead of perching: remove it from "
@@ -119,8 +119,8 @@ def refuse_hover(profile: profiles.Profile) -> None:
 def plan_or_fly(
     options: flights.FlyOptions, *, dry_run: bool, yes: bool, as_json: bool, view: bool
 ) -> int:
-    """Show the plan of a flight, or fly it; return the exit code. Errors: UsageError without a
-    terminal for the confirmation, and those of the flight."""
+    """Show the plan for a flight, or fly it; return the exit code. Errors: UsageError if there is
+    no terminal for the confirmation, and those of the flight."""
     if dry_run:
         refused = plan_problem(options)
         print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))
@@ -149,7 +149,7 @@ def resolve_options(
     log_dir: Path | None = None,
     record: bool | None = None,
 ) -> flights.FlyOptions:
-    """Merge the command line's options (None: not given) with the profile. Errors: NotFound,
+    """Merge the options from the command line (None: not given) with the profile. Errors: NotFound,
     InvalidValue, UsageError."""
     profile = with_positioning(profiles.load_profile(profile_name), positioning)
     options = flights.FlyOptions(
@@ -173,8 +173,8 @@ def command_name(profile: profiles.Profile) -> str:
 
 
 def with_positioning(profile: profiles.Profile, method: str | None) -> profiles.Profile:
-    """Return the profile with the `--positioning` method; unchanged for None. Errors:
-    InvalidValue."""
+    """Return the profile with the positioning method of `--positioning`, or unchanged for None.
+    Errors: InvalidValue."""
     if method is None:
         return profile
     if method not in positioning_methods():
@@ -185,13 +185,13 @@ def with_positioning(profile: profiles.Profile, method: str | None) -> profiles.
 
 
 def positioning_methods() -> tuple[str, ...]:
-    """Return the methods that `--positioning` accepts."""
+    """Return the positioning methods that `--positioning` accepts."""
     methods: tuple[str, ...] = get_args(profiles.PositioningConfig.model_fields["by"].annotation)
     return methods
 
 
 def ask_before_arming(uri: str) -> None:
-    """Ask whether to arm; raise UsageError unless the answer is yes."""
+    """Ask for permission to arm; raise UsageError unless the answer is yes."""
     if not ask_to_confirm(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
@@ -199,8 +199,8 @@ def ask_before_arming(uri: str) -> None:
 def fly_and_report(
     options: flights.FlyOptions, as_json: bool, view: bool, confirm: bool = False
 ) -> int:
-    """Fly, log, plot and report how the flight ended; return the exit code. `view`: open the live
-    page; `confirm`: ask on the terminal before arming."""
+    """Fly, write log and plot, and report how the flight ended; return the exit code. `view`: open
+    the live page. `confirm`: ask on the terminal before arming."""
     simulated_seed = options.seed if options.simulated else None
     log = records.LogWatcher.open_real_time(
         options.log_dir,
@@ -214,7 +214,7 @@ def fly_and_report(
     say(f"connecting to {options.uri}")
     switch, page = flights.OperatorSwitch(), None
     detached: tuple[str, ...] = ()
-    # After the landing there is nothing left to stop, but the results must be reported.
+    # Once the vehicle has landed, there is nothing left to stop, and the results must be reported.
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, view, switch))
@@ -222,8 +222,8 @@ def fly_and_report(
             detached = report.detached_watchers
         except BaseException as error:
             detached = tuple(getattr(error, "__notes__", ()))
-            # End the page first: a hanging disk would delay the end of the log, and the Land button
-            # would seem active.
+            # End the page first: a hanging disk can delay closing the log, and meanwhile the Land
+            # button would seem active.
             if page is not None:
                 page.fail(error, log.path if log.has_begun else None)
             log.abandon(str(error) or type(error).__name__)
@@ -249,8 +249,8 @@ def fly_and_report(
 
 
 def draw_flight_plot(log_path: Path, profile: profiles.Profile) -> Path | None:
-    """Plot the flight beside its log if the profile asks for it, and return the plot's path. A plot
-    that fails or is interrupted is only a warning."""
+    """Plot the flight next to its log if the profile says so, and return the plot's path. If
+    plotting fails or is interrupted, only print a warning."""
     if not profile.log.plot:
         return None
     picture = records.path_beside(log_path, ".png")
@@ -268,7 +268,8 @@ def draw_flight_plot(log_path: Path, profile: profiles.Profile) -> Path | None:
 def flight_record(
     summary: records.FlightSummary, code: int, log: Path, plot: Path | None
 ) -> dict[str, Any]:
-    """Return the JSON object of `--json`; its `error` is None if flight and log are good."""
+    """Return the JSON object for `--json`; its `error` is None if neither the flight nor the log
+    failed."""
     return summary.as_record() | {
         "lost_records": summary.lost_records,
         "log_problem": summary.log_problem,
@@ -318,7 +319,7 @@ def flight_page(
         yield None if page is None else displays.FlightPage.of(page, options.profile)
 
 
-# --- `perchctl fly --dry-run`: the resolved flight, before anything is opened
+# --- `perchctl fly --dry-run`: show the resolved flight plan without opening anything
 
 
 _COLUMN, _WIDTH = 13, 80
@@ -361,7 +362,7 @@ def plan_record(options: flights.FlyOptions) -> dict[str, Any]:
 
 def plan_text(options: flights.FlyOptions) -> str:
     """Return the plan as text of 80 columns: vehicle, camera, target, path, and implausible values
-    of the profile."""
+    in the profile."""
     resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""

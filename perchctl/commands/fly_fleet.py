@@ -1,4 +1,5 @@
-"""The work behind `perchctl fleet fly`: processes, the operator, the display, and the outcome."""
+"""The implementation of `perchctl fleet fly`: processes, the operator, the display, and the
+outcome."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import display as displays
 from perchctl import fleet as fleets
 from perchctl import flight as flights
@@ -44,8 +45,8 @@ NUMBER_KEYS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class FleetSettings:
-    """The options of the command line. `log_dir`, `record`: None if they are not given; `view`:
-    serve a live page."""
+    """The options from the command line. `log_dir`, `record`: None if not given. `view`: serve a
+    live page."""
 
     seed: int
     log_dir: Path | None
@@ -56,7 +57,7 @@ class FleetSettings:
 
 
 def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
-    """Fly a fleet by its plan; return the exit code. Errors: the tree of `perchctl.errors`."""
+    """Fly a fleet according to its plan; return the exit code. Errors: any of `perchctl.errors`."""
     started, started_s = datetime.now(UTC), time.monotonic()
     folder = fleets.make_folder(_parent_folder(plan, settings), plan, started)
     options = fleets.flight_options(plan, folder, settings.seed, settings.record)
@@ -122,7 +123,7 @@ class FleetSession:
         self._told: dict[str, str] = {}
         self._radio_problems: dict[str, str] = {}
         self._problems: list[str] = []
-        self._answers: deque[str] = deque()  # to the keys, from their thread
+        self._answers: deque[str] = deque()  # replies to key presses, from the keyboard thread
         self._slowed: set[str] = set()
         self._recorded = 0
         self._failed_s: float | None = None
@@ -140,7 +141,7 @@ class FleetSession:
                 self._wait_until_ready(coordinator)
                 if asks:
                     self._ask(coordinator)
-                # The keys stop the vehicles until all have ended, also after an error.
+                # The keys must work until all vehicles have ended, even after an error.
                 self._fly(coordinator, stack)
                 outcome = self._outcome(coordinator)
                 self._end_page(_outcome_card(outcome, self._folder))
@@ -216,11 +217,11 @@ class FleetSession:
         self._refuse_failed(coordinator)
 
     def _refuse_failed(self, coordinator: fleets.Coordinator) -> None:
-        """Raise the error that has kept the fleet on the ground: the coordinator's, or a vehicle's
-        once all have ended."""
+        """Raise the error that kept the fleet on the ground: the coordinator's, or a vehicle's once
+        all vehicles have ended."""
         results = {v.name: v.result for v in coordinator.views if v.result is not None}
         failure = coordinator.failure
-        if coordinator.started:  # checked last, because it does not change back
+        if coordinator.started:  # checked last, because it can become True at any time
             return
         if failure is not None:
             raise PerchError(f"{_failure_text(failure)}; no vehicle was armed")
@@ -259,18 +260,19 @@ class FleetSession:
 
     @property
     def _keys(self) -> int:
-        """Number of vehicles that have a key."""
+        """The number of vehicles that can be landed by a key."""
         return min(len(self._options), NUMBER_KEYS)
 
     def _land_by_key(self, coordinator: fleets.Coordinator, number: int) -> str:
-        """Land the vehicle with this number at once; return the answer to the operator. Called in
+        """Land the vehicle with this number at once; return the reply to the operator. Called in
         the keyboard thread, which must not be blocked."""
         if not 1 <= number <= self._keys:
             return f"no vehicle has the key {number}: press 1 to {self._keys} to land one"
         return self._land_one(coordinator, number, f"key {number}")
 
     def _land_one(self, coordinator: fleets.Coordinator, number: int, how: str) -> str:
-        """Land the vehicle with this number at once, from any thread; return the answer."""
+        """Land the vehicle with this number at once; return the reply. May be called from any
+        thread."""
         view = coordinator.views[number - 1]
         coordinator.land(view.name)
         if view.result is not None:
@@ -280,13 +282,14 @@ class FleetSession:
         return f"{view.name}: landing ({how})"
 
     def _is_given_up(self) -> bool:
-        """True once the vehicles' time to end after a failure of the coordinator has passed."""
+        """True if the coordinator has failed, and the vehicles have not ended within the time
+        allowed."""
         now_s = time.monotonic()
         return self._failed_s is not None and now_s - self._failed_s > ENDING_TIMEOUT_S
 
     def _look(self, coordinator: fleets.Coordinator) -> None:
-        """Show news and update the record. An exception in one part is reported once; it neither
-        ends a flight nor stops the other parts."""
+        """Report what has changed, and update displays and record. An exception in one of these
+        parts is reported once; it neither ends a flight nor stops the other parts."""
         parts = (
             self._look_at_coordinator,
             self._answer_keys,
@@ -316,15 +319,15 @@ class FleetSession:
         """Report each vehicle's new stage or phase, and how its flight ended."""
         for view in coordinator.views:
             stage, reason = _stage_and_reason(view)
-            # The reason why a fleet stayed on the floor is reported in one sentence at the end.
+            # If the fleet never takes off, the reason is reported in one sentence at the end.
             is_told = coordinator.started or view.result is None
             if is_told and stage != self._told.get(view.name, fleets.Stage.STARTING.value):
                 self._tell(f"{view.name}: {stage}: {reason}".rstrip(": "))
             self._told[view.name] = stage
 
     def _look_at_radios(self, coordinator: fleets.Coordinator) -> None:
-        """Give the radio time of vehicles that have ended to the others. Report dongles that have
-        failed or recovered."""
+        """Give the radio time of vehicles whose flights have ended to the others. Report dongles
+        that have failed or recovered."""
         for view in coordinator.views:
             if view.result is not None and view.name not in self._slowed:
                 self._slowed.add(view.name)
@@ -338,8 +341,8 @@ class FleetSession:
                 self._tell(self._problems[-1])
 
     def _look_at_distances(self, coordinator: fleets.Coordinator) -> None:
-        """Report once each pair of vehicles that came too close, and each vehicle whose distance to
-        the others became unknown."""
+        """Report, once each, every pair of vehicles that came too close, and every vehicle whose
+        distance to the others became unknown."""
         near = [f"{pair}: both land" for pair in coordinator.near_pairs]
         unknown = [
             f"{name}: its position is unknown, and so is its distance to the others"
@@ -354,22 +357,22 @@ class FleetSession:
             self._panel.show([_row(number, view) for number, view in views])
 
     def _show_page(self, coordinator: fleets.Coordinator) -> None:
-        """Show the newest data from the coordinator. If the coordinator hangs, the page shows how
-        old the data is."""
+        """Show the coordinator's newest data on the page. If the coordinator hangs, the page shows
+        how old the data is."""
         if self._page is not None and coordinator.rounds != self._shown_round:
             self._shown_round = coordinator.rounds
             rows = [_row(number, view) for number, view in enumerate(coordinator.views, 1)]
             self._update_page(lambda page: page.show(rows, live=coordinator.started))
 
     def _keep_record(self, coordinator: fleets.Coordinator) -> None:
-        """Update the record file if another vehicle has ended."""
+        """Update the record file if another vehicle's flight has ended."""
         ended = sum(view.result is not None for view in coordinator.views)
         if coordinator.started and ended > self._recorded:
             self._recorded = ended
             self._write_record(coordinator)
 
     def _report(self, problem: str) -> None:
-        """Report a problem and add it to the record, once only."""
+        """Report a problem and add it to the record, unless that was already done."""
         if problem not in self._problems:
             self._problems.append(problem)
             self._tell(problem)
@@ -387,7 +390,7 @@ class FleetSession:
             self._panel.event(at)
 
     def _write_record(self, coordinator: fleets.Coordinator) -> None:
-        """Write the record so far. No error, such as a full disk, is a reason to land."""
+        """Write the record so far. An error such as a full disk does not land the vehicles."""
         try:
             record = json.dumps(self._outcome(coordinator).record(), indent=1)
             write_files({self._folder / fleets.RECORD_NAME: f"{record}\n".encode()})
@@ -409,8 +412,8 @@ class FleetSession:
         )
 
     def _end(self, error: BaseException) -> None:
-        """Land all flying vehicles, and wait until their processes have ended. Do not wait for
-        flights that hang after the operator's stop."""
+        """Land all flying vehicles, and wait until their processes have ended. After an emergency
+        stop by the operator, do not wait for processes that hang."""
         self._switch.land()
         hung = isinstance(error, Interrupted) and self._switch.listening
         if self._panel is not None and not (hung or all(map(_has_ended, self._children.values()))):
@@ -476,7 +479,7 @@ def _row(number: int, view: fleets.VehicleView) -> displays.FleetRow:
 
 
 def _outcome_card(outcome: fleets.FleetOutcome, folder: Path) -> dict[str, Any]:
-    """The result card that the page shows at the end."""
+    """The card with the result that the page shows at the end."""
     count, code = len(outcome.options), outcome.exit_code
     reason = "all vehicles hang" if code == 0 else f"exit code {code}: {EXIT_CODES[code]}"
     place = str(folder.resolve())

@@ -1,4 +1,4 @@
-"""`perchctl hover`: hover below the target for a time, and land."""
+"""`perchctl hover`: hover below the target for some time, and land."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import flight as flights
 from perchctl import profile as profiles
 from perchctl.commands.command_line import (
@@ -89,7 +89,7 @@ def hover(
 def with_hover(
     options: flights.FlyOptions, below_m: float | None, duration_s: float | None
 ) -> flights.FlyOptions:
-    """Return the options of a flight that hovers; None: the profile's value. Errors:
+    """Return the options for a hover; arguments that are None leave the profile's values. Errors:
     InvalidValue."""
     profile = options.profile
     if profile.planner.hover is None:

@@ -42,7 +42,8 @@ def ignore_signals() -> Iterator[None]:
 
 
 class Stopper:
-    """Handles Ctrl-C: the first sets `requested`, a second one raises KeyboardInterrupt."""
+    """Handles Ctrl-C: the first press sets `requested`, and the second one raises
+    KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()

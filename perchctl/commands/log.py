@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import fleet as fleets
 from perchctl import profile as profiles
@@ -42,8 +42,8 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """Return the named log, or else the newest log in the folder (by default the folder of `fly`),
-    whose name is then printed. Errors: NotFound."""
+    """Return the given log. If none is given, print and return the newest log in the folder (by
+    default, the folder that `fly` writes to). Errors: NotFound."""
     if place is not None and not place.is_dir():
         say_on_terminal(f"reading {place}")
         return place
@@ -72,7 +72,7 @@ def _counted(items: Iterable[T], advance: Callable[[], None]) -> Iterator[T]:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[records.FlightLog]:
-    """Yield the log. Errors in the block, which must only read values, are reported as errors in
+    """Yield the log. The block must only read values: any error in it is reported as an error in
     the file. Errors: NotFound, InvalidValue."""
     log = records.read_log(path)
     with records.wrap_log_errors(path):

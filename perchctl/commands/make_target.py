@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import profile as profiles
 from perchctl import target as targets
@@ -167,7 +167,7 @@ def measured(
         if text is not None
     }
     found, notes = targets.measured_target(config.target, sides_m)
-    # All keys of a marker are written, because the base profile may lack it.
+    # All keys of a marker are written, because the base profile may lack that marker.
     values = {
         f"target.{name}.{key}": value
         for name in sides_m

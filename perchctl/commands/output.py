@@ -1,4 +1,4 @@
-"""The output of commands: messages for people on stderr, results on stdout."""
+"""The output of commands: messages go to stderr, results to stdout."""
 
 from __future__ import annotations
 
@@ -18,22 +18,21 @@ NO = ("n", "no", "q", "quit")
 
 
 def say(sentence: str) -> None:
-    """Print a message on stderr, because stdout is for results. Never raises."""
+    """Print a message on stderr, because stdout is for results. Never raises an exception."""
     print_lines(f"perchctl: {sentence}")
 
 
 def say_on_terminal(sentence: str) -> None:
-    """Print a message on a terminal that says what the command is doing, before it loads libraries,
-    which takes a second or more. Nothing is printed to a pipe or a file, where nobody is
-    waiting."""
+    """Print what the command is about to do, because loading libraries then takes a second or more.
+    Print only on a terminal: nobody waits in front of a pipe or a file."""
     with contextlib.suppress(OSError, ValueError):
         if sys.stderr.isatty():
             say(sentence)
 
 
 def print_lines(text: str, stdout: bool = False) -> bool:
-    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Returns
-    False if a result on stdout is lost, as on a full disk."""
+    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Return
+    False if a result on stdout is lost, for example because a disk is full."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
@@ -60,8 +59,8 @@ def stdin_number() -> int:
 
 
 def ask(question: str) -> str:
-    """Ask on stderr, with line editing on a terminal, and return the typed line. Raises EOFError at
-    the end of the input."""
+    """Ask a question on stderr, with line editing on a terminal, and return the typed line. Raises
+    EOFError at the end of the input."""
     if sys.stdin.isatty() and sys.stdout.isatty():
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  its import gives input() the keys of line editing
@@ -74,8 +73,8 @@ def ask(question: str) -> str:
 
 
 def ask_to_confirm(question: str) -> bool:
-    """Ask on the terminal; return True if the answer is yes. Input typed before the question is
-    discarded."""
+    """Ask a yes-or-no question on the terminal; return True if the answer is yes. Input typed
+    before the question is discarded."""
     with contextlib.suppress(OSError, ValueError, termios.error):
         termios.tcflush(stdin_number(), termios.TCIFLUSH)
     try:
@@ -92,5 +91,5 @@ def add_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[s
 
 
 def print_result(result: Mapping[str, Any] | Sequence[Any] | str | Path) -> None:
-    """Print a command's result on stdout: a text or a path as it is, anything else as JSON."""
+    """Print a command's result on stdout: text or a path as it is, anything else as JSON."""
     print(result if isinstance(result, str | Path) else json.dumps(result), flush=True)

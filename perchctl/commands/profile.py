@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
@@ -215,8 +215,8 @@ def new(
 
 
 def _with_near_calibration(profile: profiles.Profile, output: Path) -> profiles.Profile:
-    """Return the profile with the path of a calibration in the folder of `output`, or below it,
-    relative to that folder, so that both can be moved together."""
+    """Return the profile with a relative path to the calibration if that is in the folder of
+    `output` or below it, so that both can be moved together."""
     path, folder = Path(profile.camera.calibration), output.absolute().parent.resolve()
     if not (path.is_absolute() and path.is_relative_to(folder)):
         return profile
@@ -236,16 +236,14 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "left":
         return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
-        with contextlib.suppress(
-            ValueError
-        ):  # a value that is not a number is refused later, as the large side
+        with contextlib.suppress(ValueError):  # a large side that is not a number is refused later
             return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
     return QUESTIONS[name]
 
 
 def ask_questions(given: Answers) -> Answers:
-    """Ask the questions not answered in `given`, each until its answer is valid, and have all
-    answers confirmed at the end; return them. Raises UsageError at the end of the input."""
+    """Ask the questions not answered in `given`, each until its answer is valid, then ask the user
+    to confirm all answers; return them. Raises UsageError at the end of the input."""
     names = [name for name in QUESTIONS if name not in given]
     before: list[Answers] = [given]
     while True:
@@ -323,13 +321,13 @@ def _read(name: str, typed: str) -> str:
 
 
 def _shown(name: str, value: str) -> str:
-    """Return the text of a key's value as a person would type it."""
+    """Return a key's value as a user would type it."""
     if name not in MEASURES:
         return value
     unit, size = MEASURES[name]
     try:
         numbers = [float(part) / size for part in value.strip("[]").split(",")]
-    except ValueError:  # a word, or a number with its unit, as in --set
+    except ValueError:  # a word, or a number with its unit, as given with --set
         return value
     return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
 
@@ -347,9 +345,9 @@ def answers_text(answers: Answers) -> str:
 def profile_and_keys(
     answers: Answers, name: str, option: str = "--set"
 ) -> tuple[profiles.Profile, set[str]]:
-    """Return the profile of these answers, with defaults for the others, and the keys to write to
-    its file. Raises NotFound, InvalidValue, UsageError, each with the key and, if the answers come
-    from the command line, with the `option`."""
+    """Return the profile that these answers describe, with defaults for unanswered questions, and
+    the keys to write to its file. Raises NotFound, InvalidValue, UsageError; each message names the
+    key and, if the answers come from the command line, the `option`."""
     texts = {key: text for key, text in answers.items() if key not in EDGES_AND_CEILING}
     if "target.large.side_m" in texts and "target.small.side_m" not in texts:
         texts["target.small.side_m"] = default_answer("target.small.side_m", answers)
@@ -374,7 +372,7 @@ def profile_and_keys(
         )
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    # An AI-deck sends few and late images, so it needs more keys than its calibration.
+    # An AI-deck sends few images, and late, so several keys must differ, not only the calibration.
     base = profiles.load_profile("aideck") if _is_aideck(source) else profiles.Profile()
     shipped = analysis.profile_differences(
         *(p.model_dump(mode="json") for p in (profiles.Profile(), base))
@@ -447,8 +445,8 @@ def schema() -> None:
     print(json.dumps(profiles.json_schema(), indent=2))
 
 
-# --- The camera's rotation in words: which edge of its image is the vehicle's front ---
-# People see the image and the vehicle, but no axes. A hand over the vehicle's front appears at one
+# --- The camera's rotation, asked in words: which edge of its image is at the vehicle's front? ---
+# Users see the image and the vehicle, but no axes. A hand over the vehicle's front appears at one
 # edge of the image, a hand over its left side at another. The two edges determine the camera's
 # rotation about its viewing direction and whether the image is mirrored (docs/conventions.md,
 # "Camera mount").
@@ -465,8 +463,8 @@ UPRIGHT = math.cos(math.radians(30.0))
 
 
 def left_edges(front: str) -> tuple[str, str]:
-    """Return the image edge at the vehicle's left side, in an unmirrored and in a mirrored image,
-    if the edge `front` is at the vehicle's front."""
+    """Return the two image edges that can be at the vehicle's left side (in an unmirrored and in a
+    mirrored image) if the edge `front` is at the vehicle's front."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
@@ -479,8 +477,8 @@ def yaw_deg_and_mirrored(front: str, left: str) -> tuple[float, bool]:
     x, y = PICTURE_EDGES[front]
     mirrored = left == left_edges(front)[1]
     if mirrored:
-        x = -x  # for the image as it is used, after a mirrored one was flipped
-    # The front is at the angle a in the image; x right, y down, seen from below: the turn is -a.
+        x = -x  # a mirrored image is flipped before it is used
+    # The front is at the angle a in the image (x right, y down), seen from below, so the yaw is -a.
     turn_deg = -math.degrees(math.atan2(y, x))
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored
 

@@ -1,4 +1,4 @@
-"""Displays during a command: progress bars, and the guidance for a measurement."""
+"""Displays during a command: progress bars, and guidance through a measurement."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import display as displays
 
@@ -46,8 +46,8 @@ def progress_bar(
     stream: TextIO | None = None,
     unit: str = "flights",
 ) -> Iterator[Callable[[FinishedFlight], None]]:
-    """Show a bar that counts flights; yield the function to call with each result; `earlier`
-    results are counted from the start."""
+    """Show a bar that counts flights; yield the function to call with each result. The bar starts
+    with the `earlier` results."""
     ends = Counter(result.outcome for result in earlier)
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
     with _bar(unit, *columns, total=total, stream=stream, width=8) as update:
@@ -66,7 +66,7 @@ def progress_bar(
 
 @contextlib.contextmanager
 def count_bar(label: str, total: int | None, is_shown: bool = True) -> Iterator[Callable[[], None]]:
-    """Show a progress bar; yield the function that advances it by one. `total` None: unknown."""
+    """Show a progress bar; yield the function that advances it by one. `total`: None if unknown."""
     with _bar(label, TimeRemainingColumn(), total=total, is_shown=is_shown) as update:
         yield lambda: update(advance=1)
 
@@ -103,7 +103,7 @@ def _bar(
         yield partial(progress.update, progress.add_task("", total=total))
 
 
-# --- Guidance for a person ---
+# --- Guidance for the user ---
 
 _BAR_WIDTH = 30
 _GUIDE_HZ = 8
@@ -113,8 +113,8 @@ _GUIDE_HZ = 8
 def guidance_display(
     page: displays.LivePage | None, stream: TextIO | None = None
 ) -> Iterator[Callable[[calibrations.GuidedFrame], None]]:
-    """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as one line
-    per change, and on the page if there is one."""
+    """Yield the function that shows a guided frame: on a terminal as a table, otherwise as one line
+    per change, and also on the live page if there is one."""
     console = Console(file=stream or sys.stderr)
     with contextlib.ExitStack() as stack:
         table: Live | None = None

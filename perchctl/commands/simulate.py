@@ -1,4 +1,5 @@
-"""`perchctl simulate`: seeded flights in lockstep, counted; two profiles compared; a sweep."""
+"""`perchctl simulate`: count the outcomes of seeded flights, compare two profiles, or sweep a
+key."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import analysis
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
@@ -283,14 +284,14 @@ def _fly_by_each(
         )
 
 
-# --- Executors, and how a campaign ends ---
+# --- Run a campaign with an executor ---
 
 
 def make_executor(
     jobs: int | None, cluster: str | None, flown: Sequence[profiles.Profile], flights: int
 ) -> AbstractContextManager[Executor]:
-    """Return a campaign's executor: processes here, or a cluster's workers, which must have the
-    files of `flown`. Errors: UsageError."""
+    """Return the executor for a campaign: processes on this computer, or the workers of a cluster,
+    which must have the files of the profiles `flown`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -318,13 +319,13 @@ def run_campaign(
     find_error: Callable[[list[Any]], PerchError | None] = lambda results: None,
     unit: str = "flights",
 ) -> int:
-    """Fly a campaign of `total` flights, or of another `unit` of work; report those flown, however
-    it ends; return the exit code.
+    """Fly a campaign of `total` flights (or other units of work, named by `unit`); return the exit
+    code. However the campaign ends, the results so far are reported.
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
-    results, and the error if there is one. `earlier` results are counted, too; `store_result`
-    writes each new one. `find_error` returns an error of the results as a whole, or None.
-    Errors: PerchError if none was flown.
+    results, and the error if there is one. `earlier` results are counted as well; `store_result`
+    writes each new one. `find_error` returns an error of the results as a whole, or None. Errors:
+    PerchError if none was flown.
     """
     from perchctl.commands.progress import progress_bar
 

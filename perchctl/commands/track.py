@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-# Imported as packages, whose contents load on first use, so that a command starts at once.
+# Import whole packages: their contents load on first use, so that a command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays
@@ -152,7 +152,7 @@ def track(
                 if sender is not None:
                     sender.send(record)
                 if lines:
-                    # A late live result is worthless.
+                    # A live result must be printed at once.
                     print(record if as_json else text_line(tracked), flush=opened.live)
                 if page is not None:
                     sketch = displays.make_sketch(
@@ -204,8 +204,8 @@ def poll_until_stopped(
 
 @dataclass(frozen=True, eq=False)
 class TargetInCamera:
-    """The target's pose in the camera frame; `yaw_rad` is the heading in the image's plane,
-    `sigma_m` (3,) is along the camera's axes."""
+    """The target's pose in the camera frame. `yaw_rad` is the heading in the image plane; `sigma_m`
+    (3,) is along the camera's axes."""
 
     rvec_rad: Array
     tvec_m: Array
@@ -221,9 +221,9 @@ class TrackResult:
     Attributes:
         name: the image's file name, or else the frame's index.
         output: the pipeline's output; None if the image was not searched.
-        target: the target's pose; at stage ``none`` predicted by the filter.
-        notes: remarks on the image, a sentence each.
-        sighting: the pose by this image alone; None if the image was not searched.
+        target: the target's pose; if the stage is ``none``, it is predicted by the filter.
+        notes: remarks on the image, one sentence each.
+        sighting: the pose from this image alone; None if the image was not searched.
     """
 
     name: str | int
@@ -243,7 +243,7 @@ def target_in_camera(
     output: visions.PipelineOutput, previous: TargetInCamera | None
 ) -> TargetInCamera | None:
     """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
-    frames coincide; None without a target. `previous`: the last pose, whose tilt is kept while the
+    frames coincide; None without a target. `previous`: the last pose, whose tilt is used while the
     filter predicts."""
     import cv2
     import numpy as np
@@ -278,7 +278,8 @@ TARGET_FRAME_ID = "target"
 def track_record(
     tracked: TrackResult, frame_id: str, epoch_s: float | None = None
 ) -> dict[str, Any]:
-    """Return a result for a line of `track --json`; values that are not finite are None.
+    """Return a result as the object for one line of `track --json`; values that are not finite
+    become None.
 
     `epoch_s`: the Unix time at which the frames' clock was zero; None if that has no meaning.
     """
@@ -359,7 +360,7 @@ def _target_text(tracked: TrackResult) -> str:
 
 
 def track_state(tracked: TrackResult) -> dict[str, Any]:
-    """Return the live page's state for a result: `rows` of name and text, and `note`."""
+    """Return the state of the live page for a result: `rows` of name and text, and `note`."""
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
         ["markers", tracked.stage],
@@ -369,10 +370,10 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
 
 
 class DatagramSender:
-    """Sends texts by UDP, each as one datagram. It does not notice whether anybody receives them.
+    """Sends texts by UDP, each as one datagram. It cannot detect if nobody receives them.
 
-    An address that the operating system cannot reach is reported once per outage, and the tracking
-    continues. Raises InvalidValue for a text that is not an address, or a host without one.
+    An address that the operating system cannot reach is reported once per outage, and tracking
+    continues. Raises InvalidValue for a text that is not an address, or for an unknown host.
     """
 
     def __init__(self, address: str) -> None:
@@ -389,7 +390,7 @@ class DatagramSender:
             )
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        except (OSError, UnicodeError) as error:  # UnicodeError: not the form of a host name
+        except (OSError, UnicodeError) as error:  # UnicodeError: an invalid host name
             reason = getattr(error, "strerror", None) or "it is not a host name"
             raise InvalidValue(
                 f"--udp {address}: {host} has no address ({reason}); check the name, or give its "
@@ -435,14 +436,14 @@ class TrackSummary:
         for note in tracked.notes:
             kind = re.split("[:,]", note, maxsplit=1)[
                 0
-            ]  # without the parts that differ between frames
+            ]  # notes without the parts that differ between frames
             if not self._noted[kind]:
                 place = tracked.name if isinstance(tracked.name, str) else f"frame {tracked.name}"
                 say(f"{place}: {note}")
             self._noted[kind] += 1
 
     def text(self, took_s: float) -> str:
-        """Return the counts of all frames as a sentence; `took_s` is the time they took."""
+        """Return the counts of all frames as a sentence; `took_s` is the total time."""
         frames, took_s = self.frames, max(took_s, 1e-6)
         large, small = (100.0 * self._found[name] / max(frames, 1) for name in ("large", "small"))
         counted = "".join(f"; {note} in {n}" for note, n in self._noted.items())
