@@ -1,4 +1,4 @@
-"""The displays for people during a flight: terminal panel and live page."""
+"""The displays during a flight: a panel on the terminal, and a live page in the browser."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
-"""The live page of a fleet: a tile for each vehicle with its image, and buttons to stop.
+"""The live page for a fleet: a tile with the camera image of each vehicle, and buttons to stop.
 
-Each vehicle's own process serves its images (`FlightPage`). The page's threads fetch an image when
-a browser asks for it, so that images never use the connection that carries commands.
+Each vehicle's process serves its own images (`FlightPage`). The page's threads fetch an image when
+a browser requests it, so that images never use the connection that carries commands.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ show none."""
 
 
 class FleetPage(Page):
-    """Serves the page until closed. Only `end` and `close` wait.
+    """Serves the page until closed. Only the methods `end` and `close` wait.
 
     Args:
         count: number of vehicles in the fleet.
-        on_land: called by STOP ALL, from a thread of the page.
-        on_cut: called by STOP ALL pressed again, likewise.
-        on_land_one: called by a tile's Land with the vehicle's number, from 1 on, likewise.
+        on_land: called when STOP ALL is pressed, in a thread of the page.
+        on_cut: called in the same way when STOP ALL is pressed again.
+        on_land_one: called in the same way, with the vehicle's number (from 1), when Land is
+            pressed on a tile.
     """
 
     HTML = "fleet.html"
@@ -61,7 +62,7 @@ class FleetPage(Page):
         self.set_state(self._tiles, live=False)
 
     def show(self, rows: Sequence[FleetRow], *, live: bool = True) -> None:
-        """Show these vehicles. With `live`, the page warns when this is no longer called."""
+        """Show these vehicles. With `live`, the page warns if this method is no longer called."""
         for row in rows:
             if row.hangs or row.phase == Phase.PERCHED.value:
                 self._reached[row.name] = len(PERCH_STEPS)
@@ -71,11 +72,11 @@ class FleetPage(Page):
         self.set_state(self._tiles, live=live and not all(row.has_ended for row in rows))
 
     def event(self, line: str) -> None:
-        """Add a line to the events. It is also shown if the page is opened later."""
+        """Add a line to the list of events, which is also shown if the page is opened later."""
         self._events.append(line)
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image of the vehicle with this number; None if there is currently none."""
+        """The newest image from the vehicle with this number; None if there is currently none."""
         port = next((r.picture_port for r in self._rows if str(r.number) == name), None)
         return None if port is None else _fetch_picture(port)
 
@@ -106,7 +107,7 @@ class FleetPage(Page):
 
 
 def _fetch_picture(port: int) -> bytes | None:
-    """Return the newest image of the page on this port of this computer; None if it has none."""
+    """Fetch the newest image from the page at this local port; None if it has none."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PICTURE_TIMEOUT_S)
     with contextlib.closing(connection):
         try:

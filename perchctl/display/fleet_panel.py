@@ -1,4 +1,4 @@
-"""The live display of a fleet: one line for each vehicle on a terminal, and its events."""
+"""The live display for a fleet: events and, on a terminal, one line for each vehicle."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRow:
-    """The values that panel and page show for one vehicle. Unknown numbers are None.
+    """The values that the panel and the page show for one vehicle. Unknown numbers are None.
 
     Attributes:
         link_s: age of the newest telemetry.
-        has_ended: its flight is over; `hangs`: and it hangs with its motors off.
-        is_silent: its process has sent nothing for too long.
-        picture_port: of this computer, where its process serves its images.
+        has_ended: its flight is over; hangs: it is over, and the vehicle hangs with its motors off.
+        is_silent: its process has not sent anything for too long.
+        picture_port: local port at which its process serves its images.
     """
 
     number: int
@@ -60,7 +60,7 @@ class FleetRow:
 class FleetPanel(TerminalDisplay):
     """Prints events and, on a terminal, a line for each vehicle below them.
 
-    `frame`: sentences below and above, as far as the panel's width allows.
+    `frame`: sentences for the panel's lower and upper border, truncated to the panel's width.
     """
 
     def __init__(self, stream: TextIO, frame: tuple[str, str] = ("", "")) -> None:
@@ -87,7 +87,7 @@ class FleetPanel(TerminalDisplay):
 
 
 def fleet_table(rows: Sequence[FleetRow], below: str = "", above: str = "") -> Panel:
-    """Return the panel of these vehicles, `PANEL_COLUMNS` wide: a heading, and one line per
+    """Return the panel for these vehicles, `PANEL_COLUMNS` wide: a heading, and one line per
     vehicle."""
     table = Table.grid(padding=(0, 1))
     for name, width in _WIDTHS.items():

@@ -1,7 +1,7 @@
-"""The live page of one camera: newest image and numbers.
+"""The live page for one camera: the newest image, and numbers.
 
-The loop only stores references to the newest values. Drawing, JPEG encoding and HTTP happen in the
-page's threads; an error there is stored in `problem` and never raised.
+The loop only stores references to the newest values. Drawing, JPEG encoding and HTTP are done in
+the page's threads; an error there is stored in `problem` and never raised.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class LivePage(Page):
     Args:
         camera: projects the axes to draw.
         title: heading of the page.
-        on_land: called by the button Land, from a thread of the page; None: no buttons.
-        on_cut: called by the button Cut motors, likewise.
+        on_land: called when the button Land is pressed, in a thread of the page; None: no buttons.
+        on_cut: called in the same way when the button Cut motors is pressed.
     """
 
     HTML = "page.html"
@@ -73,11 +73,12 @@ class LivePage(Page):
         return self._clock() - self._picture_s < _PICTURE_STALE_S
 
     def state(self) -> dict[str, Any]:
-        """The state of `Page.state`, with ``fresh``: whether images arrive."""
+        """The result of `Page.state`, with the additional key ``fresh``: True while images
+        arrive."""
         return super().state() | {"fresh": self._is_fresh}
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image while images come; `name` is not used."""
+        """The newest image; None if no images arrive. `name` is not used."""
         newest = self.jpeg_after(0) if self._is_fresh else None
         return None if newest is None else newest[1]
 
@@ -109,8 +110,9 @@ def live_page(
     on_land: Callable[[], None] | None = None,
     on_cut: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
-    """Serve a page during the block; yield None unless `enabled`. `report` prints the address, and
-    at the end the page's problem if any. `on_land`, `on_cut`: as in `LivePage`."""
+    """Serve a page during the block; yield None unless `enabled`. `report` is called with the
+    address and, at the end, with the page's problem if there is one. `on_land`, `on_cut`: as in
+    `LivePage`."""
     if not enabled:
         yield None
         return
@@ -126,10 +128,10 @@ def live_page(
             report(f"the live page failed: {page.problem}")
 
 
-# --- The image with the detections drawn on it: outlines and the target's axes ---
+# --- Draw the detections on the image: marker outlines and the target's axes ---
 
 
-# Blue, green, red.
+# Colours as blue, green, red.
 _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
 _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
 _OTHER = (255, 255, 255)
@@ -141,7 +143,7 @@ _DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """An image with the overlay to draw on it, which is done outside the flight loop.
+    """An image and the overlay to draw on it; the drawing is done outside the flight loop.
 
     Attributes:
         image: grey (h, w) uint8; not changed by drawing.

@@ -1,4 +1,4 @@
-"""The live page of a flight: images, numbers, and buttons to land and to cut the motors."""
+"""The live page for a flight: images, numbers, and buttons to land and to cut the motors."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ HOVER_STEPS = [*PERCH_STEPS[:5], Phase.HOVER.value]
 
 
 class FlightPage:
-    """Watcher of the flight loop for the live page.
+    """Watches the flight loop and updates the live page.
 
-    A failing page does not land the vehicle: `problem` stays None, `page.problem` has the error.
+    A failing page does not land the vehicle: `problem` stays None, and `page.problem` contains the
+    error.
     """
 
     name = "the live page"
@@ -52,13 +53,13 @@ class FlightPage:
 
     @classmethod
     def of(cls, page: LivePage, profile: Profile) -> FlightPage:
-        """The watcher of a flight with this profile."""
+        """The watcher for a flight with this profile."""
         return cls(page, profile.target.large.side_m, profile.vehicle.gear_body_m[2])
 
     def frame(self, frame: Frame) -> None:
         self._frame = frame
         try:
-            if not self._flying:  # no ticks that would show it yet
+            if not self._flying:  # before take-off, no tick updates the page
                 self.page.show(Sketch(frame.image))
         except Exception as error:
             self.page.store_error(error)
@@ -85,14 +86,15 @@ class FlightPage:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:
-        """Show the flight's outcome, its log, and the command for a report, as the final state."""
+        """Show the final state: the flight's outcome, its log, and the command that makes a
+        report."""
         rows = [list(row) for row in summary.rows()]
         good = summary.outcome == "perched" or summary.is_hover_completed
         self._end(summary.outcome, summary.reason_text, rows, log, good)
 
     def fail(self, error: BaseException, log: Path | None) -> None:
-        """Show that the flight ended in an error or never began, with the rescue's report, and the
-        log if there is one."""
+        """Show that the flight ended with an error or never began, the report of the rescue after
+        the error, and the log if there is one."""
         rows = [["flight", self._rescue]] if self._rescue else []
         self._end("failed", str(error) or type(error).__name__, rows, log)
 
@@ -119,10 +121,11 @@ def _off_and_below_m(tick: Tick) -> tuple[float | None, float | None]:
 def flight_state(
     tick: Tick, drawing_sizes: dict[str, float], past: Sequence[Past] = ()
 ) -> dict[str, Any]:
-    """The page's state for a tick: phase, battery, the rows of the terminal's panel, whether
-    the flight is over, and for the page's drawings the height, the target's offset and distance
-    above in m (None: no target), and `drawing_sizes` (`large_m`, `gear_m`). `past`: what a page
-    that is opened now has missed, sent as age in s, offset and distance."""
+    """The page's state for a tick: phase, battery, the rows of the terminal's panel, and a flag
+    that the flight is over. For the page's drawings, it also contains the height, the target's
+    lateral offset and its distance above the vehicle in m (None: no target), and `drawing_sizes`
+    (`large_m`, `gear_m`). `past`: earlier values for a page that is opened late, sent as age in s,
+    offset and distance."""
     state, volts = tick.state, tick.telemetry.battery_v
     off_m, below_m = _off_and_below_m(tick)
     ground_m, hover = state.belief.ground_z_m, state.belief.profile.planner.hover

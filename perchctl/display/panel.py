@@ -1,4 +1,4 @@
-"""The live display of a flight on a terminal: its content for one tick, and how it is drawn."""
+"""The live display for a flight on a terminal: its content for one tick, and its drawing."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 def status_rows(tick: Tick) -> list[tuple[str, str]]:
-    """Return name and text of each line of the status panel, at most 80 columns together, in m, cm
-    and degrees."""
+    """Return the name and the text of each line in the status panel, together at most 80 columns
+    wide, in m, cm and degrees."""
     state, target = tick.state, tick.target
     if target is None:
         error = "no target seen yet"
@@ -93,7 +93,7 @@ def _outside_text(outside: ExternalPositions) -> str:
 
 
 def event_text(event: Event) -> str:
-    """An event as one line."""
+    """The text of an event, as one line."""
     match event.kind:
         case EventKind.PHASE:
             text = f"{event.phase.value if event.phase else '?'}: {event.reason}"
@@ -105,9 +105,9 @@ def event_text(event: Event) -> str:
 
 
 class FlightPanel(TerminalDisplay):
-    """Watcher of the flight loop that prints events and, on a terminal, a status panel below them.
-    No method raises, and only `close` waits (bounded). A failing display must not land the vehicle:
-    `problem` is always None, `failure` says why the output stopped.
+    """Watches the flight loop, and prints events and, on a terminal, a status panel below them. No
+    method raises an exception, and only `close` waits (with a timeout). A failing display must not
+    land the vehicle, so `problem` is always None; `failure` says why the output stopped.
     """
 
     name = "the panel"
@@ -123,7 +123,7 @@ class FlightPanel(TerminalDisplay):
         super().__init__(stream)
 
     def tick(self, tick: Tick) -> None:
-        """Show a tick of the loop at once if its phase is new, else at most every 0.1 s; the last
+        """Show a tick at once if the phase has changed, otherwise at most every 0.1 s. The last
         tick is always shown."""
         is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
         self._tick = tick
@@ -146,9 +146,9 @@ class FlightPanel(TerminalDisplay):
 
 
 def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
-    """The status panel of a tick: at most `PANEL_COLUMNS` columns and eight lines, one more
-    with external positions, and one more during a hover. `below` and `above` are sentences in its
-    frame."""
+    """The status panel for a tick: at most `PANEL_COLUMNS` columns and eight lines, with one more
+    line for external positions and one more during a hover. `below` and `above` are sentences for
+    its lower and upper border."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")

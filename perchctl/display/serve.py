@@ -1,4 +1,4 @@
-"""A page on 127.0.0.1, with content, buttons and an HTTP server in separate threads.
+"""A page on 127.0.0.1 with content and buttons, served over HTTP in separate threads.
 
 The flight only stores values here. An error in the page's threads is stored in `problem` and never
 raised.
@@ -24,14 +24,14 @@ state before the page closes."""
 
 
 class Page:
-    """Serves one page on localhost until closed; subclasses say what it shows.
+    """Serves one page on localhost until closed; subclasses define its content.
 
     Args:
         title: heading of the page.
-        orders: the function that each button calls, by the button's name, from a thread of the
-            page; ``land`` and ``cut`` stop all. Both None: no buttons.
+        orders: the function that each button calls, keyed by the button's name, in a thread of the
+            page. ``land`` and ``cut`` concern all vehicles; if both are None, there are no buttons.
 
-    `url` holds the token that the buttons need.
+    `url` contains the token that the buttons need.
     """
 
     HTML: ClassVar[str]
@@ -69,22 +69,22 @@ class Page:
 
     @property
     def port(self) -> int:
-        """The port on which it is served."""
+        """The port on which the page is served."""
         return int(self._server.server_address[1])
 
     # --- For the flight: these methods neither wait nor raise ---
 
     def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
-        """Show the values that `describe` returns; it is called when a browser polls.
+        """Show the values that `describe` returns; `describe` is called when a browser polls.
 
-        With `live`, the page warns when `set_state` is no longer called.
+        With `live`, the page warns if `set_state` is no longer called.
         """
         self._describe = describe
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show a card (outcome, good, reason, rows) over the last image and values. Waits up
-        to a second for a polling browser to get the card."""
+        """Show a card (outcome, good, reason, rows) over the last image and values. If a browser is
+        polling, wait up to a second for it to fetch the card."""
         with self._changed:
             self._card, self._state_s = card, None
             read_s = self._read_s
@@ -120,7 +120,8 @@ class Page:
         }
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image of this name as JPEG; None if there is none now. May wait a second."""
+        """The newest image with this name as a JPEG; None if there is currently none. May wait a
+        second."""
         return None
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
@@ -133,7 +134,7 @@ class Page:
         return name in self._orders
 
     def may_order(self, token: str) -> bool:
-        """True if the token is the one of `url`."""
+        """True if the token is the one in `url`."""
         given, own = token.encode("utf-8", "replace"), self.token.encode()
         return hmac.compare_digest(given, own)
 
@@ -161,10 +162,10 @@ class Page:
 
 
 # --- HTTP of the live page: only on loopback, and only under the names of loopback ---
-# A site in the same browser can send requests to 127.0.0.1 too. Therefore the Host header must name
-# this machine (a rebound DNS name does not), and a button needs the token from the printed address,
-# in a header that a foreign site cannot send. No response header permits a foreign site to read the
-# answers.
+# A website open in the same browser can also send requests to 127.0.0.1. Therefore the Host header
+# must name this machine (a rebound DNS name does not), and a button needs the token from the
+# printed address, in a header that a foreign site cannot send. No response header permits a foreign
+# site to read the answers.
 
 
 HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -180,7 +181,8 @@ def _read(name: str) -> str:
 
 
 def is_loopback(host: str | None) -> bool:
-    """True if a Host header names this machine, whatever the port (it may be forwarded)."""
+    """True if a Host header names this machine. The port is ignored, because it may be
+    forwarded."""
     if not host:
         return False
     try:
@@ -282,8 +284,8 @@ class _Handler(BaseHTTPRequestHandler):
                 continue
             number, jpeg = newest
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-            # The next boundary is sent with the image; otherwise a browser shows it one image
-            # late.
+            # Send the next boundary together with the image; otherwise a browser shows each image
+            # only when the next one arrives.
             self.wfile.write(head.encode() + jpeg + f"\r\n--{_BOUNDARY}\r\n".encode())
             time.sleep(LEAST_PERIOD_S)
 

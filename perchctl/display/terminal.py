@@ -1,8 +1,8 @@
-"""The common part of the panels of a flight and of a fleet: lines and, on a terminal, a panel below
-them.
+"""The common part of the displays for a flight and for a fleet: lines of text and, on a terminal, a
+panel below them.
 
-The flight only stores new values here, and the display draws them in a thread of its own. Neither
-an exception nor a stopped terminal (Ctrl-S, a stalled ssh) can therefore affect the flight.
+The flight only stores new values here, and a separate thread draws them. Neither an exception nor a
+stopped terminal (Ctrl-S, a stalled ssh connection) can therefore affect the flight.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold r
 
 
 class TerminalDisplay:
-    """Prints lines and, on a terminal, a panel below them, in a thread of its own.
+    """Prints lines and, on a terminal, a panel below them, in a separate thread.
 
-    No method raises, and only `close` waits (bounded). `failure` says why the output stopped.
+    No method raises an exception, and only `close` waits (with a timeout). `failure` says why the
+    output stopped.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -46,7 +47,7 @@ class TerminalDisplay:
         self._thread.start()
 
     def close(self) -> None:
-        """Print what is pending and release the terminal; waits at most a second."""
+        """Print all pending output and release the terminal; wait at most a second."""
         self._closing.set()
         self._wake.set()
         self._thread.join(PANEL_CLOSE_TIMEOUT_S)
@@ -87,7 +88,7 @@ class TerminalDisplay:
 
 
 def new_live(stream: TextIO) -> Live:
-    """A live display on a terminal that is drawn only by `update`."""
+    """A live display on a terminal that is redrawn only by calls of `update`."""
     console = Console(
         file=stream,
         force_terminal=True,
@@ -100,7 +101,8 @@ def new_live(stream: TextIO) -> Live:
 
 
 def frame_table(table: Table, below: str = "", above: str = "") -> Panel:
-    """A panel of `PANEL_COLUMNS` columns; `below` and `above` are sentences in its frame."""
+    """A panel of `PANEL_COLUMNS` columns; `below` and `above` are sentences for its lower and upper
+    border."""
     return Panel(
         table,
         title=Text(f"perchctl: {above}" if above else "perchctl"),
@@ -112,10 +114,10 @@ def frame_table(table: Table, below: str = "", above: str = "") -> Panel:
 
 
 def phase_style(phase: str) -> str:
-    """How a phase is written on a terminal."""
+    """The style in which a phase is printed on a terminal."""
     return _STYLES.get(phase, "bold")
 
 
 def age_text(seconds: float) -> str:
-    """An age in at most six columns."""
+    """An age as text of at most six columns."""
     return f"{1e3 * seconds:.0f} ms" if seconds < 10.0 else "none" if seconds > 1e6 else ">10 s"
