@@ -1,4 +1,4 @@
-"""Faults injected into simulated flights, and the oracle that judges flights by the true state."""
+"""Inject faults into simulated flights, and judge the flights by the simulator's ground truth."""
 
 import lazy_loader
 

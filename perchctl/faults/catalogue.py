@@ -1,7 +1,7 @@
 """The catalogue of faults that can be injected into a simulated flight.
 
-A seed must give the same flight in every version, so new draws are only added after the existing
-ones.
+A seed must give the same flight in every version, so new random draws are only added after the
+existing ones.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def draw_bool(source: DrawInputs, probability: float) -> bool:
 
 
 def duration_s(low: float = 0.1) -> Draw:
-    """Draw a duration log-uniformly from `low` to `LONGEST_LOSS_S`; one in four is permanent."""
+    """Draw a duration log-uniformly from `low` to `LONGEST_LOSS_S`; one in four draws is
+    permanent."""
 
     def draw(source: DrawInputs) -> float:
         for_s: float = log_uniform(low, LONGEST_LOSS_S)(source)
@@ -70,22 +71,22 @@ def duration_s(low: float = 0.1) -> Draw:
 
 
 def either(probability: float, first: Any, second: Any) -> Draw:
-    """Draw `first` with the given probability, else `second`; each a value or a Draw."""
+    """Draw `first` with the given probability, else `second`; each is a value or a Draw."""
     return lambda source: _value(first if draw_bool(source, probability) else second, source)
 
 
 def random_sign(size: Draw) -> Draw:
-    """Draw a number with `size` and give it a random sign."""
+    """Draw a number from `size`, and give it a random sign."""
     return lambda source: (1.0 if draw_bool(source, 0.5) else -1.0) * size(source)
 
 
 def one_of(*choices: Any) -> Draw:
-    """Draw one of several choices with equal chances."""
+    """Draw one of several choices with equal probability."""
     return lambda source: choices[int(source.rng.integers(len(choices)))]
 
 
 def draw_direction(source: DrawInputs) -> tuple[float, float]:
-    """Draw a horizontal unit vector of random direction."""
+    """Draw a horizontal unit vector in a random direction."""
     angle = float(source.rng.uniform(-math.pi, math.pi))
     return math.cos(angle), math.sin(angle)
 
@@ -119,7 +120,8 @@ def _value(value: Any, source: DrawInputs) -> Any:
 
 
 def effect(act: Callable[..., object], **values: Any) -> Draw:
-    """Draw an effect: `act` with the keyword arguments `values`, each drawn if it is a Draw."""
+    """Draw an effect: the function `act` with the keyword arguments `values`, each of which is
+    drawn if it is a Draw."""
     return lambda source: partial(act, **{name: _value(v, source) for name, v in values.items()})
 
 
@@ -136,7 +138,7 @@ def _drift(source: DrawInputs) -> e.Axes:
 
 
 def _blow(source: DrawInputs) -> e.Axes:
-    """Draw the force of a 40 ms blow that changes the speed by up to 1 m/s."""
+    """Draw the force of a 40 ms blow that changes the vehicle's speed by up to 1 m/s."""
     x, y = draw_direction(source)
     z = uniform(-0.5, 0.5)(source)
     force_n = source.scenario.mass_kg * uniform(0.2, 1.0)(source) / 0.04
@@ -207,7 +209,8 @@ def radio_effect(**values: Any) -> Draw:
 
 
 def frozen_logs(*names: str) -> Draw:
-    """Draw a freeze of the log variables `names`: their packets still arrive, unchanged."""
+    """Draw a freeze of the log variables `names`: packets still arrive, but the values do not
+    change."""
     return effect(e.log_reads, names=names, value=None, for_s=duration_s())
 
 
@@ -227,8 +230,8 @@ STATE = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "v
 
 
 # The phases in which a campaign's faults begin. HOVER is in none of these sets: a campaign flies
-# perches, and its seeds must keep drawing the same faults. Tests inject faults into a hover
-# themselves.
+# perches, and its seeds must continue to draw the same faults. Tests inject faults into a hover
+# directly.
 AIR = (
     P.APPROACH,
     P.SEARCH,
@@ -264,7 +267,7 @@ LANDED_FROM = (P.SEARCH, P.ALIGN, P.ASCEND, P.PERCH, P.COMPLETE)
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of the catalogue: `draw` gives its effects; it may begin in any of `phases`."""
+    """A fault in the catalogue: `draw` draws its effects; it may begin in any of `phases`."""
 
     name: str
     description: str
@@ -548,10 +551,11 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 @dataclass(frozen=True)
 class Case:
-    """One fault of one flight: `effects` begin `moment_s` into `phase`.
+    """One fault in one flight: its `effects` begin `moment_s` seconds into `phase`.
 
-    To reach LANDING, the operator lands `landed_after_s` into the phase `landed_from`. To reach
-    RECOVER, the magnet holds only `first_hold_ratio` of the weight at the first contact.
+    To reach the phase LANDING, the operator lands `landed_after_s` seconds into the phase
+    `landed_from`. To reach RECOVER, the magnet holds only the share `first_hold_ratio` of the
+    weight at the first contact.
     """
 
     fault: Fault
@@ -564,7 +568,7 @@ class Case:
 
     @property
     def lasts_s(self) -> float:
-        """Duration of a common cause, s."""
+        """Duration of a common cause (a fault that affects several vehicles at once), s."""
         return max(float(effect.keywords["for_s"]) for effect in self.effects)
 
 
@@ -573,8 +577,8 @@ HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """The faults whose names are listed in `names`, separated by commas; `all` selects every fault.
-    Errors: InvalidValue."""
+    """The faults listed by name in `names`, separated by commas; `all` selects every fault. Errors:
+    InvalidValue."""
     if names == "all":
         return FAULTS
     found = []
@@ -588,7 +592,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
 
 
 def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -> Case:
-    """The case of a seed, with one of `faults`; equal arguments give equal cases."""
+    """The case for a seed, with one of `faults`; equal arguments give equal cases."""
     rng = np.random.default_rng([seed, FAULT_STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]
@@ -598,7 +602,7 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 def draw_fault_case(
     fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario
 ) -> Case:
-    """Return a case of the given fault and phase, with its moment and effects drawn."""
+    """Return a case for the given fault and phase, with start time and effects drawn at random."""
     source = DrawInputs(rng, scenario)
     moment_s = uniform(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)

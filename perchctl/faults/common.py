@@ -25,7 +25,8 @@ class CommonCause:
 
     Attributes:
         fault: name, description and effects, as for a fault of one vehicle.
-        whom: all vehicles, those of one dongle (all where no dongle is known), or two.
+        whom: which vehicles it affects: all, those of one dongle (all if no dongle is known), or
+            two.
     """
 
     fault: Fault
@@ -36,8 +37,8 @@ class CommonCause:
         return self.fault.name
 
     def draw(self, rng: np.random.Generator, scenario: Scenario) -> Case:
-        """The case of each affected vehicle. Its effects begin when the fleet triggers them
-        (`FaultyFlight.begin_fault`), in whatever phase a vehicle is."""
+        """The case for each affected vehicle. Its effects begin when the fleet triggers them
+        (`FaultyFlight.begin_fault`), regardless of the vehicle's phase."""
         effects = self.fault.draw
         assert callable(effects)
         # No flight leaves its final phase, so these effects never begin on their own.

@@ -1,6 +1,6 @@
-"""The points at which faults enter a flight: its radio, its camera and the program itself.
+"""The parts of a simulated flight that faults act on: its radio, its camera and the program itself.
 
-The functions of `perchctl.faults.effects` act on `FaultRig`.
+`FaultRig` combines them; the functions in `perchctl.faults.effects` act on it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def packet_kind(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that the radio `air` loses, and also those that a fault
+    """A radio that loses all packets that the radio `air` loses, and also those that a fault
     selects."""
 
     def __init__(self, air: Radio | None = None) -> None:
@@ -55,8 +55,8 @@ class FaultyRadio(Radio):
         self.receive: Callable[[Packet], None] | None = None
 
     def lose(self, end_s: float, uplink: bool, block: str, delay_s: float = math.inf) -> None:
-        """Until `end_s` lose all commands if `uplink`, and the packets of the log block `block`
-        ("all": of every block); a finite `delay_s` delays the log packets instead."""
+        """Until `end_s`, lose all commands if `uplink` is True, and all packets of the log block
+        `block` ("all": of every block). A finite `delay_s` delays the log packets instead."""
         self._losses.append((end_s, uplink, block, delay_s))
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
@@ -96,8 +96,8 @@ LOST = 0.2
 
 @dataclass(frozen=True)
 class CameraFault:
-    """A camera fault that lasts `for_s`; `kind`: silent, frozen, snow, dark, covered, lossy,
-    out-of-order, mirrored, late (by `late_s`), sooner (by `late_s`, than the profile expects)."""
+    """A camera fault that lasts for `for_s`. `kind`: silent, frozen, snow, dark, covered, lossy,
+    out-of-order, mirrored, late (by `late_s`), or sooner (by `late_s` than the profile expects)."""
 
     kind: str
     for_s: float
@@ -105,7 +105,7 @@ class CameraFault:
 
 
 class FaultyCamera(WrappedSource):
-    """A frame source that passes on the simulated camera's frames and corrupts them during a
+    """A frame source that returns the simulated camera's frames, corrupted while there is a
     fault."""
 
     def __init__(self, inner: FrameSource, seed: int) -> None:
@@ -116,7 +116,7 @@ class FaultyCamera(WrappedSource):
         self._last: Frame | None = None
         self._queue: deque[Frame] = deque()
         self._overtaken: Frame | None = None
-        self.late_s = 0.0  # delay until a fault begins, which the profile knows
+        self.late_s = 0.0  # delay before a fault begins, included in the profile's latency
 
     def begin_fault(self, fault: CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
@@ -147,7 +147,7 @@ class FaultyCamera(WrappedSource):
                 image = (self._last or frame).image
             case "snow":
                 image = self._noise(frame.image, 120.0, INJECTED_SNOW_SIGMA)
-            case "covered":  # by a sheet in the ceiling's grey that hides the target
+            case "covered":  # a sheet as grey as the ceiling hides the target
                 image = self._noise(frame.image, float(frame.image.mean()), SHEET_SIGMA)
             case "dark":
                 image = np.asarray(cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN), np.uint8)
@@ -186,7 +186,7 @@ class FaultyCamera(WrappedSource):
         return frame
 
 
-# --- The program: simulated time passes while its loop does not run ---
+# --- The program: let simulated time pass while its loop does not run ---
 
 
 USER_PATIENCE_S = 60.0
@@ -194,21 +194,23 @@ USER_PATIENCE_S = 60.0
 
 
 class ProgramKilled(BaseException):
-    """Ends the program under test; its `except Exception` clauses do not catch it."""
+    """Ends the program under test. Not an Exception, so that its `except Exception` clauses do not
+    catch it."""
 
 
 class PlantedError(Exception):
-    """The exception that a fault raises in the loop, which the program does not expect."""
+    """The unforeseen exception that a fault raises in the loop."""
 
 
 class FaultyClock:
-    """Simulated time: a fault acts on the program where the loop waits. A killed program sends
-    nothing through `radio`. A flight longer than `stop_s` is ended.
+    """The flight's simulated clock. Faults in the program take effect whenever the loop waits. A
+    killed program sends nothing through `radio`. A flight that takes longer than `stop_s` is ended.
 
     Attributes:
-        pending: function to call once, when the loop waits next.
-        tick_s, slow_until_s: until `slow_until_s` each tick takes at least `tick_s`.
-        killed_s: when the program was killed, or None; `endless`: killed because of `stop_s`.
+        pending: function to call once, the next time the loop waits.
+        tick_s, slow_until_s: until `slow_until_s`, each tick takes at least `tick_s`.
+        killed_s: time at which the program was killed, or None; endless: it was killed because of
+            `stop_s`.
     """
 
     def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
@@ -254,15 +256,15 @@ class FaultyClock:
             self.kill()
 
 
-# --- All of them ---
+# --- All parts together ---
 
 
 @dataclass
 class FaultRig:
-    """The parts of a flight that faults act on. `press` is the operator's Ctrl-C, and `hang_up`
-    closes the terminal. `disk.problem` is the error of the log's disk. The deck provides no
-    positions while `deck_silent` is set. Each of `on_sample` is called every `SAMPLE_S` with the
-    time."""
+    """The parts of a flight that faults act on. `press` acts like the operator's Ctrl-C, and
+    `hang_up` like closing the terminal. `disk.problem` is the error that the log's disk reports.
+    The deck provides no positions while `deck_silent` is set. Each function in `on_sample` is
+    called every `SAMPLE_S` with the time."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio
@@ -281,12 +283,14 @@ class FaultRig:
         self._later.sort(key=lambda entry: entry[0])
 
     def set_until(self, end_s: float, owner: Any, name: str, value: Any, later: Any) -> None:
-        """Set the attribute `name` of `owner` to `value` now, and to `later` at `end_s`."""
+        """Set the attribute `name` of `owner` to `value` now, and to `later` at the time
+        `end_s`."""
         setattr(owner, name, value)
         self.call_at(end_s, partial(setattr, owner, name, later))
 
     def call_due(self, t_s: float) -> None:
-        """Call each function of `call_at` that is due by `t_s`, and each of `on_sample`."""
+        """Call each function passed to `call_at` that is due by `t_s`, and each function in
+        `on_sample`."""
         while self._later and self._later[0][0] <= t_s:
             self._later.pop(0)[1]()
         for act in self.on_sample:

@@ -1,7 +1,7 @@
-"""The effects of a fault: functions that act on the edges of a flight when the fault begins, at
-`t_s`.
+"""The effects of faults: each is a function that acts on the parts of a flight (`FaultRig`) when
+the fault begins, at `t_s`.
 
-Durations count from the beginning of the fault.
+Durations are measured from the beginning of the fault.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def radio_loss(
     down: str = "",
     delay_s: float = math.inf,
 ) -> None:
-    """Lose all commands for `for_s` if `up`, and the packets of the log block `down` ("all": of
-    every block). A finite `delay_s` delays the log packets instead."""
+    """For `for_s`, lose all commands if `up` is True, and all packets of the log block `down`
+    ("all": of every block). A finite `delay_s` delays the log packets instead."""
     rig.radio.lose(t_s + for_s, up, down, delay_s)
 
 
@@ -87,17 +87,18 @@ def external_positions(
     late_s: float = 0.0,
     swapped_with: str | None = None,
 ) -> None:
-    """Make the motion capture of a vehicle without a deck fail for `for_s` as
-    `CAPTURE_FAULTS[how]`, or be late by `late_s`. `swapped_with`: the other body of a swap of
-    names; None: the first one."""
+    """For a vehicle without a deck, make the motion-capture system fail for `for_s` as in
+    `CAPTURE_FAULTS[how]`, or delay its frames by `late_s`. `swapped_with`: the body that swaps
+    names with the vehicle's; None: the first other one."""
     assert rig.vehicle.capture is not None
     fault = replace(CAPTURE_FAULTS[how], late_s=late_s, swapped_with=swapped_with)
     rig.vehicle.capture.begin_fault(fault, for_s)
 
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the deck's absolute positions for `for_s`. Until then they corrected the accelerometer,
-    which reads `acc_z_mps2` too much along z throughout the flight because the motors shake it."""
+    """Stop the deck's absolute positions for `for_s`. Throughout the flight, the accelerometer
+    reads `acc_z_mps2` too much along z because the motors shake it; the positions correct the
+    estimate for that until they stop."""
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 
@@ -112,7 +113,7 @@ def estimate_error(
     drift_mps: Axes = (0.0, 0.0, 0.0),
     for_s: float = FOR_EVER,
 ) -> None:
-    """Add a step, a turn in heading, and a drift, world axes, to the state estimate."""
+    """Add a step, a change of heading, and a drift, in world axes, to the state estimate."""
 
     def spoil(now: Any) -> None:
         after_s = rig.vehicle.t_s - t_s
@@ -132,8 +133,8 @@ def estimate_error(
 def log_reads(
     rig: FaultRig, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
 ) -> None:
-    """Make the log variables `names` report `value` for `for_s`; None: freeze them at their current
-    values."""
+    """Make the log variables `names` report `value` for `for_s`; if `value` is None, freeze them at
+    their current values."""
     firmware = rig.vehicle.firmware
     for name in names:
         firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
@@ -141,7 +142,7 @@ def log_reads(
 
 
 def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> None:
-    """Let the battery's resting voltage drop by `by_v` at the rate `rate_vps`."""
+    """Make the battery's resting voltage drop by `by_v` at the rate `rate_vps`."""
     world, left_v = rig.vehicle.world, by_v
 
     def sag(_now_s: float) -> None:
@@ -154,20 +155,20 @@ def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> Non
 
 
 def thrust_changed(rig: FaultRig, t_s: float, to: tuple[float, float, float, float]) -> None:
-    """Multiply each motor's thrust by its factor in `to`, as if it had another propeller."""
+    """Multiply each motor's thrust by its factor in `to`, as if it had a different propeller."""
     powertrain = rig.vehicle.world.powertrain
     s1, s2, s3, s4 = (s * part for s, part in zip(powertrain.strength, to, strict=True))
     powertrain.strength = (s1, s2, s3, s4)
 
 
 def push(rig: FaultRig, t_s: float, force_n: Axes, for_s: float) -> None:
-    """Let a force, world axes, act on the vehicle for `for_s`."""
+    """Push the vehicle with a force, in world axes, for `for_s`."""
     still_n = (0.0, 0.0, 0.0)
     rig.set_until(t_s + for_s, rig.vehicle.world, "external_force_n", force_n, still_n)
 
 
 def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
-    """Release the magnet permanently, `after_s` after the gear has touched it."""
+    """Disable the magnet permanently, `after_s` after the gear has touched it."""
     world, contact_s = rig.vehicle.world, math.inf
 
     def watch(now_s: float) -> None:
@@ -181,7 +182,7 @@ def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
 
 
 def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
-    """Move the target and its magnet by (x, y), world axes."""
+    """Move the target and its magnet by (x, y), in world axes."""
     x, y = rig.vehicle.world.magnet.target_xy_m
     rig.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
@@ -192,13 +193,14 @@ def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
 def operator(
     rig: FaultRig, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False
 ) -> None:
-    """Press Ctrl-C at each of `presses_s` after `t_s`, or close the terminal if `hang_up`."""
+    """Press Ctrl-C at each of the times `presses_s` after `t_s`, or close the terminal if `hang_up`
+    is True."""
     for press_s in presses_s:
         rig.call_at(t_s + press_s, rig.hang_up if hang_up else rig.press)
 
 
 def killed(rig: FaultRig, t_s: float) -> None:
-    """Kill the program when its loop waits next."""
+    """Kill the program the next time its loop waits."""
     rig.clock.pending = rig.clock.kill
 
 
@@ -227,15 +229,15 @@ def raises(rig: FaultRig, t_s: float) -> None:
 
 
 def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
-    """Let the log's disk be full for `for_s`."""
+    """Make the log's disk full for `for_s`."""
     rig.set_until(t_s + for_s, rig.disk, "problem", "No space left on device", None)
 
 
-# --- Effects from the start of the flight ---
+# --- Effects that apply from the start of the flight ---
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
-    """The scenario with a magnet that holds the part `of_weight` of the vehicle's weight."""
+    """The scenario with a magnet that holds the share `of_weight` of the vehicle's weight."""
     hold_n = of_weight * (scenario.mass_kg * GRAVITY_MPS2)
     return replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
 
@@ -249,7 +251,8 @@ OF_THE_SCENARIO = (magnet_holds, room)
 
 
 def apply_to_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """Return the scenario with those `effects` applied that hold from the start of the flight."""
+    """Return the scenario with those of the `effects` applied that last from the start of the
+    flight."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
@@ -261,7 +264,8 @@ def apply_to_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenar
 
 
 def apply_to_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
-    """The profile with the positioning and the camera latency that the effects need."""
+    """The profile, changed to the positioning method and the camera latency that the effects
+    require."""
     for effect in effects:
         if effect.func in (external_positions, deck_silent):
             by = "deck" if effect.func is deck_silent else "mocap"
@@ -275,19 +279,20 @@ def apply_to_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
 
 
 def latency_drop_s(effect: Effect) -> float:
-    """Time by which an effect shortens the latency that the profile expects, s."""
+    """Time by which an effect makes images arrive sooner than the profile expects, s."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
 
-# --- When they begin ---
+# --- Begin the effects at the right time ---
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or when the phase ends earlier.
+    """Begins effects `moment_s` seconds into `phase`, or at the end of the phase if that is
+    earlier.
 
-    `tick` is called with each tick of the loop, `begin_due` every `SAMPLE_S` of simulated time.
-    `begin_s` is None until the effects begin; `flown` is the phase of the newest tick.
+    `tick` must be called with each tick of the loop, and `begin_due` every `SAMPLE_S` of simulated
+    time. `begin_s` is None until the effects begin; `flown` is the phase of the newest tick.
     """
 
     def __init__(
@@ -315,7 +320,7 @@ class Injector:
         if self.begin_s is not None:
             return
         if self.flown is not self._phase:
-            if self._due_s is not None:  # the phase was left before the moment came
+            if self._due_s is not None:  # the phase has ended earlier
                 self.begin(self._edges.vehicle.t_s)
         elif self._due_s is None:
             self._due_s = tick.t_s + self._moment_s
@@ -331,7 +336,7 @@ class Injector:
 
 
 def _measure(rig: FaultRig, noise: random.Random, _now_s: float) -> None:
-    """Pass a position from the deck to the estimator."""
+    """Pass a position measured by the deck to the estimator."""
     if rig.deck_silent:
         return
     world, firmware = rig.vehicle.world, rig.vehicle.firmware

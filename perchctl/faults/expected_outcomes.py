@@ -1,4 +1,5 @@
-"""Outcomes that physics or the firmware make unavoidable.
+"""Expected outcomes: failures that physics or the firmware make unavoidable, so that they do not
+count against the program.
 
 Their causes are taken from the ground truth of the flight (`Facts`), not from the drawn fault or
 the program's reports.
@@ -13,7 +14,7 @@ from perchctl.faults.effects import battery_sags, killed, push, thrust_changed
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 
-# from a lower height, a slip ends on the floor (docs/firmware.md, "Catching a slip")
+# after a slip below this height, the vehicle hits the floor (docs/firmware.md, "Catching a slip")
 CATCHABLE_M = 1.0
 NOTICED_S = 1.5
 """Time until the program must accept a low battery reading, s. Larger: a late landing is
@@ -30,8 +31,9 @@ CUT_DOWN: tuple[Flag, ...] = (*FALL, "strayed", "locked_needlessly")
 
 @dataclass(frozen=True)
 class ExpectedOutcome:
-    """An outcome that no program could avoid: `flags` raised within `within_s` after the time that
-    `cause` gives (None: no such time) do not count. `reason` fits into a line of the table."""
+    """An outcome that no program could avoid. `cause` returns the time at which its cause occurred,
+    or None; `flags` raised within `within_s` after that time do not count. `reason` must fit into
+    one line of the table."""
 
     name: str
     reason: str
@@ -135,7 +137,7 @@ EXPECTED_OUTCOMES = (
 
 
 def unexpected_flags(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
-    """Return the flags that count: those that no expected outcome covers."""
+    """Return the flags that count against the program: those that no expected outcome covers."""
     return tuple(
         flag
         for flag, t_s in flags.items()

@@ -1,4 +1,4 @@
-"""One flight in lockstep with a fault, judged by the simulator's ground truth."""
+"""Fly one flight in lockstep with a fault, and judge it by the simulator's ground truth."""
 
 from __future__ import annotations
 
@@ -70,14 +70,15 @@ PROBE = Packet(Port.LINK, 0, b"")
 
 
 class FaultyFlight:
-    """One flight with a fault and its judge, ready for a single call of `fly`.
+    """One flight with a fault, and the oracle that judges it. `fly` may be called only once.
 
-    It is also a `Watcher` of the loop; `problem` is the error of the log's disk, or None.
+    It is also a `Watcher` of the loop; `problem` is the error that the log's disk reports, or None.
 
     Args:
-        on_sample: called with the vehicle's time every `e.SAMPLE_S` of the flight, after the judge
-            has seen it: the flights of a fleet wait for each other there.
-        others: (name, position m) of the other rigid bodies of a motion capture; None: as drawn.
+        on_sample: called with the vehicle's time every `e.SAMPLE_S` of the flight, after the oracle
+            has been updated. The flights of a fleet wait for each other in it.
+        others: (name, position m) of each other rigid body that the motion-capture system tracks;
+            None: as drawn from the seed.
     """
 
     def __init__(
@@ -141,10 +142,10 @@ class FaultyFlight:
         self._descent_bound = DescentBound(case.effects, profile)
         self._facts = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # contact with the ceiling since the fault began
-        self._crashed = False  # the program ended by an exception that no fault raised
+        self._crashed = False  # an exception that no fault raised has ended the program
 
     def fly(self) -> FaultResult:
-        """Fly to the end, wait until the vehicle is at rest, and return the judgement."""
+        """Fly to the end, wait until the vehicle is at rest, and return the oracle's result."""
         self._vehicle.on_sample = self._each
         self._link.connect()
         if self._case.fault.phases == FROM_THE_START:
@@ -170,7 +171,8 @@ class FaultyFlight:
 
     @property
     def end(self) -> str | None:
-        """One of `ENDS` once the program has ended, even if its vehicle is still being watched."""
+        """How the program ended (one of `ENDS`), even if its vehicle is still being observed; None
+        while it runs."""
         return self._end
 
     def land(self) -> None:
@@ -178,7 +180,7 @@ class FaultyFlight:
         self._switch.land()
 
     def begin_fault(self) -> None:
-        """Begin the case's effects now, unless they have begun."""
+        """Begin the case's effects now, unless they have already begun."""
         if self._injector.begin_s is None:
             self._injector.begin(self._vehicle.t_s)
 
@@ -187,7 +189,7 @@ class FaultyFlight:
             injector.tick(tick)
 
     def event(self, event: Event) -> None:
-        """Pass the claims of a rescue event to the oracle."""
+        """Pass the claims made by a rescue event to the oracle."""
         self._oracle.add_claims(rescue_claims(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:
@@ -219,7 +221,7 @@ class FaultyFlight:
         self._facts.update(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.on_floor and not sample.motors_on:
-            # otherwise most of the time would be spent rendering images of the wait
+            # render no images while waiting, because that would take most of the computing time
             self._vehicle.camera = None
         self._on_sample(t_s)
 
@@ -304,7 +306,7 @@ def fly_with_fault(
     log: Path | None = None,
     record: bool = False,
 ) -> FaultResult:
-    """Fly a case to its end and judge the flight by the true state; `log`: file for the flight
+    """Fly a case to its end, and judge the flight by the true state. `log`: file for the flight
     log, if any. Errors: NotFound, InvalidValue (calibration, log)."""
     flown_by = e.apply_to_profile(profile, case.effects)
     watcher = (
@@ -316,8 +318,8 @@ def fly_with_fault(
 def fly_fault_in_folder(
     profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    """Fly the scenario of `seed` with a fault that the seed draws from the names `faults`; the log
-    goes to `log_dir`, if any."""
+    """Fly the scenario of `seed` with a fault that is drawn with the seed from the names `faults`.
+    The log is written to `log_dir`, if given."""
     log = None if log_dir is None else seed_log_path(seed, log_dir)
 
     def fly_drawn(scenario: Scenario) -> FaultResult:

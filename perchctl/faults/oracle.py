@@ -1,6 +1,6 @@
-"""Judge only by the simulator's ground truth whether a simulated flight went wrong.
+"""The oracle: decide by the simulator's ground truth alone if a simulated flight went wrong.
 
-The oracle raises flags (docs/campaigns.md, "Faults").
+For each kind of failure, the oracle raises a flag (docs/campaigns.md, "Faults").
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ press up to 10 ms early or late. Larger: a hand counts as a key, and its stop ne
 
 
 class Sample(NamedTuple):
-    """The vehicle's true state at one moment, SI units; a standing vehicle has height 0."""
+    """The vehicle's true state at one time, in SI units; a standing vehicle has height 0."""
 
     t_s: float
     x_m: float
@@ -86,17 +86,17 @@ class Sample(NamedTuple):
     height_m: float
     vz_mps: float
     body_up_z: float  # z component of the body's z axis: 1 level, -1 upside down
-    acc_g: float  # size of the specific force
+    acc_g: float  # magnitude of the specific force
     motors_on: bool
-    pressing: bool  # the motors push against ceiling or floor
+    pressing: bool  # the motors push the vehicle against ceiling or floor
     on_floor: bool
     hanging: bool  # the magnet holds the gear
-    hold_ratio: float  # of the magnet's hold to the weight
+    hold_ratio: float  # the magnet's holding force divided by the weight
     locked: bool
-    supervisor_ended: bool  # crashed or tumbled, as the supervisor saw it
+    supervisor_ended: bool  # the supervisor has detected a crash or tumble
     horizontal_mps: float = 0.0
-    uplink: bool = True  # a packet from the program would arrive
-    # distance from where the vehicle should be, minus the drift that the fault causes
+    uplink: bool = True  # True if a packet from the program would arrive
+    # distance from where the vehicle should be, minus the drift that the fault may cause
     astray_m: float = 0.0
     miss_m: float = 0.0  # horizontal distance of the gear from the target's centre
     below_m: float = 0.0  # distance of the gear below the plane of the printed target
@@ -105,16 +105,15 @@ class Sample(NamedTuple):
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """The depth, m, to which a slip off the magnet may fall; `hold_ratio` is the hold over the
-    weight."""
+    """The depth, m, to which the vehicle may fall after slipping off the magnet. `hold_ratio` is
+    the magnet's holding force divided by the weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
-    """Return the time at which these presses of Ctrl-C command an emergency stop; None if they
-    never do.
+    """Return the time at which these presses of Ctrl-C command an emergency stop, or None.
 
     The presses come from a hand, or from a key that repeats faster than a hand can."""
     for number, press_s in enumerate(presses_s):
@@ -148,7 +147,8 @@ class _Lasting:
 
 @dataclass
 class _Fall:
-    """`slip_ratio`: the magnet's hold over the weight, None if the fall is no slip."""
+    """A fall in progress. `slip_ratio`: the magnet's holding force divided by the weight; None if
+    the fall is not a slip off the magnet."""
 
     top_m: float
     slip_ratio: float | None = None
@@ -156,11 +156,11 @@ class _Fall:
 
 
 class Oracle:
-    """Judges a flight by a profile's limits and true samples at most 20 ms apart. A gear within
-    `magnet_radius_m` of the target's centre is on the target.
+    """Judges a flight by the profile's limits, from samples of the true state at most 20 ms apart.
+    A gear within `magnet_radius_m` of the target's centre counts as on the target.
 
     Attributes:
-        flags: each raised flag with the time at which it was first raised, in order.
+        flags: each raised flag with the time at which it was first raised, in chronological order.
         drop_m: depth of the deepest fall, from its top to the catch or the floor.
         astray_m: the largest `Sample.astray_m` in the air.
         newest: the newest sample, or None.
@@ -177,20 +177,20 @@ class Oracle:
         self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
         self._hung: Sample | None = None  # last sample in which the vehicle hung
         self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(WEIGHTLESS_S)
-        self._press_s = -math.inf  # newest sample in which the vehicle pressed
+        self._press_s = -math.inf  # time of the newest sample in which the vehicle pressed
         self._pressed = _Lasting(PRESSED_S)
-        self._calm_height_m = 0.0  # height at which the vehicle last did not sink fast
+        self._calm_height_m = 0.0  # height when the vehicle was last not sinking fast
         self._fall: _Fall | None = None
-        self._weak_s = -math.inf  # last time without enough thrust to slow down
+        self._weak_s = -math.inf  # last time at which the thrust was too small to slow down
         self._before: Sample | None = None
         self._least_up_z = 1.0
         self._supervisor_ended = False
         self._may_lock = False
-        self._claims: dict[Claim, float] = {}  # claims that have not been found true yet
-        self._seen_down = _Lasting(SEEN_S)  # time at rest with motors off and telemetry arriving
-        self._said_off = False  # a claim that the motors are off has been found true
+        self._claims: dict[Claim, float] = {}  # claims not confirmed yet, with their times
+        self._seen_down = _Lasting(SEEN_S)  # at rest with motors off while telemetry arrives
+        self._said_off = False  # a claim that the motors are off was confirmed
         self._presses_s: list[float] = []
-        self._muted_s = -math.inf  # last time at which nothing arrived
+        self._muted_s = -math.inf  # last time at which no packet could reach the vehicle
         self._end_s = math.inf
 
     def add_claims(self, claims: Iterable[Claim], t_s: float) -> None:
@@ -201,8 +201,8 @@ class Oracle:
         self._presses_s.append(t_s)
 
     def note_program_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
-        """Record when the program ended. `crashed`: by an exception that was not injected;
-        `endless`: it was killed."""
+        """Record when the program ended. `crashed`: it ended with an exception that was not
+        injected. `endless`: it was killed because the flight took too long."""
         self._end_s = t_s
         if crashed:
             self._raise("crashed", t_s)
@@ -211,7 +211,7 @@ class Oracle:
 
     @property
     def stop_s(self) -> float | None:
-        """Time at which Ctrl-C commands the emergency stop, or None."""
+        """The time at which Ctrl-C commands the emergency stop, or None."""
         return emergency_stop_s(self._presses_s)
 
     def update(self, sample: Sample) -> None:
@@ -276,7 +276,8 @@ class Oracle:
             self._calm_height_m = s.height_m
 
     def _watch_touchdown(self, s: Sample) -> None:
-        """Judge a touchdown by the sample before it, whose speed the floor has not yet reduced."""
+        """Judge a touchdown by the sample before it, because the floor has already reduced the
+        speed in the sample after it."""
         before = self._before
         if before is None or before.on_floor or not s.on_floor:
             return
@@ -304,7 +305,8 @@ class Oracle:
             self._raise("flies_on", s.t_s)
 
     def _watch_claims(self, s: Sample) -> None:
-        """Judge the open claims. Motors that were claimed to be off must not turn again."""
+        """Check the claims that are not confirmed yet. Motors that were claimed to be off must not
+        turn again."""
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
@@ -320,7 +322,7 @@ class Oracle:
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         hangs = s.hanging and not s.motors_on
         off_m = math.hypot(s.miss_m, s.below_m)
-        # A vehicle that lies on its side or its back does not stand.
+        # A vehicle that lies on its side or its back does not count as standing.
         stands = not s.motors_on and not _airborne(s) and s.body_up_z > self._tilted_up_z
         truths = {
             "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
@@ -337,7 +339,7 @@ class Oracle:
         return truths[claim]
 
     def _watch_stop(self, s: Sample) -> None:
-        """Judge obedience to the emergency stop, but only while packets arrive."""
+        """Check that an emergency stop is obeyed, but only while packets can reach the vehicle."""
         if not s.uplink:
             self._muted_s = s.t_s
         stop_s = self.stop_s
@@ -347,7 +349,8 @@ class Oracle:
             self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:
-        """Judge a lock by what came before it; a later tumble is no reason."""
+        """Check if a lock of the vehicle was justified by what happened before it; a later tumble
+        does not justify it."""
         if s.supervisor_ended or s.body_up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:
@@ -358,7 +361,7 @@ def _airborne(s: Sample) -> bool:
     return not s.on_floor and s.height_m > LEAST_FALL_HEIGHT_M
 
 
-# --- The program's final messages, as claims about the vehicle that are true or false ---
+# --- Convert the program's final messages to claims about the vehicle, which are true or false ---
 
 
 Claims = set[Claim]
@@ -416,5 +419,5 @@ def report_claims(report: FlightReport) -> Claims:
 
 
 def rescue_claims(event: Event) -> Claims:
-    """The claims of a rescue's event; an empty set for any other event."""
+    """The claims made by a rescue's event; an empty set for any other event."""
     return set() if event.rest_state is None else RESCUE_CLAIMS[event.rest_state]

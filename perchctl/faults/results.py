@@ -1,5 +1,5 @@
-"""Results of flights with faults: a single flight's result, and a campaign's figures for JSON and
-as a table."""
+"""Results of flights with faults: the result of a single flight, and the figures of a campaign for
+JSON and as a table."""
 
 from __future__ import annotations
 
@@ -30,15 +30,16 @@ class FaultResult(CampaignFlight):
 
     Attributes:
         outcome: one of `ENDS`.
-        flags: what went wrong, each flag with its first time.
-        counted: the flags that no expected outcome covers.
+        flags: what went wrong: each flag with the time at which it was first raised.
+        counted: the flags that count against the program, because no expected outcome covers them.
         expected: the names of the expected outcomes whose cause occurred, whether or not a flag was
             raised.
-        begin_s: when the fault began, `moment_s` into `phase`; None if the flight ended before.
-        miss_m: distance from the target's centre; None if not perched.
-        way: the phases of the flight in order.
-        row: name of the transition that ended the flight; empty without a transition.
-        drop_m: depth of the deepest fall until it was caught, as simulated.
+        begin_s: when the fault began, `moment_s` into `phase`; None if the flight ended before
+            that.
+        miss_m: distance from the target's centre; None if the vehicle did not perch.
+        way: the phases of the flight, in order.
+        row: name of the transition that ended the flight; empty if no transition did.
+        drop_m: true depth of the deepest fall until it was caught.
         astray_m: largest distance in the air from where the vehicle should have been.
     """
 
@@ -82,11 +83,11 @@ SHARES = {
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
-    """A campaign's figures as a record for JSON.
+    """The figures of a campaign as a JSON object.
 
-    The count of a flag leaves out flights in which an expected outcome covers it. `unavoidable` is
-    the number of flights with a covered flag, `expected_outcomes` the number with each cause; the
-    figures of `SHARES` are shares of all flights.
+    A flag is not counted in flights in which an expected outcome covers it. `unavoidable` is the
+    number of flights with a covered flag, and `expected_outcomes` the number of flights with each
+    cause. The figures in `SHARES` are shares of all flights.
     """
     return {
         "flights": len(results),
@@ -108,13 +109,13 @@ def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
 
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
-    """Return the flights with a flag that counts, the most serious first."""
+    """Return the flights with a flag that counts against the program, the most serious first."""
     bad, order = [r for r in results if r.is_bad], list(FLAGS)
     return sorted(bad, key=lambda r: (min(map(order.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """Return the flights of each fault, the figures and the worst flights as plain text."""
+    """Return the flights by fault, the figures and the worst flights as plain text."""
     figures, flown = fault_summary(results), Counter(r.fault for r in results)
     wrong = Counter(r.fault for r in results if r.is_bad)
     excused = Counter(r.fault for r in results if r.is_excused)

@@ -1,5 +1,5 @@
-"""The ground truth of a flight: samples of the vehicle for the oracle, the facts that decide which
-outcomes are expected, and the bounds within which the true vehicle must stay."""
+"""The ground truth of a flight: samples of the vehicle's state for the oracle, the facts that
+determine which outcomes are expected, and the bounds within which the true vehicle must stay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PRESSING_WEIGHT_RATIO = 1.02
 
 
 class WatchedVehicle(SimulatedVehicle):
-    """A simulated vehicle that calls `on_sample` with the time, every `e.SAMPLE_S`."""
+    """A simulated vehicle that calls `on_sample` with the time every `e.SAMPLE_S`."""
 
     def __init__(
         self,
@@ -107,21 +107,25 @@ WATCH_WITHIN_S = 0.1
 
 @dataclass
 class Facts:
-    """What was true in the flight; a time is None for what never happened.
+    """What happened in a flight according to the ground truth; a time is None if the event never
+    happened.
 
     Attributes:
         effects: the fault's effects, which began at `begin_s`.
         silence_lock_s: when the firmware locked the vehicle because no packet had arrived.
-        make_onboard_landing_command: the onboard landing was under way when that silence began.
+        make_onboard_landing_command: True if the onboard landing was under way when that silence
+            began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle rebooted in the air while its motors turned.
-        stop_s: when the operator's presses ordered the motors off.
-        magnet_failed_s: when the magnet let go for good; `hung_through_watch`: by then the whole
-            weight had hung on the magnet, motors off, for the whole time of the program's watch.
-        slipped_s: when the vehicle first came off the magnet with its motors still, `slip_height_m`
-            high; `toppled`: it turned over within `TOPPLES_S`.
-        weak_s: when battery and motors could first not lift the weight any more.
-        battery_low_s, battery_low_m: time and height at which the loaded battery was first low.
+        stop_s: when the operator's key presses commanded the emergency stop.
+        magnet_failed_s: when the magnet failed permanently; `hung_through_watch`: by then, the
+            whole weight had hung on the magnet with the motors off for as long as the program
+            monitors it.
+        slipped_s: when the vehicle first came off the magnet with its motors stopped, at the height
+            `slip_height_m`; `toppled`: it turned over within `TOPPLES_S`.
+        weak_s: when battery and motors could first no longer lift the weight.
+        battery_low_s, battery_low_m: time and height at which the battery's voltage under load was
+            first too low.
     """
 
     effects: tuple[e.Effect, ...] = ()
@@ -145,7 +149,7 @@ class Facts:
 
 
 class FactsRecorder(Facts):
-    """The facts of a flight, collected from samples of the true state."""
+    """Collects the facts of a flight from samples of the true state."""
 
     def __init__(
         self, vehicle: SimulatedVehicle, profile: Profile, effects: tuple[e.Effect, ...] = ()
@@ -156,14 +160,14 @@ class FactsRecorder(Facts):
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
         self._silent_s: float | None = None  # start of the current silence
-        self._heard_s = -math.inf  # end of the newest silence that was long enough for a cut
+        self._heard_s = -math.inf  # end of the newest silence that may end in a lock
         self._landed_alone = self._begun = False
-        self._hangs_s: float | None = None  # time since which the whole weight has hung
+        self._hangs_s: float | None = None  # when the whole weight began to hang on the magnet
         self._before: Sample | None = None
 
     def update(self, sample: Sample) -> None:
-        """Record the next sample. The caller must set `begin_s` before, once the fault has
-        begun."""
+        """Record the next sample. Once the fault has begun, the caller must have set `begin_s`
+        before this call."""
         before = self._before
         self._note_silence(sample)
         self._note_hanging(sample)
@@ -181,7 +185,7 @@ class FactsRecorder(Facts):
             long and self._landed_alone
         )
         locks = s.locked and not (self._before and self._before.locked)
-        ordered = self._vehicle.firmware.supervisor.emergency  # cut by a packet, not by silence
+        ordered = self._vehicle.firmware.supervisor.emergency  # locked by a command
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
         if locks and (long or late) and self.silence_lock_s is None:
             self.silence_lock_s = s.t_s
@@ -210,7 +214,7 @@ class FactsRecorder(Facts):
             self._hangs_s = s.t_s
 
     def _note_power(self, s: Sample) -> None:
-        """Note when four times the thrust of the weakest motor no longer lifts the weight."""
+        """Record when four times the thrust of the weakest motor no longer lifts the weight."""
         vehicle, world = self._vehicle, self._vehicle.world
         weakest = min(world.powertrain.strength or (1.0,))
         lift_n = min(4.0 * MOTOR_FORCE_N, weakest * max_thrust_n(world.battery_rest_v))
@@ -235,7 +239,7 @@ FREE_AIR = GUIDED_BY_CAMERA | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
 """The camera faults that leave no usable image. During a fault in `NO_SIGHT`, no target can be
 seen."""
-# "dark" is missing because a target close by is found in the dark
+# without "dark", because a nearby target is found even in a dark image
 NO_SIGHT = (*NO_PICTURE, "covered")
 NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
@@ -253,12 +257,12 @@ HANDED_OVER_M = 0.3
 
 
 class PositionBound:
-    """The horizontal places where the vehicle may be in each phase. During take-off it is at its
-    start (or at `planner.approach_xy_m`). During search, estimate, alignment and recovery it is
-    between start and target. During ascent, press and completion it is under a target. From the
-    beginning of a landing on, it stays where it should have been at that moment.
+    """The horizontal region in which the vehicle must be in each phase. During take-off, that is
+    its start (or `planner.approach_xy_m`); during search, estimate, alignment and recovery, the
+    line between start and target; during ascent, press and completion, the place under a target.
+    From the beginning of a landing on, the region is the one at that time.
 
-    A target that looks like the vehicle's own counts, too.
+    A target that looks like the vehicle's own counts as well.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:
@@ -273,7 +277,8 @@ class PositionBound:
             self._targets.append(place)
 
     def note_phase(self, phase: Phase | None, place: Place) -> None:
-        """Note the program's phase and the vehicle's true place; the first place is the start."""
+        """Record the program's phase and the vehicle's true position; the first position is the
+        start."""
         if self._phase is None:
             self._starts.insert(0, place)
         if phase in TERMINALS and self._down_at is None:
@@ -281,11 +286,11 @@ class PositionBound:
         self._phase = phase or Phase.APPROACH
 
     def astray_m(self, place: Place) -> float:
-        """The distance from `place` to the nearest place where the vehicle may be."""
+        """The distance from `place` to the region in which the vehicle must be."""
         return min(math.dist(spot, place) for spot in self._nearest(place))
 
     def _nearest(self, place: Place) -> list[Place]:
-        """The nearest point of each line that the vehicle may be on."""
+        """The point nearest to the vehicle on each line where it may be."""
         if self._down_at is not None:
             return [self._down_at]
         if self._phase in (None, Phase.APPROACH):
@@ -309,7 +314,8 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
 
 
 def target_places(scenario: Scenario) -> list[Place]:
-    """The places of the vehicle's target and of identical neighbours; none without a target."""
+    """The positions of the vehicle's target and of neighbouring targets that look the same; none
+    without a target."""
     if scenario.no_target:
         return []
     x_m, y_m = scenario.target_xy_m
@@ -323,10 +329,11 @@ def target_places(scenario: Scenario) -> list[Place]:
 
 
 class UndetectedDrift:
-    """How far (m) a fault may push the vehicle sideways with no sensor noticing.
+    """How far (m) a fault may move the vehicle sideways without any sensor detecting it.
 
-    A drift counts while the vehicle does not steer by a visible target; a force while it acts and
-    the target that gives positions is out of view. A step does not count: it can be noticed.
+    A drift counts while the vehicle does not steer by a visible target. A force counts while it
+    acts and the target, as the positioning system, is out of view. A step does not count, because
+    it can be detected.
     """
 
     def __init__(
@@ -345,7 +352,8 @@ class UndetectedDrift:
         self._slid_m = self._fault_s = 0.0
 
     def update_drift_m(self, fault_s: float, phase: Phase | None) -> float:
-        """The possible drift, m, `fault_s` after the fault began; calls are in time order."""
+        """The possible drift, m, `fault_s` after the fault began. Must be called in order of
+        time."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0
@@ -358,13 +366,13 @@ class UndetectedDrift:
 
 
 class DescentBound:
-    """Decides when the vehicle must descend: at once on the operator's command or an exception,
-    otherwise once the fault has lasted longer than the profile's waiting time."""
+    """Determines when the vehicle must descend: at once after the operator's command or an
+    exception, otherwise once the fault has lasted longer than the profile's waiting time."""
 
     def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
         self._due_s: float | None = None  # None: the fault has not begun
-        self._from_m: float | None = None  # the vehicle's height when the descent was due
+        self._from_m: float | None = None  # the vehicle's height when the descent became due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
         """Record when the fault began, and the program's phase at that time. Further calls do
@@ -386,9 +394,9 @@ class DescentBound:
     ) -> bool:
         """True if the vehicle should have descended by now but has not.
 
-        A vehicle that has been `touching` the ceiling in time may hang there; without `uplink` the
-        time to obey starts anew. `lands`: the onboard landing is active, which counts as coming
-        down unless the vehicle climbs.
+        A vehicle that has been `touching` the ceiling in time may hang there. Without `uplink`, the
+        time allowed for obeying starts again. `lands`: the onboard landing is active, which counts
+        as descending unless the vehicle climbs.
         """
         if self._due_s is None:
             return False
@@ -413,8 +421,8 @@ def _for_s(effect: e.Effect) -> float:
 
 
 def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
-    """The seconds from an effect's beginning in `phase` until the program has to land;
-    infinite if no landing is due."""
+    """The time, s, from an effect's beginning in `phase` until the program must land; infinite if
+    it need not land."""
     safety, values, limit_s = profile.safety, effect.keywords, math.inf
     if effect.func is e.operator:
         limit_s = min(values["presses_s"])
