@@ -8,7 +8,7 @@ opened or armed. To fly, simulate or draw a fleet:
     fleet.vehicles                      # FleetVehicle: name, home_m, target_m, and an ordinary
                                         # Profile, with which a single flight is flown as it is
     plan = make_plan(fleet)             # FleetPlan; raises InvalidValue if it cannot be flown
-    plan.fleet                          # the fleet with telemetry periods that its dongles carry
+    plan.fleet                          # the fleet with telemetry periods that fit its dongles
     plan.schedule.groups                # who flies together: (("north", "east"), ("south",))
     plan.schedule.may_fly_together(a, b)
     plan.corridors["north"]             # perchctl.corridor.Corridor, in the room's axes
@@ -29,17 +29,19 @@ A flight consists of one process per vehicle, and a parent process that sends th
         coordinator.confirm(), .land(name), .views, .has_ended
     read_fleet_folder(folder)           # what such a flight has left
 
-messages: all that parent and vehicle say. vehicle_process: the vehicle's side; parent_watch: its
-operator, which lands without a parent. dispatch: who may take off, who lands, and who is too near,
-as pure functions. coordinator, children: the parent's side. prepare: what is refused before
-anything starts, and radio hubs. outcome: exit code and ``fleet.json``; folder: read again.
+messages: the messages between parent and vehicle. vehicle_process: the vehicle's side.
+parent_watch: the operator's commands in it, and landing if the parent is gone. dispatch: who may
+take off, who lands, and who is too close, as pure functions. coordinator, children: the parent's
+side. prepare: checks before anything starts, and radio hubs. outcome: exit code and ``fleet.json``.
+folder: read that file again.
 
-load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
-assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, the
-profiles that keep to them, and who flies when. plan: all of it in one call. drawing: the room from
-above. identify: what belongs together, on the floor. convert: lists of Crazyflies from other
-programs. lockstep: a whole fleet's simulated flight. room: what its vehicles share. coroutine: how
-its flights wait for each other. results: how they ended.
+load: the fleet file, and checks that two vehicles share nothing that they must not share. fleet:
+the frozen values. assignment: interchangeable targets. radio: dongles and the radio budget.
+schedule: corridors, the profiles that enforce them, and who flies when. plan: all of this in one
+call. drawing: the room from above. identify: check on the floor that each vehicle stands at its
+home. convert: lists of Crazyflies from other programs. lockstep: the simulated flight of a whole
+fleet. room: what its vehicles share. coroutine: how its flights wait for each other. results: how
+they ended.
 """
 
 import lazy_loader

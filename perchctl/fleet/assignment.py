@@ -9,11 +9,12 @@ from perchctl.fleet.fleet import Fleet
 
 def assign_nearest(fleet: Fleet) -> Fleet:
     """Return the fleet with its targets assigned so that the sum of the squared distances from home
-    to target is smallest.
+    to target is minimal.
 
     With squared distances, straight paths between starts and goals do not meet if starts and goals
-    are 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). Among equal sums, scipy's choice
-    is used, which is always the same. A target's markers move with it.
+    are 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). If several assignments have the
+    same sum, scipy's choice is used, which is deterministic. A target's markers are assigned with
+    it.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -17,7 +17,7 @@ from perchctl.flight import FlyOptions
 PROCESS_END_TIMEOUT_S = 5.0
 """Time for a process to end after its result, s. Longer: the fleet ends later. Shorter: a process
 that is only slow is killed."""
-# The child reports that it is running before it loads the libraries.
+# Before it loads the libraries, the child reports that it is running.
 VEHICLE_PROGRAM = (
     "from perchctl.children import connect_to_parent; channel = connect_to_parent(); "
     "from perchctl.fleet.vehicle_process import main; main(channel)"
@@ -25,15 +25,15 @@ VEHICLE_PROGRAM = (
 
 
 class VehicleProcess:
-    """The process of one vehicle. It has a session of its own, so that the terminal's Ctrl-C does
-    not reach it, and its output goes to a file in the flight's folder.
+    """The process of one vehicle. It runs in its own session, so that the terminal's Ctrl-C does
+    not reach it. Its output is written to a file in the flight's folder.
 
-    A thread receives its messages. A process that is stopped in the middle of a message blocks only
-    this thread. An invalid message is dropped, and `fault` says why.
+    A thread receives the messages from the process. If the process is stopped in the middle of a
+    message, only this thread is blocked. An invalid message is dropped, and `fault` says why.
     """
 
     def __init__(self, name: str, options: FlyOptions) -> None:
-        """Start the process. Raises InvalidValue if the folder cannot be written, OSError if no
+        """Start the process. Raises InvalidValue if the folder cannot be written, and OSError if no
         process can be started."""
         self._status: Status | None = None
         self._result: Result | None = None
@@ -51,15 +51,15 @@ class VehicleProcess:
             ) from None
         self._process, self._channel = spawn(VEHICLE_PROGRAM, self._output)
         self.pid = self._process.pid
-        # the process has ended already, which is noticed elsewhere
+        # the process has already ended, which is detected elsewhere
         with contextlib.suppress(OSError):
             self._channel.send(options)
         self._reader = threading.Thread(target=self._read, name=f"fleet-{name}", daemon=True)
         self._reader.start()
 
     def send(self, order: Order) -> None:
-        """Send an order, or drop it if there is no room: a stopped process reads nothing, and must
-        not block the parent's work for the others."""
+        """Send an order, or drop it if the buffer is full: a stopped process reads nothing, and
+        must not block the parent, which also serves the other vehicles."""
         with contextlib.suppress(OSError, ValueError):
             if select.select([], [self._channel], [], 0.0)[1]:
                 self._channel.send(order)
@@ -76,8 +76,7 @@ class VehicleProcess:
     def end_of_process(self) -> str | None:
         if self._reader.is_alive() or self._result is not None:
             return None
-        # A process without a connection to the fleet lands its vehicle, so it must not be ended
-        # yet.
+        # A process that has lost its connection lands its vehicle, so it must not be killed yet.
         code = self._process.poll()
         if code is None:
             return None
@@ -88,7 +87,7 @@ class VehicleProcess:
         self._process.kill()
 
     def close(self) -> None:
-        """End the process within bounded time, and delete its output file if it is empty. May be
+        """End the process, with a timeout, and delete its output file if that is empty. May be
         called twice."""
         if self._closed:
             return

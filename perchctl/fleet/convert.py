@@ -28,8 +28,8 @@ _CAPTURE = (
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedVehicle:
-    """A vehicle in another program's list: its name, its URI, and what else the list says about
-    it."""
+    """A vehicle in another program's list: its name, its URI, and anything else that the list says
+    about it."""
 
     name: str
     uri: str
@@ -39,7 +39,7 @@ class ConvertedVehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedFleet:
-    """Another program's list. `skipped` are the vehicles that it has disabled. `in_room_axes`: it
+    """Another program's list. `skipped`: the vehicles that are disabled in it. `in_room_axes`: it
     says that a Lighthouse measures the positions."""
 
     name: str
@@ -49,7 +49,7 @@ class ConvertedFleet:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Return what a fleet file needs and the list does not contain."""
+        """Return what a fleet file requires but the list does not contain."""
         homes = any(vehicle.home_m is None for vehicle in self.vehicles)
         return (*(("home_m",) if homes else ()), "target_m", "source")
 
@@ -184,6 +184,6 @@ def _text(value: Any, default: str) -> str:
 
 
 def _file_name(name: str) -> str:
-    """Return the name in the form that a fleet file allows."""
+    """Convert the name to a form that a fleet file allows."""
     fit = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-_.")[:32]
     return fit or "vehicle"

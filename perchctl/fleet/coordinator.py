@@ -1,9 +1,9 @@
 """The parent of a fleet: it receives the vehicles' messages, sends orders, and ends processes that
 hang. It has no flight logic.
 
-`Coordinator.step` does one round without waiting; `run` repeats it in a thread of its own.
-Therefore neither a blocked terminal nor an unanswered question can delay a stop. If the rounds
-hang, no more orders are sent, and every vehicle lands by itself.
+`Coordinator.step` does one round without waiting; `run` repeats it in a separate thread, so that
+neither a blocked terminal nor an unanswered question can delay a stop. If a round hangs, no more
+orders are sent, and every vehicle lands by itself.
 
 If a round raises an exception, its decisions can no longer be trusted, and
 `Coordinator.step_stopping` permanently replaces `step`. It orders all vehicles to land or, on the
@@ -57,35 +57,37 @@ class Child(Protocol):
     """The process of one vehicle, as the parent sees it. No method waits."""
 
     def send(self, order: Order) -> None:
-        """Send an order, or drop it if there is no room: the next one has the same content."""
+        """Send an order, or drop it if the buffer is full; the next order has the same content."""
 
     def newest(self) -> tuple[Status | None, float]:
-        """Return the newest status, and the time of the last message on `time.monotonic`."""
+        """Return the newest status, and the time of the last message by `time.monotonic`."""
 
     def result(self) -> Result | None:
-        """Return the process's result once it has sent one and ended."""
+        """Return the result of the process once it has sent one and has ended."""
 
     def fault(self) -> str | None:
-        """Return what is wrong with a message that it has sent, in words; None if nothing is."""
+        """Return what was wrong with a message from the process, in words; None if all were
+        valid."""
 
     def end_of_process(self) -> str | None:
-        """Return how the process has ended without a result, in words; None while it runs."""
+        """Return how the process ended without a result, in words; None while it runs."""
 
     def kill(self) -> None:
         """End the process at once."""
 
 
 class Coordinator:
-    """Flies a fleet by its plan. `confirm`, `land` and `view` may be called from any thread.
+    """Flies a fleet according to its plan. `confirm`, `land` and `views` may be used from any
+    thread.
 
     Attributes:
-        started: permission to take off has been given to the first group.
-        reasons: why vehicles were ordered to land, other than by the operator.
+        started: True once the first group has been given permission to take off.
+        reasons: why vehicles were ordered to land, unless the operator ordered it.
         near_pairs: pairs that were ordered to land because they came too close to each other.
-        unwatched: vehicles in the air whose distance to another one is unknown at present.
-        rounds: the number of rounds so far, which does not change while the thread hangs.
-        failure: the error that a round has raised, after which all are ordered to land; otherwise
-            None.
+        unwatched: vehicles in the air whose distance to another one is currently unknown.
+        rounds: the number of rounds so far; it does not change while the thread hangs.
+        failure: the error that a round has raised, after which all vehicles are ordered to land;
+            otherwise None.
     """
 
     def __init__(
@@ -103,8 +105,8 @@ class Coordinator:
         self.failure: str | None = None
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
-        # Vehicles in the order of `land` calls. Each call adds one in a single step, because the
-        # keys and the page may call it at the same time.
+        # Vehicles in the order of `land` calls. A dict, because adding to it is atomic: the keys
+        # and the page may call `land` at the same time.
         self._landed: dict[str, None] = {}
         self._were_near: frozenset[str] = frozenset()
         self._garbled: frozenset[str] = frozenset()
@@ -115,16 +117,16 @@ class Coordinator:
         self._begun_s = clock()
         self._may_have_flown: set[str] = set()
 
-    # --- Queries and orders of others ---
+    # --- Queries and commands, from any thread ---
 
     @property
     def views(self) -> tuple[VehicleView, ...]:
-        """What is known about each vehicle, in the order of the file."""
+        """What is known about each vehicle, in the order of the fleet file."""
         return self._views
 
     @property
     def are_ready(self) -> bool:
-        """True if all are ready now."""
+        """True if all vehicles are currently ready."""
         return are_all_ready(self._views)
 
     @property
@@ -133,13 +135,13 @@ class Coordinator:
         return all(view.result is not None for view in self._views)
 
     def confirm(self) -> None:
-        """Confirm on the operator's behalf: the flights begin as soon as all vehicles are ready at
-        the same time."""
+        """Record the operator's confirmation: the flights begin as soon as all vehicles are ready
+        at the same time."""
         self._confirmed = True
 
     def land(self, name: str) -> None:
-        """Land one vehicle; a vehicle on the floor does not take off any more. Raises InvalidValue
-        if no vehicle of the fleet has this name."""
+        """Land one vehicle. If it is still on the floor, it will not take off any more. Raises
+        InvalidValue if no vehicle in the fleet has this name."""
         if name not in self._children:
             known = ", ".join(self._children)
             raise InvalidValue(f"the fleet has no vehicle {name!r}; it has {known}")
@@ -153,7 +155,7 @@ class Coordinator:
         self._views = tuple(
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
-        # read once: an order to land all must not arrive after the permission
+        # read only once, so that all decisions in this round are based on the same command
         word = self._switch.read()
         if self._confirmed and are_all_ready(self._views) and word is OperatorRequest.NONE:
             self.started = True
@@ -180,9 +182,9 @@ class Coordinator:
                 self.step_stopping()
 
     def step_stopping(self) -> None:
-        """Order all to land, or to cut their motors on the operator's command, and receive what can
-        still be received. An error with one vehicle does not keep the others from getting their
-        orders."""
+        """Order all vehicles to land or, on the operator's command, to cut their motors, and
+        receive what can still be received. An error with one vehicle does not prevent the orders to
+        the others."""
         now_s, word = self._clock(), self._switch.read()
         order = Order(
             word=OperatorRequest.STOP if word is OperatorRequest.STOP else OperatorRequest.LAND
@@ -201,8 +203,8 @@ class Coordinator:
         self.rounds += 1
 
     def _watch_distances(self) -> None:
-        """Land both vehicles of a pair that came too close; they do not continue once they are
-        apart again."""
+        """Land both vehicles of a pair that came too close. The landing continues even when they
+        are apart again."""
         self.unwatched = find_unwatched(self._plan, self._views)
         for pair in find_near_pairs(self._plan, self._views):
             both = {pair.first, pair.second}
@@ -239,8 +241,8 @@ class Coordinator:
     def _lost(
         self, name: str, child: Child, status: Status | None, silent_s: float
     ) -> Result | None:
-        """Return the result of a process that has ended without one, or that hangs and is ended
-        now."""
+        """Return a result for a process that has ended without sending one, or that hangs and is
+        killed now."""
         problem = child.end_of_process()
         loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
         if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):
@@ -266,14 +268,14 @@ class Coordinator:
         due = now_s - self._sent_s.get(name, float("-inf")) >= BEAT_S - ROUND_S / 2
         if name not in self._results and (due or order != self._sent.get(name)):
             self._sent[name], self._sent_s[name] = order, now_s
-            if order.may_take_off:  # it may be lost before it has reported its take-off
+            if order.may_take_off:  # the process may have been lost before it reported the take-off
                 self._may_have_flown.add(name)
             self._children[name].send(replace(order, sent_s=now_s))
 
 
 def _explained(result: Result, why: str | None) -> Result:
-    """Return the result of a vehicle that the parent has kept from flying or has landed, with the
-    reason `why`."""
+    """Return the result with the reason `why`, for a vehicle that the parent did not permit to fly,
+    or has landed."""
     if why is None or result.exit_code == 0:
         return result
     return replace(result, reason=f"{why}: {result.reason}")

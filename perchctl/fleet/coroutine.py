@@ -1,4 +1,4 @@
-"""A function that runs in a thread of its own, but only when its owner lets it.
+"""Run a function in a separate thread, but only while its owner lets it run.
 
 A flight in lockstep is one long call, and its simulated time advances deep inside it. To advance
 several flights together, each runs in a thread that returns the baton after each step:
@@ -7,8 +7,8 @@ several flights together, each runs in a thread that returns the baton after eac
     resume()  --- baton --->    runs on
               <-- baton ----    pause()
 
-Exactly one of all these threads runs at a time, and the owner decides which, so that what they
-compute does not depend on the computer's scheduler.
+Only one of all these threads runs at a time, and the owner decides which one. The results therefore
+do not depend on the computer's scheduler.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ R = TypeVar("R")
 
 
 class CoroutineClosed(BaseException):
-    """Ends a function whose owner is gone; its `except Exception` clauses do not catch it."""
+    """Ends a function whose owner has closed it. Not an Exception, so that its `except Exception`
+    clauses do not catch it."""
 
 
 class ThreadCoroutine(Generic[R]):
     """Runs `function` from one `pause` to the next; the function itself calls `pause`.
 
-    `result` is its return value, None before it has returned. Close the object at the end: a thread
-    that waits forever keeps alive everything that its function refers to.
+    `result` is the function's return value; None until it has returned. Close the object at the
+    end, because a thread that waits forever keeps everything that its function refers to in memory.
     """
 
     def __init__(self, function: Callable[[], R], name: str) -> None:
@@ -59,7 +60,7 @@ class ThreadCoroutine(Generic[R]):
             raise CoroutineClosed
 
     def close(self) -> None:
-        """End the function at its present `pause`, unless it has already ended."""
+        """End the function at its current `pause`, unless it has already ended."""
         self._closed = True
         self._baton.release()
         self._thread.join()
@@ -71,7 +72,7 @@ class ThreadCoroutine(Generic[R]):
                 self.result = self._function()
         except CoroutineClosed:
             pass
-        except BaseException as error:  # raised for the owner, in its own thread
+        except BaseException as error:  # `resume` raises it in the owner's thread
             self._error = error
         self._ended = True
         self._returned.release()

@@ -2,22 +2,22 @@
 
     nothing is permitted until all are ready at the same time and the operator has confirmed
     groups fly in the order of the schedule, each once all of the group before have ended
-    whoever has ended in another's corridor, or nobody knows where, keeps it on the floor
-    a failure before the first take-off ends all; later it ends all with ``on_failure: land-all``
-    two in the air that are known to be too near each other land
-    nobody begins to climb while another one is near its climb, or nobody knows where that one is
+    a vehicle that has ended in another one's corridor, or nobody knows where, keeps it on the floor
+    a failure before the first take-off ends all flights; later, only with ``on_failure: land-all``
+    two vehicles in the air that are known to be too close to each other land no vehicle begins to
+    climb while another one is near its climb, or may be
 
-The reported position is used only for a vehicle that measures it in the room's axes (``frame:
-room``). For all others, the places of the plan are used.
+A vehicle's reported position is used only if it is measured in room axes (``frame: room``). For all
+other vehicles, the positions in the plan are used.
 
-If a position is old or cannot be trusted, the distances to it are unknown. An unknown distance
-lands nobody; otherwise a lost link of one vehicle would end its neighbours' flights. It does not
-count as safe either: `find_unwatched` lists such vehicles for people. Two of them are kept apart by
-the corridor that each vehicle enforces by itself, without any message.
+If a position is old or cannot be trusted, the distances to it are unknown. An unknown distance does
+not make a vehicle land; otherwise a lost link to one vehicle would end its neighbours' flights. It
+does not count as safe either: `find_unwatched` lists such vehicles for the operator. They are kept
+apart by their corridors, which each vehicle enforces by itself, without any message.
 
-As long as all vehicles keep to their corridors, everybody may climb: the plan keeps the place below
-a target at the separation from all corridors that are flown at the same time. The permission to
-climb guards against a neighbour that has left its corridor, or may have left it.
+As long as all vehicles keep to their corridors, every vehicle may climb: in the plan, the place
+below a target has the required separation from all corridors that are flown at the same time. The
+permission to climb guards against a neighbour that has left its corridor, or may have left it.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ class VehicleView:
     """What the parent knows about one vehicle.
 
     Attributes:
-        status: the newest status; None before the first.
+        status: its newest status; None before the first one.
         silent_s: time since its last message.
-        result: how it ended; None until then.
+        result: how its flight ended; None until then.
     """
 
     name: str
@@ -73,7 +73,7 @@ class VehicleView:
 
     @property
     def is_in_air(self) -> bool:
-        """True from its first setpoint to the end of its mission, as far as it has said so."""
+        """True from its first setpoint to the end of its mission, according to its status."""
         return self.result is None and self.stage is Stage.FLYING
 
     @property
@@ -87,7 +87,7 @@ class VehicleView:
 
     @property
     def is_silent(self) -> bool:
-        """True if its status is too old to count."""
+        """True if its status is too old to be used."""
         return self.silent_s >= FRESH_STATUS_S
 
     @property
@@ -98,15 +98,14 @@ class VehicleView:
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """An order for each vehicle, and the reason for each order that does not come from the
-    operator."""
+    """An order for each vehicle, and the reason for each order that the operator did not give."""
 
     orders: Mapping[str, Order]
     reasons: Mapping[str, str]
 
 
 def are_all_ready(views: Sequence[VehicleView]) -> bool:
-    """True if all are ready now."""
+    """True if all vehicles are currently ready."""
     return all(view.is_ready for view in views)
 
 
@@ -118,15 +117,17 @@ def decide(
     word: OperatorRequest = OperatorRequest.NONE,
     landed: Collection[str] = (),
 ) -> Decision:
-    """Return the orders at this moment.
+    """Return the orders to send now.
 
     Args:
-        started: all were ready, and the operator has confirmed; never taken back.
+        started: all vehicles have been ready, and the operator has confirmed; never becomes False
+            again.
         word: the operator's command for all vehicles.
         landed: vehicles that the operator has landed individually.
     """
     ended = {view.name: view.result for view in views if view.result is not None}
-    # Once the fleet flies, a vehicle that the operator has landed individually has not failed.
+    # Once the fleet flies, a vehicle that the operator has landed individually does not count as
+    # failed.
     by_key = {
         name
         for name, result in ended.items()
@@ -212,11 +213,12 @@ def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point
 
 
 def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]) -> str | None:
-    """Return why this vehicle must not begin to climb to its target now: another one in the air is
-    within the plan's separation of its climb, a column as wide as its corridor, or may be.
+    """Return why this vehicle must not begin to climb to its target now: another vehicle in the air
+    is, or may be, within the plan's separation from its climb, a column as wide as its corridor.
 
-    A vehicle without a known position is trusted to be in its corridor only if it cannot share its
-    position, answers and does not land. Otherwise it may be up to `TARGET_ALONE_M` beside its way.
+    A vehicle without a known position is assumed to be in its corridor only if it has no position
+    in room axes to report, still answers, and is not landing. Otherwise it may be up to
+    `TARGET_ALONE_M` away from its path.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
     least_m = radius_m + plan.separation_m - ROUNDING_M
@@ -240,8 +242,8 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
 
 
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:
-    """Return why this vehicle must not take off any more: another one has ended in its corridor.
-    Vehicles that have ended do not move again, so this is permanent."""
+    """Return why this vehicle must not take off any more: another vehicle's flight has ended in its
+    corridor. Such a vehicle does not move again, so this is permanent."""
     corridor = plan.corridors[name]
     for other, result in ended.items():
         vehicle = plan.fleet.vehicle(other)
@@ -262,8 +264,8 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
 
 
 def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
-    """True if a vehicle that has ended is known to stand where it took off. An estimate that begins
-    at zero drifts, so it cannot show this."""
+    """True if a vehicle whose flight has ended is known to stand where it took off. An estimate
+    that starts at zero drifts, so it cannot show this."""
     if not result.has_flown:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:

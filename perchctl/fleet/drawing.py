@@ -1,7 +1,7 @@
 """The room from above: homes, corridors, targets and order, as text and as SVG.
 
-Both show the room's axes, x to the right and y up. A plan that is refused is drawn as well, without
-its order, to show which vehicles are in each other's way.
+In both, the room's x axis points to the right and y up. A plan that is refused is drawn as well,
+without the order of flight, to show which vehicles are in each other's way.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     """The room in at most 80 columns: a map, and a line for each vehicle.
 
-    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` is in one
+    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` lies in one
     corridor, ``#`` in several.
     """
     corridors = _corridors(fleet)

@@ -1,4 +1,4 @@
-"""Several vehicles in one room, as frozen values: their homes, their targets and how they fly."""
+"""The fleet as frozen values: the vehicles in one room, with their homes, targets and profiles."""
 
 from __future__ import annotations
 
@@ -22,26 +22,28 @@ MOST_VEHICLES = 32
 
 
 def vehicle_seed(fleet_seed: int, number: int) -> int:
-    """Return the seed of the vehicle with this number, counted from 0. No two vehicles of any
-    fleets have the same seed."""
+    """Return the seed for the vehicle with this number, counted from 0. No two vehicles get the
+    same seed, not even in fleets with different seeds."""
     return MOST_VEHICLES * fleet_seed + number
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetVehicle:
-    """One vehicle of a fleet, with the ordinary `Profile` of its flight.
+    """One vehicle of a fleet, with the ordinary `Profile` for its flight.
 
-    The profile already holds the URI, the camera source and, in the axes of this vehicle's state
-    estimate, the place of its target (`target.expected_xy_m`, `planner.approach_xy_m`).
+    The profile already contains the URI, the camera source and, in the axes of this vehicle's state
+    estimate, the position of its target (`target.expected_xy_m`, `planner.approach_xy_m`).
 
     Attributes:
-        name: unique in the fleet; letters, digits, ``-``, ``_`` and ``.``, fit for a file's name.
-        home_m: where it stands before take-off, in the room's axes.
-        target_m: where its target hangs, in the room's axes.
-        heading_deg: where its nose points at home, counter-clockwise from the room's x axis.
+        name: unique in the fleet; consists of letters, digits, ``-``, ``_`` and ``.``, so that it
+            can be part of a file name.
+        home_m: position before take-off, in room axes.
+        target_m: position of its target, in room axes.
+        heading_deg: direction in which its nose points at home, counter-clockwise from the room's x
+            axis.
         frame: the origin and axes of its state estimate. ``room``: those of the room, as with
-            motion capture, Lighthouse or Loco. ``home``: it starts at zero wherever it stands,
-            as with a Flow deck or the target alone.
+            motion capture, Lighthouse or Loco. ``home``: the estimate starts at zero where the
+            vehicle stands, as with a Flow deck or the target alone.
     """
 
     name: str
@@ -53,7 +55,7 @@ class FleetVehicle:
 
     @property
     def uri(self) -> str:
-        """The vehicle's URI. A URI without a dongle (``radio:///80``) has been given one."""
+        """The vehicle's URI. If the file names no dongle (``radio:///80``), one has been chosen."""
         return self.profile.link.uri
 
     @property
@@ -63,7 +65,8 @@ class FleetVehicle:
 
     @property
     def address(self) -> str:
-        """The same text for all URIs of a vehicle, without dongle, letter case and options."""
+        """The same text for all URIs of a vehicle: without the dongle and options, in one letter
+        case."""
         return vehicle_uri(self.uri)
 
     @property
@@ -73,37 +76,37 @@ class FleetVehicle:
 
     @property
     def as_flown(self) -> FleetVehicle:
-        """The vehicle as its own process flies it. The axes of a simulated vehicle begin where it
-        stands, even if its position comes from a simulated motion capture."""
+        """The vehicle as its own process flies it. The axes of a simulated vehicle start where it
+        stands, even if a simulated motion-capture system measures its position."""
         if not self.simulated or self.frame == "home":
             return self
         return replace(self, frame="home").with_target(self.target_m)
 
     def flown_to_room(self, estimate_m: Point) -> Point:
-        """Convert a place from the axes in which `as_flown` flies to those of the room."""
+        """Convert a position from the axes of `as_flown` to those of the room."""
         axes = replace(self, frame="home") if self.simulated else self
         return axes.to_room(estimate_m)
 
     def to_room(self, estimate_m: Point) -> Point:
-        """Convert a place from the axes of the vehicle's state estimate to those of the room."""
+        """Convert a position from the axes of the vehicle's state estimate to those of the room."""
         if self.frame == "room":
             return estimate_m
         x, y = _rotated(estimate_m, math.radians(self.heading_deg))
         return self.home_m[0] + x, self.home_m[1] + y
 
     def to_estimate(self, room_m: Point) -> Point:
-        """Convert a place from the room's axes to those of the vehicle's state estimate."""
+        """Convert a position from room axes to those of the vehicle's state estimate."""
         if self.frame == "room":
             return room_m
         away = room_m[0] - self.home_m[0], room_m[1] - self.home_m[1]
         return _rotated(away, -math.radians(self.heading_deg))
 
     def with_target(self, target_m: Point, target: TargetConfig | None = None) -> FleetVehicle:
-        """The vehicle with a target at this place of the room; `target`: its markers, by default
-        those of the vehicle's profile.
+        """The vehicle with a target at this position in the room. `target`: the target's markers,
+        by default those in the vehicle's profile.
 
-        A vehicle that flies with the target alone gets no point to approach. It stands below its
-        target, and a heading error of a few degrees would make it fly away from it first.
+        A vehicle that flies with the target alone gets no approach point. It stands below its
+        target, and with a heading error of a few degrees it would first fly away from the target.
         """
         expected_m = self.to_estimate(target_m)
         planner = self.profile.planner
@@ -123,15 +126,15 @@ class FleetVehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Fleet:
-    """A fleet file as loaded and checked: no two vehicles share an address, a name, a camera or a
-    motion-capture body, and with ``assign: nearest`` each already has its target.
+    """A fleet file, loaded and checked: no two vehicles share an address, a name, a camera or a
+    motion-capture body, and with ``assign: nearest`` each vehicle already has its target.
 
     Attributes:
         order: ``one-at-a-time``, ``together`` or ``N at a time``; `most_at_once` has the number.
-        on_failure: whether the others fly on or land after one has failed.
-        separation_m: least distance between two corridors that are flown at a time; None: the
-            default (`perchctl.fleet.schedule`).
-        path: the file that it was read from.
+        on_failure: whether the other vehicles continue or land after one has failed.
+        separation_m: minimum distance between two corridors that are flown at the same time; None:
+            the default (`perchctl.fleet.schedule`).
+        path: the file that the fleet was read from.
     """
 
     name: str
@@ -152,7 +155,7 @@ class Fleet:
         return int(self.order.split()[0])
 
     def vehicle(self, name: str) -> FleetVehicle:
-        """Return the vehicle of this name. Raises KeyError."""
+        """Return the vehicle with this name. Raises KeyError."""
         for vehicle in self.vehicles:
             if vehicle.name == name:
                 return vehicle

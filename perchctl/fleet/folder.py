@@ -23,8 +23,9 @@ class FleetFolder:
     """A fleet's flight, as recorded in ``fleet.json``.
 
     Attributes:
-        logs: the logs that exist, by the vehicle's name, in the order of the record.
-        lines: how each vehicle ended, by its name, including those without a log.
+        logs: the logs that exist, keyed by vehicle name, in the order of ``fleet.json``.
+        lines: how each vehicle's flight ended, keyed by vehicle name, including vehicles without a
+            log.
     """
 
     record: dict[str, Any]
@@ -32,8 +33,8 @@ class FleetFolder:
     lines: dict[str, str]
 
     def filmed(self) -> list[FilmedVehicle]:
-        """Return each vehicle with a log, for `perchctl.analysis.write_fleet_film`. Errors: those
-        of reading a log, and InvalidValue for a record without the plan."""
+        """Return each vehicle that has a log, for `perchctl.analysis.write_fleet_film`. Errors:
+        those of reading a log, and InvalidValue if ``fleet.json`` does not contain the plan."""
         from perchctl.analysis import FlightAnalysis
 
         flights = {}
@@ -59,7 +60,7 @@ def _filmed(
     log = Path(flight.log.path)
     pace = (end.get("pace") or {}).get("ratio") or 1.0
     lasts_s = flight.log.end_s / pace
-    # The estimate of a simulated vehicle begins where it stands, even with a motion capture.
+    # A simulated vehicle's estimate starts where it stands, even with motion capture.
     is_simulated = str(plan["uri"]).startswith("sim://")
     return FilmedVehicle(
         name=name,
@@ -81,9 +82,9 @@ def _point(values: Sequence[float]) -> Point:
 
 
 def read_fleet_folder(folder: Path) -> FleetFolder | None:
-    """Return the fleet's flight in this folder; None without a ``fleet.json``.
+    """Return the fleet's flight in this folder; None if there is no ``fleet.json``.
 
-    Raises InvalidValue if that file is no record of a fleet.
+    Raises InvalidValue if that file is not the record of a fleet's flight.
     """
     path = folder / RECORD_NAME
     if not path.is_file():
@@ -96,7 +97,7 @@ def read_fleet_folder(folder: Path) -> FleetFolder | None:
             lines[name] = vehicle_line(
                 name, vehicle["hangs"], vehicle["outcome"], vehicle["miss_m"], vehicle["reason"]
             )
-            # Only the file's name, because the folder may have been moved.
+            # Use only the file name, because the folder may have been moved.
             log = None if vehicle["log"] is None else folder / Path(vehicle["log"]).name
             if log is not None and log.is_file():
                 logs[name] = log

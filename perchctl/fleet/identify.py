@@ -1,4 +1,4 @@
-"""`perchctl fleet check --identify`: check one vehicle after another that its address, body, camera
+"""`perchctl fleet check --identify`: check, one vehicle after another, that address, body, camera
 and home belong together."""
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from perchctl.fleet.schedule import have_common_marker
 def identify_fleet(
     plan: FleetPlan, scope: CheckScope, ask: Callable[[str], bool]
 ) -> Iterator[tuple[str, Row]]:
-    """Yield the rows of each vehicle with its name, as they are known. Connects to one vehicle at a
-    time, so vehicles that share a dongle need no radio hub.
+    """Yield the name and a row for each vehicle, as soon as a row is known. Connects to one vehicle
+    at a time, so vehicles that share a dongle need no radio hub.
 
     Errors: those of `flight_options` and of `perchctl.check.check`.
     """
@@ -32,7 +32,7 @@ def identify_fleet(
 
 
 def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
-    """Return where this vehicle stands, and what the others would observe in its place."""
+    """Return where this vehicle stands, and what the other vehicles would observe from there."""
     flown = vehicle.as_flown
     others = [other for other in fleet.vehicles if other.name != vehicle.name]
     own_m, within_m = _seen_m(vehicle, vehicle.target_m), vehicle.profile.target.expected_within_m
@@ -59,7 +59,7 @@ def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
 
 
 def _seen_m(vehicle: FleetVehicle, place_m: Point) -> Point:
-    """Convert a place of the room to how a vehicle at its home sees it: forward, left."""
+    """Convert a position in the room to (forward, left) as seen from the vehicle at its home."""
     return replace(vehicle, frame="home").to_estimate(place_m)
 
 

@@ -1,6 +1,6 @@
 """Load a fleet file and check it; the result is a frozen `Fleet`.
 
-Every fault is one sentence of the form ``file: vehicle NAME: key: what is wrong``. Nothing is
+Every error is one sentence of the form ``file: vehicle NAME: key: what is wrong``. Nothing is
 connected or opened.
 """
 
@@ -81,7 +81,8 @@ class _File(Section):
 
 
 def find_fleet(name: str) -> Path:
-    """Return the file of a fleet given by path or name. NotFound names the choices."""
+    """Return the file of a fleet that is given by path or name. Raises NotFound, with the available
+    names."""
     path = Path(name).expanduser()
     if path.is_file():
         return path
@@ -163,9 +164,9 @@ def _vehicle(
 
 
 def default_frame(profile: Profile) -> Frame:
-    """Return the frame of a vehicle whose fleet file names none. Motion capture measures in the
-    room's axes. A deck may be a Lighthouse but, since a profile does not say so, it counts as a
-    Flow deck, whose drift needs more room."""
+    """Return the frame of a vehicle if the fleet file does not say it. Motion capture measures in
+    room axes. A deck may be a Lighthouse but, since a profile does not say which deck it is, it
+    counts as a Flow deck, whose drift needs more room."""
     return "room" if profile.positioning.source.is_mocap else "home"
 
 
@@ -189,7 +190,7 @@ def _layers(
 
 
 def _with_own_body(profile: Profile, name: str) -> Profile:
-    """With motion capture, a body without a name gets the vehicle's name."""
+    """With motion capture, use the vehicle's name for a rigid body without a name."""
     positioning = profile.positioning
     if not positioning.source.is_mocap or "body" in positioning.model_fields_set:
         return profile
@@ -197,7 +198,8 @@ def _with_own_body(profile: Profile, name: str) -> Profile:
 
 
 def _check(where: str, vehicle: FleetVehicle) -> None:
-    """Refuse a frame, a URI or a camera source with which the vehicle could not be flown."""
+    """Raise InvalidValue for a frame, a URI or a camera source with which the vehicle could not
+    fly."""
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
@@ -208,7 +210,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
         )
     try:
         if not is_own_uri(uri):
-            # A URI for any dongle, as cfcli writes it, gets a number later.
+            # A URI without a dongle, as written by cfcli, is given one later.
             check_uri(uri.replace("radio:///", "radio://0/", 1))
         source = parse_source(vehicle.source)
     except PerchError as error:
@@ -221,7 +223,8 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
 
 
 def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> Point:
-    """Return where the vehicle's target is in the room. Raises InvalidValue if nothing says so."""
+    """Return the position of the vehicle's target in the room. Raises InvalidValue if neither the
+    file nor the profile contains it."""
     if target_m is not None:
         return target_m
     expected_m = vehicle.profile.target.expected_xy_m
@@ -258,12 +261,14 @@ def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
 
 
 def _address(vehicle: FleetVehicle) -> str | None:
-    """Return None for a simulated vehicle: each flight starts its own simulator."""
+    """The address that two vehicles must not share; None for a simulated vehicle, because each
+    flight starts its own simulator."""
     return None if vehicle.simulated else vehicle.address
 
 
 def _camera(vehicle: FleetVehicle) -> str | None:
-    """Return None for a source that is no device: the simulated camera, and recordings."""
+    """The camera that two vehicles must not share; None for a source that is not a device (the
+    simulated camera, and recordings)."""
     source = parse_source(vehicle.source)
     return source.device if source.live and source.scheme != "sim" else None
 
@@ -291,7 +296,7 @@ def _split(
                 f"{nearest_names(str(name), allowed)}"
             )
     for name, value in sections.items():
-        # The same section in another layer would replace this one unnoticed.
+        # A section with the same name in another layer would silently replace this one.
         is_text = name in _ALSO_TEXT and isinstance(value, str)
         if name in _SECTIONS and not is_text and not isinstance(value, dict):
             raise InvalidValue(
@@ -310,7 +315,8 @@ def _validated(where: object, model: type[Section], values: dict[str, Any]) -> A
 
 
 def _in_words(key: str, reason: str) -> str:
-    """Return the reason with the allowed values, where pydantic shows a regular expression."""
+    """Return the reason for an error with the allowed values in words, where pydantic shows a
+    regular expression."""
     found = reason.rpartition(", found ")[2]
     if reason.startswith("string should match") and key == "order":
         return f"found {found}; allowed are one-at-a-time, together, or as in 2 at a time"

@@ -1,5 +1,4 @@
-"""The flight of a whole fleet in lockstep: one room, one clock, and the same result for the same
-seed.
+"""Fly a whole fleet in lockstep: one room, one clock, and the same result for the same seed.
 
 Each vehicle's flight is a flight in lockstep, flown and judged as by `perchctl simulate --faults`.
 It runs in a `ThreadCoroutine` that pauses at each tick of the room's clock:
@@ -8,10 +7,11 @@ It runs in a `ThreadCoroutine` that pauses at each tick of the room's clock:
         until all of its flights have ended:
             the clock advances by TICK_S
             each flight runs until its own clock has reached the room's     (in the fleet's order)
-            the room measures distances, and says who feels whose downwash
+            the room measures distances, and updates the downwash on each vehicle
 
-Meanwhile, the vehicles of later groups stand at their homes. A vehicle that has ended stays where
-it hangs, stands or lies. A vehicle of the next group starts only if none of them is in its way.
+Meanwhile, the vehicles of later groups stand at their homes. A vehicle whose flight has ended stays
+where it hangs, stands or lies. A vehicle of the next group takes off only if none of these is in
+its way.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ _CAUSE_BY_NAME = {cause.name: cause for cause in COMMON_CAUSES}
 
 
 def fleet_faults() -> dict[str, str]:
-    """Name and description of all faults of one vehicle and all common causes."""
+    """The names and descriptions of all faults in one vehicle and of all common causes (faults that
+    affect several vehicles at once)."""
     causes = {
         name: f"in several vehicles: {c.fault.description}" for name, c in _CAUSE_BY_NAME.items()
     }
@@ -72,15 +73,15 @@ def fleet_faults() -> dict[str, str]:
 
 
 def plan_sha256(plan: FleetPlan) -> str:
-    """Return the SHA-256 of everything that may change a fleet's flight, for a file of results."""
+    """Return the SHA-256 of everything that can affect a fleet's flight, for a results file."""
     profiles = [vehicle.profile.model_dump(mode="json") for vehicle in plan.fleet.vehicles]
     text = json.dumps([plan.record(), profiles], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def select_fleet_faults(names: str) -> tuple[str, ...]:
-    """Return the faults and common causes whose names are listed in `names`, separated by commas;
-    ``all`` selects all of them. Errors: InvalidValue."""
+    """Return the faults and common causes listed by name in `names`, separated by commas; ``all``
+    selects all of them. Errors: InvalidValue."""
     if names == "all":
         return (*_FAULT_BY_NAME, *_CAUSE_BY_NAME)
     found = [part.strip() for part in names.split(",")]
@@ -92,13 +93,13 @@ def select_fleet_faults(names: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Trouble:
-    """The faults of the fleet with one seed.
+    """The faults in the fleet for one seed.
 
     Attributes:
-        name: the name of a fault or common cause; "none" without one.
-        cases: the case of each affected vehicle.
-        group, at_s: when a common cause begins: this time after the start of a group (counted from
-            0). None: each case begins by itself.
+        name: the name of a fault or common cause; "none" if there is none.
+        cases: the case for each affected vehicle.
+        group, at_s: a common cause begins `at_s` after the start of this group (counted from 0).
+            None: each case begins by itself.
     """
 
     name: str = HEALTHY.fault.name
@@ -110,8 +111,8 @@ class Trouble:
 def draw_trouble(
     plan: FleetPlan, placed: Sequence[PlacedVehicle], faults: Sequence[str], seed: int
 ) -> Trouble:
-    """Return the fault or common cause that a seed draws from the names `faults`; none if there are
-    no names."""
+    """Draw, with a seed, a fault or common cause from the names `faults`; none if there are no
+    names."""
     if not faults:
         return Trouble(cases={})
     rng = np.random.default_rng([seed, _FAULT_STREAM])
@@ -133,7 +134,8 @@ def draw_trouble(
 
 
 def swapped_cases(case: Case, first: str, second: str) -> dict[str, Case]:
-    """Return the cases of two vehicles that each get the other one's body, from the case of one."""
+    """Make the cases for two vehicles whose rigid bodies swap names, from the case for one of
+    them."""
     return {
         name: replace(
             case, effects=tuple(partial(e, swapped_with=body_name(other)) for e in case.effects)
@@ -154,7 +156,7 @@ def _whom(
     return names
 
 
-# --- One fleet ---
+# --- One fleet's flight ---
 
 
 class _Seat:
@@ -178,19 +180,19 @@ class _Seat:
                 on_sample=self._wait,
                 others=self._room.others_of(self.name) or None,
             )
-        except ConnectionFailed as error:  # such as a motion capture that does not see the vehicle
+        except ConnectionFailed as error:  # for example, motion capture does not see the vehicle
             return refused_vehicle(str(error))
         self._room.bodies[self.name].follow(flight.vehicle)
         return flight.fly()
 
     def _wait(self, t_s: float) -> None:
-        """Wait for the room's clock when this flight's own clock has reached it."""
+        """Wait for the room's clock once this flight's own clock has reached it."""
         while self._begin_s + t_s >= self._clock.t_s - 1e-6:
             self.coroutine.pause()
 
     def note_place(self) -> None:
-        """Note the position that the vehicle estimates, in its own axes: this is all that its
-        parent knows."""
+        """Record the vehicle's estimated position, in its own axes, which is all that the parent
+        knows."""
         if self.flight is not None:
             read = self.flight.vehicle.firmware.log_value
             self.known_m = read("stateEstimate.x"), read("stateEstimate.y")
@@ -218,13 +220,13 @@ class FleetFlight:
         self._placed = {each.name: each for each in placed}
         self._room, self._clock = Room(placed), _Clock()
         self._results: dict[str, FaultResult] = {}
-        # known positions in the room of the vehicles that have ended
+        # known positions, in room axes, of the vehicles whose flights have ended
         self._known_m: dict[str, Point] = {}
         self._landed_all = ""  # the vehicle whose failure makes all the others land
         self._cause_has_begun = False
 
     def fly(self, seed: int) -> FleetResult:
-        """Fly one group after another, and return how all vehicles ended."""
+        """Fly one group after another, and return how each vehicle's flight ended."""
         for number, group in enumerate(self._plan.schedule.groups):
             self._land_after_failure([])  # even if no vehicle of the group has started
             starters = [name for name in group if not self._refuse(name)]
@@ -285,8 +287,8 @@ class FleetFlight:
         self._results[seat.name] = result
         body.rest()
         vehicle = self._plan.fleet.vehicle(seat.name)
-        # An estimate in the room's axes contains the true positions; the simulated one begins at
-        # the true start. For any other estimate, the parent takes the start from the file.
+        # An estimate in room axes shows where the vehicle really started; it is simulated in axes
+        # that start there. For any other estimate, the parent assumes the start given in the file.
         axes = self._placed[seat.name].true if vehicle.frame == "room" else vehicle
         hangs = result.outcome == "perched"
         self._known_m[seat.name] = vehicle.target_m if hangs else axes.to_room(seat.known_m)
@@ -309,7 +311,7 @@ class FleetFlight:
     # --- Vehicles that must not start ---
 
     def _refuse(self, name: str) -> bool:
-        """Note a vehicle that must not start as refused, standing at its home."""
+        """Record a vehicle that must not take off as refused, standing at its home."""
         reason = self._refusal(name)
         if not reason:
             return False
@@ -325,8 +327,8 @@ class FleetFlight:
         return next(filter(None, (self._in_the_way(other, name) for other in self._known_m)), "")
 
     def _in_the_way(self, other: str, name: str) -> str:
-        """Return why a vehicle that has ended is in the way of `name`; empty if it is not. An
-        unknown position (NaN) always is."""
+        """Return why a vehicle whose flight has ended is in the way of `name`; empty if none is. A
+        vehicle at an unknown position (NaN) always is."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
         does = "hangs" if hangs else "lies"
@@ -342,8 +344,8 @@ class FleetFlight:
         return ""
 
     def _is_lasting(self, name: str) -> bool:
-        """True if a common cause that concerns this vehicle has begun and is permanent. A cause
-        whose group ended before its moment never begins."""
+        """True if a common cause that affects this vehicle has begun and is permanent. A cause
+        never begins if its group ends before the time at which it is due."""
         case = self._trouble.cases.get(name)
         return self._cause_has_begun and case is not None and case.lasts_s > FOR_GOOD_S
 
@@ -353,10 +355,10 @@ def _finite(value: float) -> float | None:
 
 
 def fly_fleet(plan: FleetPlan, faults: tuple[str, ...], seed: int) -> FleetResult:
-    """Fly one seed of a fleet to its end; any executor can send this function to a worker.
+    """Fly a fleet with one seed to the end. Any executor can send this function to a worker.
 
-    `faults`: names from `select_fleet_faults`, of which the seed draws one; without any, there is
-    no fault.
+    `faults`: names from `select_fleet_faults`, one of which is drawn with the seed; if there are
+    none, no fault is injected.
     """
 
     def fly() -> FleetResult:

@@ -6,9 +6,9 @@
 Every message contains a whole state, never a change. If one is lost, late or duplicated, the next
 one corrects it, and none has to be answered. The command in the last `Order` that arrives stays
 valid, and without another order the vehicle lands after
-`perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off counts only in the turn in
-which it is read, a permission to climb only while it is fresh, and a command to land or to cut the
-motors takes precedence.
+`perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off is valid only for the
+iteration of the flight loop (turn) that reads it, and a permission to climb only while it is fresh.
+A command to land or to cut the motors takes precedence over both.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ which a silent parent counts as dead. Shorter: they cost computing time."""
 class Stage(Enum):
     """The stages of a vehicle's process."""
 
-    STARTING = "starting"  # vehicle and camera have not answered yet
+    STARTING = "starting"  # vehicle or camera have not answered yet
     CHECKING = "checking"  # on the floor, its checks not yet passed
     READY = "ready"  # on the floor, disarmed; only permission is missing
     FLYING = "flying"  # from its first setpoint to the end of its mission
@@ -46,11 +46,12 @@ class VehicleOutcome(Enum):
     PERCHED = "perched"  # it hangs with its motors off
     LANDED = "landed"
     ABORTED = "aborted"
-    FAILED = "failed"  # its flight raised, or its process was lost
+    FAILED = "failed"  # its flight raised an exception, or its process was lost
 
     @classmethod
     def from_phase(cls, phase: Phase) -> VehicleOutcome:
-        """The outcome of a mission that ended in this phase. Raises KeyError unless it is over."""
+        """The outcome of a mission that ended in this phase. Raises KeyError if the phase is not
+        final."""
         return {
             Phase.PERCHED: cls.PERCHED,
             Phase.LANDED: cls.LANDED,
@@ -64,11 +65,11 @@ class Order:
     repeatedly.
 
     Attributes:
-        may_take_off: permission to take off; without meaning in the air.
-        may_climb: permission to begin the climb from below the target; without meaning afterwards.
-        why_not_climb: why there is none, for people.
-        sent_s: `time.monotonic` of the decision, one clock for all processes.
-        word: the operator's command; a vehicle never takes back one that it has received.
+        may_take_off: permission to take off; has no effect in the air.
+        may_climb: permission to begin the climb to the target; has no effect once it has begun.
+        why_not_climb: reason why there is no such permission, to be shown.
+        sent_s: time of the decision by `time.monotonic`, a clock that all processes share.
+        word: the operator's command; once a vehicle has received one, it stays in effect.
     """
 
     may_take_off: bool = False
@@ -80,20 +81,20 @@ class Order:
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """Where a vehicle is in its flight, for the parent's schedule and for people. Unknown numbers
+    """The state of a vehicle's flight, for the parent's decisions and for display. Unknown numbers
     are None.
 
     Attributes:
-        phase: of its mission; None on the floor before it.
+        phase: phase of its mission; None on the floor, before the mission.
         reason: what it waits for on the floor, or why it is in its phase.
-        height_m: above the ground.
-        error_m: the target's level distance from the gear.
+        height_m: height above the ground.
+        error_m: horizontal distance of the target from the gear.
         telemetry_age_s: age of the oldest part of the newest telemetry.
-        loop_age_s: time since the last turn of its flight loop; None before the first.
-        place_m: where it is, in the axes of its estimate; None while the estimate cannot be
+        loop_age_s: time since the last iteration (turn) of its flight loop; None before the first.
+        place_m: its position in the axes of its estimate; None while the estimate cannot be
             trusted.
-        log: the file of its log, once the flight has begun: should it end without a `Result`.
-        picture_port: of this computer, where its process serves its pictures; None without a page.
+        log: its log file, once the flight has begun; needed if the process ends without a `Result`.
+        picture_port: local port at which its process serves its images; None without a page.
     """
 
     stage: Stage = Stage.STARTING
@@ -111,13 +112,13 @@ class Status:
 
 @dataclass(frozen=True, kw_only=True)
 class Pace:
-    """How well the computer kept up with one flight, from the first tick to the last.
+    """How well the computer kept pace with one flight, from the first tick to the last.
 
     Attributes:
         flown_s, wall_s: duration on the loop's clock, which a simulator may provide, and on the
             wall clock.
-        gap_p50_s, gap_p99_s, gap_max_s: between two setpoints, on the wall clock.
-        cores: computing time of the vehicle's process without its simulator, per second.
+        gap_p50_s, gap_p99_s, gap_max_s: time between two setpoints, on the wall clock.
+        cores: CPU time of the vehicle's process per second, without its simulator.
     """
 
     flown_s: float
@@ -135,13 +136,14 @@ class Pace:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """How one vehicle ended; its process sends nothing after it.
+    """How one vehicle's flight ended; the last message from its process.
 
     Attributes:
-        has_flown: False if it has never left the floor by itself.
-        ended_s: `time.monotonic` at its last tick, None without one; one clock for all processes.
-        place_m: its last place, in the axes of its estimate; None if the estimate could not be
-            trusted then, or was old.
+        has_flown: False if it never took off.
+        ended_s: time of its last tick by `time.monotonic`, a clock that all processes share; None
+            if there was no tick.
+        place_m: its last position, in the axes of its estimate; None if the estimate was old or
+            could not be trusted.
     """
 
     exit_code: int

@@ -54,19 +54,19 @@ _CODES_WORST_FIRST = (*(cls.exit_code for cls in _WORST_FIRST), 0)
 
 def worst_code(codes: Iterable[int]) -> int:
     """Return the most severe of these exit codes; 0 if there are none. A code that perchctl does
-    not know counts as `PerchError`."""
+    not use counts as that of `PerchError`."""
     known = (code if code in EXIT_CODES else PerchError.exit_code for code in codes)
     return min(known, key=_CODES_WORST_FIRST.index, default=0)
 
 
 def fleet_exit_code(results: Sequence[Result]) -> int:
-    """Return 0 if all vehicles hang and their logs are complete, otherwise the code of the vehicle
-    that fared worst."""
+    """Return 0 if all vehicles hang and their logs are complete, otherwise the exit code of the
+    vehicle with the worst result."""
     return worst_code(result.exit_code for result in results)
 
 
 def worst_of(results: Mapping[str, Result]) -> str:
-    """Return the name of the vehicle whose exit code is the fleet's."""
+    """Return the name of the vehicle whose exit code is used for the fleet."""
     code = fleet_exit_code([*results.values()])
     return next(name for name, result in results.items() if worst_code([result.exit_code]) == code)
 
@@ -78,20 +78,20 @@ def as_error(name: str, result: Result) -> PerchError:
 
 
 def vehicle_line(name: str, hangs: bool, outcome: str, miss_m: float | None, reason: str) -> str:
-    """Return how one vehicle ended, in words."""
+    """Return how one vehicle's flight ended, in words."""
     miss = "" if miss_m is None else f", {1e3 * miss_m:.1f} mm from centre"
     return f"{name:<12}{'hangs' if hangs else outcome}{miss}: {reason}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetOutcome:
-    """A fleet's flight that has ended, or its present state.
+    """The outcome of a fleet's flight, or its current state.
 
     Attributes:
-        started, started_s: when it began, as a date, and on `time.monotonic`.
-        results: of the vehicles that have ended, by name.
-        problems: problems of several vehicles, such as a dead dongle, in one sentence each.
-        failed: the parent itself has failed and landed all vehicles.
+        started, started_s: when it began, as a date and by `time.monotonic`.
+        results: results of the vehicles whose flights have ended, keyed by name.
+        problems: problems that affect several vehicles, such as a dead dongle, one sentence each.
+        failed: True if the parent itself has failed and landed all vehicles.
     """
 
     plan: FleetPlan
@@ -110,8 +110,8 @@ class FleetOutcome:
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the vehicle that fared worst. A vehicle without a result counts as a
-        failure, and so does a failure of the parent."""
+        """The exit code of the vehicle with the worst result. A vehicle without a result counts as
+        a failure, and so does a failure of the parent."""
         codes = [result.exit_code for result in self.results.values()]
         failures = len(self.unfinished) + int(self.failed)
         return worst_code(codes + [PerchError.exit_code] * failures)
@@ -129,7 +129,7 @@ class FleetOutcome:
         return sum(pace.flown_s for pace in paces) / wall_s if wall_s > 0.0 else None
 
     def record(self) -> dict[str, Any]:
-        """The content of ``fleet.json``: JSON types, places in the room's axes."""
+        """The content of ``fleet.json`` in JSON types; positions are in room axes."""
         vehicles = [self._vehicle_record(name, result) for name, result in self.results.items()]
         ratio, code = self.ratio, self.exit_code
         return {

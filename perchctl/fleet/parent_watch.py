@@ -1,8 +1,8 @@
-"""The operator's commands in a vehicle's own process, and its behaviour without a parent.
+"""Receive the operator's commands in a vehicle's own process, and land if the parent is gone.
 
-The flight loop and the link's watchdog both read the command many times a second. Neither waits for
-the parent: a separate thread receives the orders, and a parent that is dead or silent counts as a
-command to land. A vehicle therefore also lands if its loop hangs and the parent is gone.
+The flight loop and the link's watchdog both read the current command many times a second. Neither
+waits for the parent: a separate thread receives the orders, and if the parent is dead or silent,
+the command is to land. A vehicle therefore also lands if its loop hangs and the parent is gone.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ may begin although a neighbour has come near since. Shorter: a busy computer del
 class ParentSwitch(OperatorSwitch):
     """An `OperatorSwitch` that is operated by the parent's orders.
 
-    `take` and `lose_parent` are called by the thread that reads the orders. The silence is measured
-    on `clock` by `read`, from its first call on.
+    `take` and `lose_parent` are called by the thread that receives the orders. `read` measures the
+    parent's silence on `clock`, starting with its first call.
     """
 
     may_take_off: bool = False
@@ -46,20 +46,22 @@ class ParentSwitch(OperatorSwitch):
     _counting: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def take(self, order: Order) -> None:
-        """Process an order. Its command can only add to what was ordered before. A lost parent
-        whose orders arrive again can still cut the motors, but cannot give permission."""
+        """Process an order. Its command cannot revoke an earlier one. If orders arrive again from a
+        parent that was considered lost, they can still cut the motors, but cannot give
+        permission."""
         self._heard = True
         self._newest = order
         if order.word is not OperatorRequest.NONE:
             self.land()
         if order.word is OperatorRequest.STOP:
             self.cut()
-        # Set after the command, so that the permission is not read before it.
+        # Set after the command, so that no reader sees the permission without the command.
         permitted = order.may_take_off and order.word is OperatorRequest.NONE
         self.may_take_off = permitted and self.lost is None
 
     def climb_withheld(self) -> str | None:
-        """Return why the climb to the target must not begin; None with a fresh permission."""
+        """Return why the climb to the target must not begin; None if there is a fresh
+        permission."""
         order = self._newest
         if self.lost is not None:
             return self.lost
@@ -68,7 +70,7 @@ class ParentSwitch(OperatorSwitch):
         return None if order.may_climb else order.why_not_climb or "the fleet is not flying"
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:
-        """Land and never take off, since nobody can stop this vehicle any more."""
+        """Land, or never take off, because nobody can stop this vehicle any more."""
         self.lost = self.lost or why
         self.may_take_off = False
         self.land()

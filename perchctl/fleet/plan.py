@@ -21,11 +21,12 @@ from perchctl.fleet.schedule import (
 
 @dataclass(frozen=True, kw_only=True)
 class FleetPlan:
-    """A fleet that can be flown: `fleet` with telemetry periods that its dongles can carry, the
-    corridor of each vehicle in the room's axes, and the schedule.
+    """The plan for a fleet that can be flown: `fleet` with telemetry periods that its dongles can
+    carry, the corridor of each vehicle in room axes, and the schedule.
 
     Attributes:
-        separation_m: least distance between the edges of two corridors that are flown at a time.
+        separation_m: minimum distance between the edges of two corridors that are flown at the same
+            time.
     """
 
     fleet: Fleet
@@ -89,8 +90,8 @@ class FleetPlan:
 
 
 def make_plan(fleet: Fleet) -> FleetPlan:
-    """Return the plan of a fleet's flight. If it cannot be flown, raises InvalidValue with one
-    sentence that names the vehicles or the dongle."""
+    """Return the plan for a fleet's flight. If the fleet cannot be flown, raise InvalidValue with
+    one sentence that names the vehicles or the dongle."""
     budgeted, dongles = budget_radio(fleet)
     return FleetPlan(
         fleet=budgeted,

@@ -1,5 +1,5 @@
-"""Prepare the options of each vehicle's process, and refuse what cannot be flown before any of them
-starts."""
+"""Prepare the options for each vehicle's process, and refuse a flight that is not possible before
+any process starts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from perchctl.link import RadioHub
 
 def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
     """Return the path of a new folder for one fleet flight: ``fleet_<UTC
-    yyyymmdd_hhmmss>_<fleet>``. The first log creates it."""
+    yyyymmdd_hhmmss>_<fleet>``. The folder is created with the first log."""
     stem = f"fleet_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{plan.fleet.name}"
     path, number = parent / stem, 1
     while path.exists():
@@ -35,30 +35,31 @@ takes more from those that fly. Smaller is not possible."""
 
 
 class Radios:
-    """The radio hubs of the dongles that several vehicles share, by dongle.
+    """The radio hubs for the dongles that several vehicles share, keyed by dongle.
 
-    The vehicles' own processes notice by themselves if their hub or dongle fails; `problems` is for
-    people.
+    The vehicles' own processes detect by themselves that their hub or dongle has failed; `problems`
+    is for display.
     """
 
     def __init__(self, hubs: Mapping[str, RadioHub]) -> None:
         self._hubs = hubs
 
     def route(self, options: Mapping[str, FlyOptions]) -> dict[str, FlyOptions]:
-        """Return the options of each flight, through its hub if it has one. `uri` remains the
-        vehicle's own URI, which identifies its log, its lock and its comparison with the motion
-        capture."""
+        """Return the options for each flight, changed to use a hub if there is one. `uri` remains
+        the vehicle's own URI, which identifies its log, its lock and its lift comparison with the
+        motion-capture system."""
         ways = {uri: way for hub in self._hubs.values() for uri, way in hub.uris.items()}
         return {name: replace(each, link_uri=ways.get(each.uri)) for name, each in options.items()}
 
     def slow_down(self, uri: str) -> None:
-        """Give the share of a vehicle whose flight has ended to those that are still flying."""
+        """Give the radio time of a vehicle whose flight has ended to those that are still
+        flying."""
         for hub in self._hubs.values():
             if uri in hub.uris:
                 hub.limit(uri, IDLE_PER_S)
 
     def problems(self) -> dict[str, str]:
-        """Return why a dongle has failed, by dongle. Never waits."""
+        """Return the reasons why dongles have failed, keyed by dongle. Never waits."""
         found = {}
         for dongle, hub in self._hubs.items():
             reported = (report.problem for report in hub.reports.values())
@@ -89,10 +90,11 @@ def open_radios(plan: FleetPlan) -> Iterator[Radios]:
 def flight_options(
     plan: FleetPlan, folder: Path, seed: int, record: bool | None
 ) -> dict[str, FlyOptions]:
-    """Return the options of each vehicle's flight, with its corridor as a safety row, checked as by
-    `perchctl fly`. Errors: those of `check_options`, with the vehicle's name.
+    """Return the options for each vehicle's flight, with its corridor as a safety row (a row in the
+    transition table), after the same checks as in `perchctl fly`. Errors: those of `check_options`,
+    with the vehicle's name.
 
-    `record`: keep the pictures; None: keep those of real vehicles.
+    `record`: keep the images; None: keep those of real vehicles only.
     """
     options = {}
     for number, vehicle in enumerate(plan.fleet.vehicles):
@@ -116,9 +118,9 @@ def flight_options(
 
 
 def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
-    """The warnings of each vehicle's offline checks, each with the names that it concerns. The
-    errors of `warnings_before_flight` and of a missing comparison with the motion capture, with the
-    vehicle's name."""
+    """The warnings from the offline checks, each with the names of the vehicles that it concerns.
+    Errors, with the vehicle's name: those of `warnings_before_flight`, and a missing lift
+    comparison with the motion-capture system."""
     names: dict[str, list[str]] = {}
     for name, each in options.items():
         with naming(name):

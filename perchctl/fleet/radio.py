@@ -72,8 +72,8 @@ class RadioPlace:
 
 @dataclass(frozen=True, kw_only=True)
 class DongleLoad:
-    """One dongle with its vehicles: the packets per second that it carries for each of them, and
-    the largest number that one of them needs."""
+    """One dongle with its vehicles: the packets per second that it can carry for each of them, and
+    the largest number that any of them needs."""
 
     dongle: str
     channel: int
@@ -94,7 +94,7 @@ def radio_place(vehicle: FleetVehicle) -> RadioPlace | None:
 
 
 def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
-    """The vehicles, each ``radio:///`` with a dongle.
+    """Return the vehicles with a dongle in each ``radio:///`` URI.
 
     Vehicles on one channel share a dongle, since two dongles on a channel disturb each other. A
     channel without any vehicle that names a dongle gets the next unused number.
@@ -117,7 +117,7 @@ def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
 
 
 def carried_per_s(vehicles: int) -> float:
-    """Return the packets per second that a dongle carries for each of this many vehicles on one
+    """Return the packets per second that a dongle can carry for each of this many vehicles on one
     channel."""
     if vehicles <= 1:
         return ALONE_PER_S
@@ -125,16 +125,16 @@ def carried_per_s(vehicles: int) -> float:
 
 
 def uplink_per_s(profile: Profile) -> float:
-    """Return the packets per second that perchctl sends to a vehicle: a setpoint in each turn of
-    the loop, and the positions of a motion capture or of the target."""
+    """Return the packets per second that perchctl sends to a vehicle: a setpoint in each iteration
+    of the flight loop, and positions from motion capture or from the target."""
     positioning = profile.positioning
     sent_hz = 0.0 if positioning.source.is_deck else positioning.rate_hz
     return profile.link.loop_hz + sent_hz
 
 
 def needed_per_s(profile: Profile, period_s: float | None = None) -> float:
-    """Return the packets per second that a flight needs, at `period_s` or at the profile's own
-    telemetry period.
+    """Return the packets per second that a flight needs at the telemetry period `period_s`, by
+    default the profile's.
 
     Each exchange carries one packet in each direction, so the larger of both numbers counts.
     """
@@ -143,12 +143,13 @@ def needed_per_s(profile: Profile, period_s: float | None = None) -> float:
 
 
 def budget_radio(fleet: Fleet) -> tuple[Fleet, tuple[DongleLoad, ...]]:
-    """The fleet with telemetry periods that its dongles can carry, and each dongle's load.
+    """Return the fleet with telemetry periods that its dongles can carry, and the load of each
+    dongle.
 
-    A `link.telemetry_period_s` that a profile or the fleet file names is kept; where none is named,
-    the shortest one that fits is chosen. Raises InvalidValue, naming the dongle and what to do, if
-    vehicles on one dongle use different channels or rates, if two dongles are too near on the air,
-    or if a flight needs more than its dongle carries.
+    If a profile or the fleet file contains `link.telemetry_period_s`, that value is used; otherwise
+    the shortest period that fits is chosen. Raises InvalidValue, naming the dongle and what to do,
+    if vehicles on one dongle use different channels or rates, if the channels of two dongles are
+    too close, or if a flight needs more than its dongle can carry.
     """
     on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]] = {}
     for vehicle in fleet.vehicles:
@@ -238,8 +239,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
 
 
 def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
-    """Return what to slow down so that the flight fits, if that is enough; the text ends in ``,
-    or``."""
+    """Return advice on a slower telemetry with which the flight would fit, ending in ``, or``;
+    empty if that is not enough."""
     if fits:
         need = needed_per_s(profile, fits[0])
         return (
@@ -255,14 +256,14 @@ def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
 
 
 def _periods_s(profile: Profile) -> list[float]:
-    """Return the periods that may be chosen, from the profile's own on, shortest first."""
+    """Return the periods that may be chosen, shortest first, beginning with the profile's."""
     first = round(profile.link.telemetry_period_s / LOG_STEP_S)
     last = round(SLOWEST_PERIOD_S / LOG_STEP_S)
     return [round(step * LOG_STEP_S, 3) for step in range(first, max(first, last) + 1)]
 
 
 def _most_that_fit(need_per_s: float) -> int:
-    """Return how many vehicles with this need one dongle carries, at least one."""
+    """Return how many vehicles that need this packet rate one dongle can carry, at least one."""
     counts = range(1, MOST_ON_A_DONGLE + 1)
     fit = [count for count in counts if need_per_s <= USABLE_SHARE * carried_per_s(count)]
     return max(fit, default=1)

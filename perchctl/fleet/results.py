@@ -1,4 +1,5 @@
-"""How simulated fleets ended: one fleet's result, and a campaign's figures for JSON and as text."""
+"""Results of simulated fleets: one fleet's result, and the figures of a campaign for JSON and as
+text."""
 
 from __future__ import annotations
 
@@ -19,14 +20,16 @@ class FleetResult(CampaignFlight):
     """Result of one fleet's flight.
 
     Attributes:
-        outcome: perched if all vehicles have, else that of its worst vehicle.
-        fault: name of the fault in one vehicle, or of the common cause; "none" without.
+        outcome: perched if all vehicles have perched, otherwise the worst vehicle's outcome.
+        fault: name of the fault in one vehicle, or of the common cause; "none" if there was none.
         vehicles: result of each vehicle, in the order of `names`.
-        collisions: number of pairs in `collided`, which came nearer than two vehicles may.
-        least_distance_m: least level distance between two vehicles while one's motors turned.
-        least_distance_in_air_m: the same while both's did; None if there were never two.
-        separation_m: what the plan promises between the corridors of two that fly together.
-        time_s: from the first group's begin to the last one's end.
+        collisions: number of pairs in `collided`, which came so close that they touched.
+        least_distance_m: smallest horizontal distance between two vehicles while the motors of at
+            least one turned.
+        least_distance_in_air_m: the same while the motors of both turned; None if that never
+            happened.
+        separation_m: the plan's separation between the corridors of two vehicles that fly together.
+        time_s: time from the start of the first group to the end of the last one.
     """
 
     fault: str
@@ -41,18 +44,20 @@ class FleetResult(CampaignFlight):
 
     @property
     def is_bad(self) -> bool:
-        """True if two collided, if a flag counts, or if a vehicle did not perch without a fault."""
+        """True if two vehicles collided, if a flag counts against the program, or if there was no
+        fault but some vehicle did not perch."""
         missed = self.fault == HEALTHY.fault.name and self.outcome != "perched"
         return self.collisions > 0 or missed or any(v.is_bad for v in self.vehicles)
 
 
 def fleet_outcome(results: Sequence[FaultResult]) -> str:
-    """The fleet's outcome: perched if all vehicles have, else that of its worst one."""
+    """The fleet's outcome: perched if all vehicles have perched, otherwise the worst vehicle's
+    outcome."""
     return max((result.outcome for result in results), key=_FROM_GOOD_TO_BAD.index)
 
 
 def refused_vehicle(reason: str) -> FaultResult:
-    """Return the result of a vehicle that was not allowed to start."""
+    """Return the result for a vehicle that was not allowed to take off."""
     return FaultResult(
         seed=0,
         outcome="refused",
@@ -71,8 +76,8 @@ def refused_vehicle(reason: str) -> FaultResult:
 
 
 def fleet_summary(results: Sequence[FleetResult]) -> dict[str, Any]:
-    """A campaign's figures as a record for JSON: of the fleets, and of all their vehicles what
-    `fault_summary` counts."""
+    """The figures of a campaign as a JSON object: those of the fleets, and those of `fault_summary`
+    over all their vehicles."""
     figures = fault_summary([vehicle for fleet in results for vehicle in fleet.vehicles])
     del figures["worst_seeds"]
     return {

@@ -1,12 +1,12 @@
-"""One simulated room: where each vehicle of a fleet stands, hangs and flies, the downwash between
-them, and how close they come to each other.
+"""One simulated room: the positions of a fleet's vehicles, the downwash between them, and how close
+they come to each other.
 
-Each vehicle is simulated in axes of its own, whose origin is the floor below its start. An estimate
-in the room's axes is the same flight with other numbers, so it is simulated in those axes, too. The
-room converts all places with `FleetVehicle.to_room`.
+Each vehicle is simulated in its own axes, whose origin is the floor below its start. With an
+estimate in room axes, the flight would be the same with other numbers, so it is simulated in these
+axes as well. The room converts all positions with `FleetVehicle.to_room`.
 
-A start is never exactly where the fleet file says. An estimate that starts at zero does not know
-the difference; one in the room's axes does.
+No vehicle starts exactly where the fleet file says. An estimate that starts at zero does not show
+the difference; an estimate in room axes does.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ _Place = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedVehicle:
-    """A vehicle in the room of one seed.
+    """A vehicle in the room drawn from one seed.
 
     Attributes:
-        true: the vehicle at its true place, with an estimate whose axes begin there.
+        true: the vehicle with its true start as its home, and with an estimate that starts there.
         profile: the profile that it flies with, including its corridor.
     """
 
@@ -64,8 +64,8 @@ class PlacedVehicle:
 
 
 def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
-    """Return the fleet in the room of a seed: the true starts, one ceiling, and each vehicle's own
-    scenario with its target and those of the neighbours that its camera may see."""
+    """Place the fleet in the room drawn from a seed: the true starts, one ceiling, and for each
+    vehicle a scenario with its target and those of the neighbours that its camera may see."""
     rng = np.random.default_rng([seed, _START_STREAM])
     drawn = []
     for number, vehicle in enumerate(fleet.vehicles):
@@ -102,8 +102,8 @@ def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
 def _neighbours(
     own: FleetVehicle, scenario: Scenario, drawn: Sequence[tuple[FleetVehicle, Scenario]]
 ) -> tuple[Neighbour, ...]:
-    """Return the other vehicles' targets in the axes of this vehicle's own. Their ids are given
-    even if they are the same: flying to one of them counts as straying."""
+    """Return the other vehicles' targets, in the axes of this vehicle's target. Their marker ids
+    are given even if they are the same, so that flying to one of them counts as an error."""
     found = []
     heading_rad = math.radians(own.heading_deg) + scenario.target_yaw_rad
     c, s = math.cos(heading_rad), math.sin(heading_rad)
@@ -123,17 +123,18 @@ def _neighbours(
     return tuple(found)
 
 
-# --- All vehicles as time passes ---
+# --- Track all vehicles as time passes ---
 
 
 def body_name(name: str) -> str:
-    """Return the name of the rigid body of the vehicle called `name` in the motion capture of
-    another one. In its own capture, its body has the name from its profile."""
+    """Return the name of a vehicle's rigid body in the simulated motion-capture system of another
+    vehicle. In its own system, the body has the name given in its profile."""
     return f"body of {name}"
 
 
 class Body:
-    """One vehicle in the room: simulated, or at the place where it stands, hangs or lies."""
+    """One vehicle in the room: a simulated one, or one that stands, hangs or lies at a fixed
+    position."""
 
     def __init__(self, placed: PlacedVehicle) -> None:
         self._true = placed.true
@@ -171,7 +172,7 @@ class Body:
         return self._vehicle is not None and max(self._vehicle.firmware.motors) > 0.0
 
     def in_own_axes(self, place_m: _Place) -> _Place:
-        """Convert a place of the room to the axes of this vehicle's simulation."""
+        """Convert a position in the room to the axes of this vehicle's simulation."""
         return (*self._true.to_estimate(place_m[:2]), place_m[2])
 
 
@@ -179,11 +180,13 @@ class Room:
     """All vehicles of a fleet, by name.
 
     Attributes:
-        collided: the pairs whose centres came nearer than two ellipsoids of `COLLISION_RADIUS_M`
-            and `COLLISION_HALF_HEIGHT_M`, also if one fell onto the other with its motors off.
-        least_m: least level distance between the centres of two vehicles of which one's motors
-            turn, as heights do not count between corridors; infinite before.
-        least_both_m: the same of two whose motors turn.
+        collided: the pairs that touched, with each vehicle modelled as an ellipsoid of
+            `COLLISION_RADIUS_M` and `COLLISION_HALF_HEIGHT_M`, even if one fell onto the other with
+            its motors off.
+        least_m: smallest distance between the centres of two vehicles while the motors of at least
+            one turn; infinite at first. Only horizontal, since corridors are separated regardless
+            of height.
+        least_both_m: the same while the motors of both turn.
     """
 
     def __init__(self, placed: Sequence[PlacedVehicle]) -> None:
@@ -192,8 +195,9 @@ class Room:
         self.least_m = self.least_both_m = math.inf
 
     def others_of(self, name: str) -> tuple[tuple[str, _Place], ...]:
-        """Return the other vehicles with their positions as a motion capture sees them, in the axes
-        of the vehicle called `name`. If there are none, a capture keeps its own bodies."""
+        """Return the other vehicles with their positions, as a motion-capture system reports them,
+        in the axes of the vehicle `name`; empty if there are no others, and then the system
+        keeps its own bodies."""
         own = self.bodies[name]
         return tuple(
             (body_name(other), own.in_own_axes(body.place_m))
@@ -202,8 +206,9 @@ class Room:
         )
 
     def update(self) -> None:
-        """Measure the distances, and update each simulated vehicle's downwash and view of the
-        others. Must be called when all vehicles have reached the same time."""
+        """Measure the distances, and update the downwash on each simulated vehicle and the bodies
+        that its motion capture sees. Must be called when all vehicles have reached the same
+        time."""
         places = {name: body.place_m for name, body in self.bodies.items()}
         turning = {name: body.turns for name, body in self.bodies.items()}
         for pair in itertools.combinations(self.bodies, 2):

@@ -1,4 +1,4 @@
-"""Keep vehicles apart: each one's corridor, and the order in which they fly.
+"""Keep vehicles apart: compute each vehicle's corridor, and the order in which they fly.
 
 The corridor's radius depends on the positioning:
 
@@ -7,13 +7,14 @@ The corridor's radius depends on the positioning:
     target alone                                   TARGET_ALONE_M
 
 Two vehicles are in the air together only if their corridors keep the separation and neither stands
-near the other's. A vehicle that waits on the floor, or that hangs, is an obstacle for the others:
+near the other's corridor. A vehicle that waits on the floor, or that hangs, is an obstacle for the
+others:
 
     i waits in j's corridor  ->  i flies before j
     i hangs in j's corridor  ->  j flies before i
 
-An order that satisfies all of these is found by sorting. If there is none, the error names two
-vehicles.
+An order that satisfies all of these constraints is found by topological sorting. If there is none,
+the error names two vehicles.
 """
 
 from __future__ import annotations
@@ -82,9 +83,9 @@ def corridor_radius_m(vehicle: FleetVehicle) -> float:
 
 
 def _unseen_s(profile: Profile) -> float:
-    """Return the longest time in which only the estimate says where the vehicle is: take-off and
+    """Return the longest time for which only the estimate shows where the vehicle is: take-off and
     flight to the target, the whole search, and the descent from the height limit. Under its target,
-    it flies by sight."""
+    the vehicle steers by the camera."""
     planner = profile.planner
     search_s = planner.search.attempts * planner.search.wait_s
     descent_s = profile.safety.max_height_m / planner.landing.speed_mps
@@ -92,7 +93,7 @@ def _unseen_s(profile: Profile) -> float:
 
 
 def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
-    """Return the vehicle's corridor in the room's axes."""
+    """Return the vehicle's corridor in room axes."""
     profile = vehicle.profile
     return Corridor(
         home_m=vehicle.home_m,
@@ -104,12 +105,11 @@ def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
 
 
 def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Corridor:
-    """Return the same corridor in the axes of the vehicle's own state estimate: its fence.
-    `estimate`: the same vehicle with other axes of its state estimate, which are used instead.
+    """Return the same corridor in the axes of the vehicle's own state estimate, in which it is
+    enforced. `estimate`: the same vehicle with an estimate in other axes, which are used instead.
 
-    The radius is the same. A vehicle that follows setpoints keeps its estimate on the path while
-    its true position drifts. A vehicle under its target keeps its true position while its estimate
-    drifts.
+    The radius is the same: while a vehicle follows setpoints, its estimate stays on the path and
+    its true position drifts; under its target, its true position stays and its estimate drifts.
     """
     corridor, axes = vehicle_corridor(vehicle), estimate or vehicle
     return replace(
@@ -120,11 +120,10 @@ def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = Non
 
 
 def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Profile:
-    """Return the profile with which a vehicle of a fleet flies: its own, with its corridor as a
-    safety row (`safety.corridor`). Outside the corridor, the vehicle lands.
+    """Return the profile with which a vehicle of a fleet flies: its own profile, with its corridor
+    as a safety limit (`safety.corridor`). Outside the corridor, the vehicle lands.
 
-    `estimate`: the same vehicle with other axes of its state estimate, whose profile is used
-    instead.
+    `estimate`: the same vehicle with an estimate in other axes, whose profile is used instead.
     """
     section = CorridorConfig(**asdict(estimate_corridor(vehicle, estimate)))
     profile = (estimate or vehicle).profile
@@ -156,8 +155,7 @@ class Precedence:
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Groups of vehicles that fly together, in order, and the constraints from which they
-    follow."""
+    """Groups of vehicles that fly together, in order, and the constraints that lead to them."""
 
     groups: tuple[tuple[str, ...], ...]
     conflicts: tuple[Conflict, ...]
@@ -166,8 +164,8 @@ class Schedule:
     def may_fly_together(self, first: str, second: str) -> bool:
         """True if the corridors of both keep all separations.
 
-        Two vehicles that may not fly together are also in each other's way on the floor: if one has
-        landed away from its home, the other one must not take off.
+        Two vehicles that must not fly together are also in each other's way on the floor: if one
+        has landed away from its home, the other one must not take off.
         """
         return {first, second} not in ({c.first, c.second} for c in self.conflicts)
 
@@ -214,7 +212,8 @@ def find_conflicts(
 
 
 def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
-    """Return who must fly before whom, because it waits or hangs in the other one's corridor."""
+    """Return which vehicle must fly before which other one, because one of them waits or hangs in
+    the other's corridor."""
     found = []
     for (name, own), (other, corridor) in itertools.permutations(corridors.items(), 2):
         waits_m, hangs_m = (corridor.distance_to_m(p) for p in (own.home_m, own.target_m))
@@ -235,7 +234,7 @@ def _from(gap_m: float, other: str) -> str:
 
 
 def gap_text(gap_m: float) -> str:
-    """Return the distance of a place from a corridor's edge, negative inside, and the text for
+    """Return the distance of a position from a corridor's edge (negative inside), and the text for
     it."""
     return f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
 
@@ -267,8 +266,8 @@ def _groups(
 
 
 def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corridor]) -> None:
-    """Raise InvalidValue if no order keeps all precedences; of several cycles, for one of two
-    vehicles."""
+    """Raise InvalidValue if no order satisfies all precedences. If there are several cycles, report
+    one of only two vehicles if possible."""
     by_pair: dict[tuple[str, str], Precedence] = {}
     for each in precedences:
         by_pair.setdefault((each.first, each.then), each)
@@ -318,7 +317,7 @@ def _check_fence(vehicle: FleetVehicle) -> None:
 
 
 def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
-    """Refuse two targets that a vehicle could confuse."""
+    """Raise InvalidValue if a vehicle could confuse two targets."""
     apart_m = math.dist(first.target_m, second.target_m)
     for one, other in ((first, second), (second, first)):
         within_m = one.profile.target.expected_within_m

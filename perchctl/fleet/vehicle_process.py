@@ -62,8 +62,8 @@ def main(channel: Channel) -> None:
 def fly_vehicle(
     options: FlyOptions, switch: ParentSwitch, line: ParentLine, reporter: StatusReporter
 ) -> Result:
-    """Fly once; whatever happens becomes a `Result`. A second error while the first is being
-    handled is raised: `reporter` knows how far the flight has come."""
+    """Fly once, and convert the outcome or any error to a `Result`. An error while another one is
+    being handled is raised; `reporter` then knows how far the flight had come."""
     log: LogWatcher | None = None
     try:
         line.may_interrupt = True
@@ -97,14 +97,14 @@ def fly_vehicle(
 
 
 class ParentLine:
-    """The connection to the parent, served by a thread of its own; only `finish` waits.
+    """The connection to the parent, served by a separate thread; only `finish` waits.
 
     If the parent is gone or sends an invalid message, the vehicle lands. In the latter case the
-    connection stays open, because the operator may still cut the motors. Before the flight loop
-    listens, a command ends the process's start as a signal would.
+    connection stays open, because the operator may still cut the motors. As long as the flight loop
+    does not read commands yet, a command interrupts the start of the process, as a signal would.
 
     Attributes:
-        may_interrupt: the main thread can take an `Interrupted` now.
+        may_interrupt: True while an `Interrupted` may be raised in the main thread.
     """
 
     def __init__(self, channel: Channel, switch: ParentSwitch) -> None:
@@ -119,11 +119,12 @@ class ParentLine:
         self._thread.start()
 
     def note_turn(self) -> None:
-        """Note that the flight loop has made a turn."""
+        """Record that the flight loop has run one iteration (turn)."""
         self._turned_s = time.monotonic()
 
     def tell(self, status: Status) -> None:
-        """Store the newest status. One with a new stage or phase is sent at the next check."""
+        """Store the newest status. If its stage or phase is new, it is sent without waiting for the
+        next regular message."""
         before, self._status = self._status, status
         self._soon = self._soon or (before.stage, before.phase) != (status.stage, status.phase)
 
@@ -163,8 +164,8 @@ class ParentLine:
             self._ended.set()
 
     def _take_orders(self) -> None:
-        """Process all waiting orders. After a pause of this process there may be many, and a
-        permission counts only if the newest one still gives it."""
+        """Process all waiting orders. If this process was stopped for a while, there may be many; a
+        permission counts only if the newest order still gives it."""
         order = self._next_order()
         while self._channel.poll(0.0):
             if order is not None:
@@ -189,14 +190,16 @@ class ParentLine:
         return None
 
     def _interrupt_start_alone(self) -> None:
-        """Without a parent, wait until the start can be interrupted or the loop listens."""
+        """After the parent is gone, wait until the start can be interrupted or the loop reads
+        commands."""
         while self._result is None and not (self._has_interrupted or self._switch.listening):
             self._interrupt_start()
             time.sleep(POLL_S)
 
     def _interrupt_start(self) -> None:
-        """Interrupt the start once, because nobody reads the command while vehicle and camera are
-        being connected. A second signal would interrupt the clean-up after the first one."""
+        """Interrupt the start, because nothing reads the command while vehicle and camera are being
+        connected. Do so only once: a second signal would interrupt the clean-up after the first
+        one."""
         starts = self.may_interrupt and not self._switch.listening
         if starts and self._switch.landing_requested and not self._has_interrupted:
             self._has_interrupted = True
@@ -204,13 +207,13 @@ class ParentLine:
 
 
 class StatusReporter(Watcher):
-    """A watcher of the flight that reports its state to the parent, and stores what the result
-    needs.
+    """A watcher that reports the flight's state to the parent, and stores what is needed for the
+    result.
 
     Attributes:
-        log: the file of the flight's log, once it is open.
-        watchers: further watchers of the flight, which serve its pictures.
-        failure: the result of a flight that has raised.
+        log: the flight's log file, once it is open.
+        watchers: further watchers of the flight, which serve its images.
+        failure: the result, if the flight has raised an exception.
     """
 
     name = "the status for the fleet"
@@ -222,16 +225,16 @@ class StatusReporter(Watcher):
         self.failure: Result | None = None
         self._picture_port: int | None = None
         self._line, self._switch = line, switch
-        self._first: tuple[float, float, float] | None = None  # loop, wall and computing time, s
+        self._first: tuple[float, float, float] | None = None  # loop, wall and CPU time, s
         self._last: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._setpoint_s: float | None = None
         self._gaps_s: list[float] = []
-        self._rest: str | None = None  # place of a vehicle that was rescued
+        self._rest: str | None = None  # where a rescued vehicle came to rest
         self._tick: Tick | None = None
 
     def serve_pictures(self, options: FlyOptions) -> None:
-        """Serve the flight's pictures for the fleet's page, without buttons. An error is printed,
-        but does not prevent the flight."""
+        """Serve the flight's images for the fleet's page, without buttons. An error is printed, but
+        does not prevent the flight."""
         try:
             # a flight without a page does not need this module
             from perchctl.display import FlightPage, LivePage
@@ -262,7 +265,7 @@ class StatusReporter(Watcher):
             self._setpoint_s = None
         try:
             status = flight_status(tick)
-        except Exception as error:  # a detached reporter looks like a loop that hangs
+        except Exception as error:  # if detached, its loop would seem to hang
             status = Status(
                 stage=Stage.FLYING,
                 phase=tick.state.phase,
@@ -275,7 +278,7 @@ class StatusReporter(Watcher):
             self._rest = event.reason
 
     def result_of(self, outcome: VehicleOutcome, summary: FlightSummary, log: str) -> Result:
-        """The result of a flight that has ended by itself."""
+        """The result of a flight that ended without an exception."""
         return replace(
             self._result(summary.exit_code, outcome, summary.reason),
             attempts=summary.attempts,
@@ -298,7 +301,7 @@ class StatusReporter(Watcher):
         if self._rest is not None:
             reason = f"{reason}; {self._rest}"
         result = self._result(code, VehicleOutcome.FAILED, reason)
-        return replace(result, log=None if self._tick is None else self.log)  # deleted without one
+        return replace(result, log=None if self._tick is None else self.log)  # deleted if no tick
 
     def _result(self, code: int, outcome: VehicleOutcome, reason: str) -> Result:
         tick, lost = self._tick, self._switch.lost
@@ -353,7 +356,7 @@ def flight_status(tick: Tick) -> Status:
 
 
 def _valid_place_m(tick: Tick) -> Point | None:
-    """Return the vehicle's position in the axes of its estimate; None if nobody knows it."""
+    """Return the vehicle's position in the axes of its estimate; None if it is unknown."""
     place_m = tick.telemetry.position_m[:2]
     is_known = tick.state.belief.is_position_valid and all(map(math.isfinite, place_m))
     return place_m if is_known else None
