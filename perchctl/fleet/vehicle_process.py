@@ -288,8 +288,8 @@ class StatusReporter(Watcher):
         )
 
     def result_of_error(self, error: BaseException) -> Result:
-        """Return the result of a flight that raised: refused on the ground, or rescued in the
-        air."""
+        """Return the result of a flight that raised an exception: it was refused on the ground, or
+        rescued in the air."""
         match error:
             case PerchError():
                 code, reason = error.exit_code, str(error)
