@@ -1,4 +1,4 @@
-"""A flight's clock, which follows real time or the simulated vehicle's time."""
+"""The clock of a flight, which follows real time or the simulated vehicle's time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Clock(Protocol):
         """Return the current monotonic time, s."""
 
     def wait_until(self, t_s: float) -> None:
-        """Wait until the clock reads `t_s`; return at once if that is past."""
+        """Wait until the clock reads `t_s`; return at once if that time has passed."""
 
 
 class WallClock:
@@ -40,11 +40,11 @@ class WallClock:
 
 
 class SimulatedClock:
-    """Clock of a simulator in real time: simulator and flight loop wait for each other.
+    """Clock for a simulator that runs in real time: simulator and flight loop wait for each other.
 
-    The simulator advances the clock, which stands still on a busy computer. Any thread may call
-    `now`. `zero_s`: the clock's reading at the simulator's start, chosen so that the first reading
-    agrees with `time.monotonic`.
+    The simulator advances the clock, so time stands still while a busy computer delays the
+    simulator. Any thread may call `now`. `zero_s`: the clock's reading at the simulator's start,
+    chosen so that the first reading agrees with `time.monotonic`.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
-"""Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
+"""Criteria for a vehicle on the ground, used by `fly` before take-off and by `check`. Pure.
 
-Each criterion returns the problem, or None. Two things are known about a vehicle at rest, even
-without motion capture: where the ground is, and which way is up.
+Each criterion returns a problem, or None. Even without motion capture, two things are known about a
+vehicle at rest: the height of the ground, and which way is up. A turn is one iteration of the
+flight loop.
 """
 
 from __future__ import annotations
@@ -48,9 +49,10 @@ WITHIN_REACH_M = (
     0.35  # distance from the gear; a take-off needs more height, so no target can be that close
 )
 ROOM_M = 50.0  # no capture volume is larger: a more distant position must be in another unit
-# between attitude and capture; the rigid body's axes were aligned by eye
+# tolerance between the vehicle's vertical and the motion-capture system's; the rigid body's axes
+# were aligned by eye
 UP_AXIS_AGREE_DEG = 20.0
-WANDERED_M = 0.1  # far above the noise of a motion capture
+WANDERED_M = 0.1  # far above the noise of motion capture
 REST_S = 1.9
 """Time for which the state estimate must have stood still before a take-off. The loop keeps no
 older samples. Shorter: a slow drift is harder to detect."""
@@ -79,11 +81,11 @@ _FORBIDDEN = (
 
 @dataclass(frozen=True)
 class Variance:
-    """A variance that the vehicle's estimator reports, and the limit for take-off.
+    """A variance reported by the vehicle's estimator, and its limit for take-off.
 
     Attributes:
-        what: the estimated quantity, as in messages.
-        value: the variance, in `unit`; None if the vehicle reports none.
+        what: the estimated quantity, as named in messages.
+        value: the variance, in `unit`; None if the vehicle does not report it.
         most: the largest variance, in `unit`, with which the vehicle may take off.
         unit: unit of `value` and `most`.
     """
@@ -125,8 +127,8 @@ class GroundCriteria:
 
     @property
     def waits_for_arming(self) -> bool:
-        """True if the vehicle does not arm itself and is ready except for arming. `fly` arms it
-        last, just before take-off. Also true while its motors start."""
+        """True if the vehicle does not arm itself and only arming is missing. `fly` arms it last,
+        just before take-off. Also true while its motors start."""
         telemetry = self.telemetry
         if telemetry.has_bit(CAN_FLY):
             return False
@@ -154,7 +156,7 @@ class GroundCriteria:
 
     @property
     def battery_too_high(self) -> Problem | None:
-        """Problem: the battery has a higher voltage than a single cell, so the limits do not
+        """Problem: the battery's voltage is higher than that of a single cell, so the limits do not
         apply."""
         rests_v = self.telemetry.battery_v
         if not rests_v > MOST_CELL_V:
@@ -212,7 +214,7 @@ class GroundCriteria:
 
     @property
     def estimate_unsettled(self) -> Problem | None:
-        """Problem: a variance of the state estimate is too large, unknown or old."""
+        """Problem: a variance of the state estimate is too large, unknown or too old."""
         telemetry, advice = self.telemetry, "check the positioning system"
         if self.profile.positioning.source.is_target:
             advice = "check that the positions arrive and that the target stays in view"
@@ -242,7 +244,7 @@ class GroundCriteria:
 
     @property
     def off_ground(self) -> Problem | None:
-        """Problem: according to the settled state estimate, the vehicle is not on the ground: it
+        """Problem: according to the settled state estimate, the vehicle is not on the ground, but
         hangs or is held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
@@ -321,12 +323,12 @@ class GroundCriteria:
 
     @staticmethod
     def moving_estimate(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-        """Problem: within `rest_window` of `samples`, oldest first, the state estimate has moved,
-        or its mean velocity was too high.
+        """Problem: within the `rest_window` of `samples` (oldest first), the state estimate has
+        moved, or its mean velocity was too high.
 
         The vehicle stands still, so something misleads its estimate: optical flow over a dark
         floor, a base station that was moved, or the positions of another body. Or somebody carries
-        the vehicle too smoothly for its accelerometer to notice. If the samples span less time,
+        the vehicle too smoothly for its accelerometer to detect it. If the samples span less time,
         only those are checked.
         """
         if not samples:
@@ -357,7 +359,7 @@ class GroundCriteria:
     @staticmethod
     def moved_body(moved_m: float, profile: Profile) -> Problem | None:
         """Problem: the external positions have moved by `moved_m` while the vehicle stood still.
-        They belong to another body, or the target swings."""
+        They belong to another rigid body, or the target swings."""
         if moved_m <= WANDERED_M:
             return None
         return Problem(
@@ -366,8 +368,9 @@ class GroundCriteria:
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
-        """Problem: `place` is in another unit, has another axis up, or is too far from the
-        expected target. If the target is the source, only the distance is checked."""
+        """Problem: the position `place` is in another unit, has another axis up, or is too far from
+        the expected target. If the target itself is the positioning system, only the distance is
+        checked."""
         x, y, z = place.position_m
         if self.profile.positioning.source.is_target:
             return self._unreachable(place)
@@ -404,21 +407,22 @@ class GroundCriteria:
 
 
 def rest_window(samples: Sequence[Telemetry]) -> list[Telemetry]:
-    """Return the samples, oldest first, that show whether a vehicle has stood still for `REST_S`:
-    those of that time and the one before it, which reveals a pause at its beginning. Samples from
-    before the vehicle last restarted are left out. If the samples span less time, all are
-    returned."""
+    """Return the samples, oldest first, from which to decide if a vehicle has stood still for
+    `REST_S`: those within that time, and the one before it, which shows if there was a gap at the
+    beginning. Samples from before the vehicle's last restart are left out. If the samples span less
+    time, all are returned."""
     same = [s for s in samples if s.start == samples[-1].start]
     first = max((i for i, s in enumerate(same) if same[-1].t_s - s.t_s >= REST_S), default=0)
     return same[first:]
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Problem: the capture and the vehicle's attitude disagree about the vertical."""
+    """Problem: the motion-capture system and the vehicle's own attitude disagree about the
+    vertical."""
     if place.quaternion is None:
         return None
-    # The world's vertical in the capture's axes, assuming that its rigid body has the vehicle's
-    # axes.
+    # The vertical in the motion-capture system's axes, assuming that the rigid body's axes are the
+    # vehicle's.
     R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
     up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
@@ -439,13 +443,14 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 
 
 def feed_name(profile: Profile) -> str:
-    """Name of the source of external positions, as used in messages."""
+    """The name of the source of external positions, as used in messages."""
     by_target = profile.positioning.source.is_target
     return "the view of the target" if by_target else "the motion-capture system"
 
 
 class RestCheck:
-    """Detects that the capture tracks another body, which moves while the vehicle stands still."""
+    """Detects that the motion-capture system tracks another body, which moves while the vehicle
+    stands still."""
 
     def __init__(self) -> None:
         self._from: ExternalPosition | None = None
@@ -453,9 +458,9 @@ class RestCheck:
     def moved_body_problem(
         self, place: ExternalPosition | None, profile: Profile
     ) -> Problem | None:
-        """The problem of a body that has moved since the vehicle came to rest.
+        """Problem: the rigid body has moved since the vehicle came to rest.
 
-        Must be called in each turn with fresh telemetry and a fresh position; `place` is None while
+        Must be called in each turn with fresh telemetry and a fresh position. `place` is None while
         the vehicle does not stand still, which restarts the check."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
@@ -465,7 +470,7 @@ class RestCheck:
 
 
 def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
-    """The problem of external positions that are not sent, or are too old."""
+    """Problem: external positions are not being sent, or are too old."""
     if status.problem is not None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
@@ -475,7 +480,7 @@ def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
 
 
 def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """The problem of a state estimate whose position or heading differs from `place`."""
+    """Problem: the position or heading of the state estimate differs from `place`."""
     away_m = math.dist(place.position_m, telemetry.position_m)
     turned_deg = 0.0
     if place.quaternion is not None:

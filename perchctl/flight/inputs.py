@@ -1,5 +1,8 @@
 """The inputs of one tick of the loop: telemetry, at most one frame, and the values computed from
-them."""
+them.
+
+A turn is any iteration of the loop; a tick is a turn whose command is sent.
+"""
 
 from __future__ import annotations
 
@@ -79,24 +82,23 @@ class FlightInputs:
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    is_logged: bool = False  # whether the log also stores checksums of the images
-    # Called with each frame as the source delivered it.
+    is_logged: bool = False  # if True, the log also stores checksums of the images
+    # Called with each frame in the form in which the source delivered it.
     on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
-    # Passes the vehicle's positions to `send` if the target is its positioning system.
+    # Sends the vehicle's positions if the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
     sends_sights: bool = True
-    output: PipelineOutput | None = None  # of this tick's frame, if it was searched
-    taken: TickInputs = field(default_factory=TickInputs)  # in this tick
+    output: PipelineOutput | None = None  # output for this tick's frame, if it was searched
+    taken: TickInputs = field(default_factory=TickInputs)  # what was received in this tick
     is_blind: bool = False
     repeated: bool = False  # this tick's frame is identical to the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
-    # The kind, by `FrameHealth`, of the image that is the camera's problem; None for another kind
-    # of problem.
+    # If the camera's problem is a bad image, its kind according to `FrameHealth`; otherwise None.
     problem_kind: str | None = None
     frames: int = 0
-    _frame_kind: str = "ok"  # of the newest frame
+    _frame_kind: str = "ok"  # kind of the newest frame, according to `FrameHealth`
     _note: str | None = None
 
     def __post_init__(self) -> None:
@@ -119,9 +121,9 @@ class FlightInputs:
         """Read telemetry and at most one frame.
 
         Args:
-            search: look for the target; otherwise the frame only shows that the camera works.
-            sends_sights: send the positions measured from the target, if it is the positioning
-                system; False once the descent continues without them.
+            search: search the frame for the target; otherwise it only shows that the camera works.
+            sends_sights: send the positions measured from the target if it is the positioning
+                system; False once the vehicle descends without them.
             drops_sightings: discard the detections from which the vehicle's motion is estimated.
         """
         self.sends_sights = sends_sights
@@ -156,7 +158,7 @@ class FlightInputs:
             if problem is not None:
                 self.camera_problem, self.problem_kind = problem, None
             return
-        # the source has another image size; a single image of another size is just corrupted
+        # the source itself has another image size; a later image of another size is just corrupted
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         self._frame_kind = "ok"
@@ -164,7 +166,7 @@ class FlightInputs:
         self.repeated = self._frame_kind == "repeated"
         is_doubtful = self._frame_kind in DOUBTFUL_KINDS
         if rejection is not None:
-            if not self.repeated:  # otherwise nothing is new, including the camera's problem
+            if not self.repeated:  # a repeated frame changes nothing, not even the camera's problem
                 self.camera_problem = rejection
                 is_unusable = self._frame_kind != "ok" and not is_doubtful
                 self.problem_kind = self._frame_kind if is_unusable else None
@@ -185,7 +187,7 @@ class FlightInputs:
 
     @staticmethod
     def ended_text(name: str) -> str:
-        """Return the camera's problem for the time after the recording `name` has ended."""
+        """Return the camera's problem after the recording `name` has ended."""
         return f"{name} has ended"
 
     @property
@@ -197,9 +199,10 @@ class FlightInputs:
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def picture_problem(self, now_s: float) -> str | None:
-        """Return why there is no good image now; None if there is one. Possible reasons: no image
-        has arrived, the newest one could not be used as a measurement, or the last good one is
-        older than `safety.camera_hold_s`. An image that is only dark or empty counts as good."""
+        """Return why there is currently no good image; None if there is one. Possible reasons: no
+        image has arrived, the newest image could not be used as a measurement, or the last good
+        image is older than `safety.camera_hold_s`. An image that is only dark or empty counts as
+        good."""
         age_s = now_s - self.last_good_frame_s
         if self.frames == 0:
             return self.camera_problem or "none has arrived"
@@ -208,8 +211,9 @@ class FlightInputs:
         return None if self.camera_problem == self._note else self.camera_problem
 
     def telemetry_age_s(self, now_s: float) -> float:
-        """The age of the oldest value in the newest telemetry. A reading that stays the same while
-        others change is as old as its first sample. Infinite before the first telemetry."""
+        """The age of the oldest value in the newest telemetry. A value that stays the same while
+        others change is considered as old as the first sample that contained it. Infinite before
+        the first telemetry."""
         newest, imu = self.history.newest, self.history.imu
         if newest is None:
             return math.inf
@@ -226,7 +230,7 @@ class FlightInputs:
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late_samples=tuple(late))
         if self.last_good_frame_s == began_s:
-            # this tick did get an image, so the camera has not failed
+            # this tick received an image, so the camera has not failed
             self.last_good_frame_s = now_s
 
     def observation(self, now_s: float) -> Observation:
@@ -254,17 +258,17 @@ class FlightInputs:
 
     @property
     def poses(self) -> dict[str, UnfilteredPose]:
-        """The unfiltered poses from this tick's image, of the `large`, `small` and `joint`
-        markers."""
+        """The unfiltered poses from this tick's image: those of the `large` and `small` marker, and
+        the `joint` pose of both."""
         poses = {} if self.output is None else self.output.poses
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """The estimate of the target at `now_s`; None until the target has been seen. `tracked` is
-        False while no good frames arrive or the frames are not searched, because the filter counts
-        its coasting in frames."""
+        False while no good frames arrive or frames are not searched, because the filter limits its
+        prediction by the number of frames."""
         target = self.perception.target(now_s)
-        if self._positioning is not None:  # otherwise the estimate would run away
+        if self._positioning is not None:  # the target defines the world
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.is_blind or stale):
@@ -302,8 +306,8 @@ class FlightInputs:
 # --- The target as positioning system, tick by tick ---
 # While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
 # better than from any image, so the known position is sent instead. This ends with the first sample
-# in which the accelerometer no longer shows that something carries the vehicle. Otherwise a falling
-# vehicle would receive the position of a hanging one, and its estimate would agree.
+# in which the accelerometer no longer shows that something supports the vehicle. Otherwise a
+# falling vehicle would receive the position of a hanging one, and its estimate would agree.
 
 
 SUPPORTED_FOR_S = 0.1
@@ -314,7 +318,7 @@ a fall counts as support."""
 SUPPORTED_MEAN_G = 0.06
 """Largest deviation from 1 g of the mean over `SUPPORTED_FOR_S`, g. Running motors cause a spread
 of 0.013 g."""
-# faster than a bias makes the estimate sink while the known position is sent
+# an accelerometer bias cannot make the estimate sink faster while the known position is sent
 SUPPORTED_SINK_MPS = -0.15
 FROZEN_ATTITUDE_S = 0.06
 """Age above which an unchanged attitude no longer counts as the attitude at the exposure, s. An
@@ -333,7 +337,8 @@ class TargetPositioning:
         self._touches = False
 
     def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:
-        """Begin a tick: send a supported vehicle's position if it is known without an image."""
+        """Begin a tick: if the vehicle's support shows its position without an image, send that
+        position."""
         newest = history.newest
         self._touches = in_contact
         if newest is None or not is_supported(history, now_s):
@@ -345,7 +350,8 @@ class TargetPositioning:
             self.feed.send_known(touching_m, now_s)
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
-        """Send the position that follows from `pose`, if any, unless the vehicle is in contact."""
+        """Send the position computed from `pose`, if any, unless the vehicle is in contact with the
+        ceiling."""
         if (
             pose is None
             or self._touches
@@ -366,7 +372,7 @@ class TargetPositioning:
 
 
 def is_supported(history: History, now_s: float) -> bool:
-    """True if fresh samples show that something has carried the weight for `SUPPORTED_FOR_S`."""
+    """True if fresh samples show that something has supported the weight for `SUPPORTED_FOR_S`."""
     newest = history.newest
     if newest is None or now_s - newest.t_s + newest.behind_s > SUPPORTED_FOR_S:
         return False
@@ -379,15 +385,15 @@ def is_supported(history: History, now_s: float) -> bool:
 
 
 def _newest_samples(history: History, within_s: float) -> list[Telemetry]:
-    """The samples at most `within_s` older than the newest one, oldest first. The search starts at
-    the newest sample, because the history is much longer."""
+    """The samples that are at most `within_s` older than the newest one, oldest first. The search
+    starts at the newest sample, because the history is much longer."""
     newest_s = history.samples[-1].t_s
     found: list[Telemetry] = []
     for sample in reversed(history.samples):
         if newest_s - sample.t_s > within_s:
             break
         found.append(sample)
-    found.reverse()  # a sum of floats depends on their order
+    found.reverse()  # oldest first, because a sum of floats depends on the order
     return found
 
 
@@ -398,7 +404,7 @@ Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
 class TurnReporter:
-    """Counts the loop's turns, and calls `report` with each."""
+    """Counts the loop's turns, and calls `report` with the record of each."""
 
     def __init__(self, report: Callable[[TickRecord], None]) -> None:
         self._report = report
@@ -429,7 +435,8 @@ class TurnReporter:
     def note_decision(
         self, obs: Observation, state: PlannerState, command: Command, feed: FeedStatus | None
     ) -> None:
-        """Record the planner's decision: an error after it is not the planner's."""
+        """Record the planner's decision, so that a later error in the turn is not attributed to the
+        planner."""
         self._open = obs, (state, command, feed)
 
     def report_discarded_turn(
@@ -446,7 +453,7 @@ class TurnReporter:
         obs, decision = self._open
         if decision is not None:
             self._report(self.flown_turn(inputs, obs, *decision))
-        elif isinstance(error, Exception):  # else the planner was only interrupted
+        elif isinstance(error, Exception):  # otherwise, the planner was only interrupted
             self._open = None
             turn = TickRecord(
                 number=self._counted(),

@@ -1,5 +1,5 @@
-"""A complete flight in lockstep: the flight loop runs on simulated time, and the same seed gives
-exactly the same flight."""
+"""Fly a complete flight in lockstep: the flight loop runs on simulated time, and the same seed
+gives exactly the same flight."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import Frame, StepFunction, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
-_QUEUED = 2  # number of images that may wait; a newer one replaces the oldest
+_QUEUED = 2  # number of images that may wait for the loop; a newer one replaces the oldest
 HARD_LANDING_MPS = 1.0  # hitting the floor faster than this is a fall, regardless of the log
 FIRST_FRAME_S = 1.0
 
@@ -60,7 +60,8 @@ class LockstepClock:
 
 
 class LockstepSource:
-    """The simulated camera's delivered frames; the newest wins, as for a live camera."""
+    """The frames delivered by the simulated camera; as with a live camera, only the newest is
+    returned."""
 
     live = True
     finished = False
@@ -102,7 +103,7 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
 
 
 class TruthWatcher(Watcher):
-    """Watches the simulator's true state, which the flight cannot see, for falls."""
+    """Detects falls in the simulator's true state, to which the flight has no access."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -129,10 +130,10 @@ class TruthWatcher(Watcher):
 
 @dataclass(frozen=True)
 class LockstepFlight:
-    """A finished flight with its true final state.
+    """A finished flight, with the vehicle's true final state.
 
-    `miss_m`: from gear to target centre, horizontal; `hanging`: by the magnet; `locked`: by the
-    supervisor.
+    `miss_m`: horizontal distance from the gear to the target's centre. `hanging`: the vehicle hangs
+    from the magnet. `locked`: the firmware's supervisor has locked the vehicle.
     """
 
     report: FlightReport
@@ -174,13 +175,14 @@ def fly_lockstep(
     """Fly one seed of the profile's scenario to its end, faster than real time.
 
     Args:
-        log: the log file, or a watcher, which is closed only if the flight raises.
-        scenario, capture: replace those drawn from the seed.
+        log: the log file, or a watcher, which is closed only if the flight raises an exception.
+        scenario, capture: used instead of those drawn from the seed.
         operator: the operator's command.
-        watchers: further watchers of the flight. One that raises is detached, with a `Note` as
-            warning after the flight.
-        rows: your own transitions, besides those of the profile.
-        camera: gets the simulated camera, and returns the source that is flown with.
+        watchers: further watchers of the flight. A watcher that raises an exception is detached,
+            with a `Note` as a warning after the flight.
+        rows: your own transitions, in addition to those of the profile.
+        camera: function that is called with the simulated camera, and returns the frame source to
+            fly with.
         perception: your own estimator, called with the same arguments instead of `perchctl.step`.
             The planner flies to the `target` in the state that it returns.
 
@@ -244,15 +246,15 @@ def fly_lockstep(
     return flight
 
 
-# --- External positions in lockstep: the simulated motion capture, by the same feed ---
+# --- External positions in lockstep: simulated motion capture through the same feed ---
 
 
 def lockstep_feed(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """A feed of the simulated motion capture that runs on the link's clock; None without a
-    capture.
+    """A feed of positions from the simulated motion-capture system, on the link's clock; None
+    without such a system.
 
-    Advances the simulation until the capture sees the vehicle, and starts the state estimate
-    there. Raises ConnectionFailed if the vehicle is not seen.
+    Advances the simulation until the system sees the vehicle, and starts the state estimate at that
+    position. Raises ConnectionFailed if the vehicle is not seen.
     """
     capture, config = link.vehicle.capture, profile.positioning
     if config.source.is_target:

@@ -1,7 +1,8 @@
-"""The flight loop: telemetry, newest frame, pipeline, planner, link, log; one thread.
+"""The flight loop: read telemetry and the newest frame, run pipeline and planner, send a command,
+and write the log.
 
-Time comes from a `Clock`, so the same loop flies in real time through cflib and in
-lockstep with a simulated vehicle.
+One iteration is called a turn, and all turns run in a single thread. Time comes from a `Clock`, so
+the same loop flies in real time through cflib and in lockstep with a simulated vehicle.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ vehicles on the floor take computing time from those in the air."""
 
 
 class PositionStatus(Protocol):
-    """The part of a `perchctl.positioning.PositionFeed` that the loop uses."""
+    """The part of `perchctl.positioning.PositionFeed` that the loop uses."""
 
     def status(self, now_s: float) -> FeedStatus: ...
 
@@ -73,7 +74,7 @@ class PositionStatus(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FlightParts:
-    """The parts that the flight loop works with.
+    """The parts from which a flight is assembled.
 
     `watchers` observe the flight and cannot end it (`perchctl.flight.watching`); `judges` observe a
     simulated flight, and their errors do end it. `positions` sends the external positions; None if
@@ -103,17 +104,17 @@ class FlightParts:
     simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
-        """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
+        """Age of the newest position from motion capture; 0 if positions come from elsewhere."""
         return 0.0 if self.positions is None else self.positions.status(now_s).age_s
 
 
 def fly(parts: FlightParts) -> FlightReport:
     """Wait until the vehicle is ready, fly the mission, and return how it ended.
 
-    The link must be connected. If anything raises an exception, the vehicle is landed first.
-    Errors: `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and anything
-    unforeseen after the rescue. The report, or the error's `__notes__`, contains one sentence for
-    each watcher that was detached.
+    The link must be connected. If anything raises an exception, the vehicle is landed (the rescue)
+    before the exception is raised. Errors: `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted`
+    before take-off, and any unforeseen error after the rescue. The report, or the error's
+    `__notes__`, contains one sentence for each watcher that was detached.
     """
     watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
     try:
@@ -139,7 +140,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
     parts.link.set_guard(disarm_on_word(parts.operator), watchers.sent)
     _wait_until_ready(
         parts, inputs, turns, watchers
-    )  # the vehicle does not fly before this returns
+    )  # the vehicle stays on the ground until this returns
     watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
     parts.link.set_guard(watchdog.poll, watchers.sent)
     try:
@@ -213,8 +214,8 @@ def _wait_until_ready(
             _refuse_lost_view(parts, inputs, newest)
         is_held = not parts.may_take_off(waiting) and not waiting
         if is_held:
-            # A vehicle may wait for permission for minutes; afterwards, each check has its usual
-            # time again.
+            # A vehicle may wait for permission for minutes; after that, each check has its full
+            # time limit again.
             waiting, started_s = PERMISSION, now_s
         arming.note_waiting(waiting, now_s, parts.clock.now())
         if not waiting and newest is not None:
@@ -268,13 +269,13 @@ def _mission(
         parts.begin_turn()
         inputs.poll_inputs(
             began_s,
-            # Close to the ceiling, the image shows no target and cannot be used for steering.
+            # At the ceiling, the camera is too close to see the target.
             search=state is None or state.phase is not Phase.COMPLETE,
             sends_sights=state is None or state.belief.dead_reckoning_since_s is None,
             drops_sightings=drops_sightings,
         )
         drops_sightings = False
-        if clock.now() - began_s > TURN_HANG_S:  # a setpoint from before the hang is out of date
+        if clock.now() - began_s > TURN_HANG_S:  # after a hang, the decision is out of date
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
@@ -286,7 +287,7 @@ def _mission(
         turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_before_landing and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > TURN_HANG_S):
-            redone = True  # a decision made before a hang is not sent after it
+            redone = True  # decide again: the decision made before the hang is not sent
             turns.report_discarded_turn(inputs, obs, new, command)
             continue
         state, redone = new, False
@@ -335,7 +336,7 @@ def _mission(
             )
         due_s += period_s
         if due_s < now_s:
-            due_s = now_s + period_s  # missed ticks are not made up for with a burst
+            due_s = now_s + period_s  # missed ticks are not made up for
         clock.wait_until(due_s)
 
 

@@ -1,7 +1,7 @@
-"""The operator's commands: Ctrl-C, the other signals, the panel's key and the live page's buttons.
+"""The operator's commands: Ctrl-C, other signals, the space bar and the live page's buttons.
 
-Each press of Ctrl-C reaches the program as one signal, and so does each repeat of a key that is
-held down. The program can distinguish the two only by their timing:
+Each press of Ctrl-C reaches the program as one signal, and so does each automatic repeat while the
+key is held down. The program can tell them apart only by their timing:
 
 ========================================================  ==========================================
 presses                                                   order
@@ -86,9 +86,9 @@ _EPS_S = 1e-9
 class OperatorSwitch:
     """The operator's command, by the table above, for planner and watchdog.
 
-    `press` is Ctrl-C. `land` is for the Land button on the live page and for the signals that ask a
-    program to end: it lands the vehicle, never stops the motors, and may be repeated. `cut` is for
-    the panel's key and the Cut motors button: it stops the motors at once. All methods may be
+    `press` handles Ctrl-C. `land` handles the Land button on the live page and the signals that ask
+    a program to end: it lands the vehicle, never stops the motors, and may be repeated. `cut`
+    handles the space bar and the Cut motors button: it stops the motors at once. All methods may be
     called from any thread.
 
     `interrupt` raises `Interrupted` if the flight loop is not listening yet, because there is
@@ -96,7 +96,7 @@ class OperatorSwitch:
     """
 
     listening: bool = False
-    closing: bool = False  # the link
+    closing: bool = False  # True while the link is being closed
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -131,8 +131,8 @@ class OperatorSwitch:
                     self._decide(now_s)
 
     def interrupt(self) -> None:
-        """Raises `Interrupted` on a signal while the loop is not listening; called in the main
-        thread."""
+        """Raise `Interrupted` if a signal arrives while the loop does not read commands; called in
+        the main thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
         if not self.closing and self.clock() - self._stopped_s >= STOP_HANG_S:
@@ -173,7 +173,8 @@ def _may_be_key(presses_s: Sequence[float]) -> bool:
 
 
 def _is_surely_key(presses_s: Sequence[float]) -> bool:
-    """True if these presses, which a held key may have caused, cannot have been made by hand."""
+    """True if these presses, which a held key may have caused, cannot be separate presses by
+    hand."""
     delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
     mean_s = _mean_gap_s(repeats_s)
     if len(repeats_s) < 2:
@@ -205,7 +206,7 @@ def _are_even(times_s: Sequence[float]) -> bool:
 
 LANDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Signals that end or suspend other programs; on one of them, a flight lands."""
-_MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight in a shell's background
+_MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight that runs in the background
 _NO_SUSPENDING = "Ctrl-Z cannot suspend a flight: landing"
 
 
@@ -270,8 +271,8 @@ def cut_key(
 ) -> Iterator[bool]:
     """Let the space bar cut the motors while the block runs.
 
-    Yields True if this is possible: it needs the file descriptor of a terminal with this process in
-    the foreground; otherwise nothing is changed.
+    Yields True if this is possible, that is, if the file descriptor is a terminal with this process
+    in the foreground; otherwise nothing is changed.
 
     `on_keys` is called with all keys in another thread and must return at once. Keys take effect
     without Enter and are not echoed; Ctrl-C and Ctrl-Z still cause signals. Keys pressed before or

@@ -1,4 +1,7 @@
-"""Checks that must pass on the ground before any motor turns."""
+"""Checks that must pass on the ground before any motor turns.
+
+A turn is one iteration of the flight loop, which also runs while the vehicle waits for take-off.
+"""
 
 from __future__ import annotations
 
@@ -76,8 +79,8 @@ def refuse_wrong_positions(
     """Raise SafetyAbort if positions are in another unit, or belong to another world frame or
     another body.
 
-    Nothing is checked if the data is old or if the vehicle is tilted or moving. `rest_check`
-    remembers the position from earlier turns.
+    Nothing is checked if the data is old or if the vehicle is tilted or moving. `rest_check` stores
+    the position from earlier turns.
     """
     if status is None or telemetry is None:
         return
@@ -98,7 +101,7 @@ def refuse_wrong_positions(
 
 @dataclass(frozen=True)
 class GroundTurn:
-    """What the loop knows in one turn before take-off.
+    """The data of one loop turn before take-off.
 
     `waited_s` is the total waiting time, and `took_s` the duration of this turn so far. `samples`
     is the recent telemetry, oldest first; the newest sample is `telemetry_age_s` old.
@@ -121,8 +124,9 @@ class GroundTurn:
 
 def still_waiting_for(turn: GroundTurn) -> str:
     """Return the conditions that take-off still waits for, in words; empty if the vehicle is ready.
-    Only this turn counts: if a check passed earlier but fails now, take-off waits for it again.
-    Errors: TimedOut after too long a wait, SafetyAbort off the ground or too near to the target."""
+    Only the current turn counts: if a check passed earlier but fails now, take-off waits for it
+    again. Errors: TimedOut if the wait takes too long, SafetyAbort if the vehicle is not on the
+    ground or is too close to the target."""
     profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_target = profile.safety.estimator_wait_s, profile.positioning.source.is_target
     if not turn.samples:
@@ -161,7 +165,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     if not waiting and turn.picture_problem:
         waiting = f"a good picture ({turn.picture_problem})"
         others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
-        if waited_s <= others_s + limit_s:  # it may have failed while waiting for the others
+        if waited_s <= others_s + limit_s:  # the camera may have failed during the other checks
             waited_s = min(waited_s, turn.unseen_s)
     waiting = waiting or _first({"a view of the target, which measures the position": unsent})
     if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
@@ -173,8 +177,8 @@ def still_waiting_for(turn: GroundTurn) -> str:
 
 
 def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-    """Problem: the estimate moves, or has not stood still for long enough. A gap in the telemetry
-    does not count as standing still."""
+    """Problem: the estimate moves, or has not been still for long enough. A gap in the telemetry
+    does not count as being still."""
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
@@ -248,8 +252,8 @@ class Arming:
         """Return the request to send now, if any. Must be called in each turn in which the vehicle
         `waits_for_arming`, with fresh telemetry.
 
-        Raises TimedOut if it does not arm within `ARMS_WITHIN_S`, SafetyAbort if it disarms itself
-        while its motors start.
+        Raises TimedOut if the vehicle is not armed within `ARMS_WITHIN_S`, and SafetyAbort if it
+        disarms itself while its motors start.
         """
         if self._began_s is None:
             self._began_s = now_s
@@ -286,11 +290,11 @@ def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm
     return poll
 
 
-# --- Whether a target that is the positioning system stays in view during the climb. Pure ---
+# --- Check that a target used as the positioning system stays in view during the climb. Pure ---
 
 
 LEAN_DEG = 5.0  # allowance for the tilt during the climb, also against a draught
-Start = tuple[float, float, float]  # where it stands, in the world of the target's place
+Start = tuple[float, float, float]  # the vehicle's position, in the world of the target's position
 
 
 def view_problem(
@@ -339,7 +343,7 @@ def target_view_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """The view of a vehicle that tilts so that the target moves towards the image border."""
+    """The view from a vehicle that tilts so that the target moves towards the image border."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.has_marker and aside_m > 1e-9):

@@ -1,4 +1,4 @@
-"""One flight in real time, from options to report: opens link, camera and log, flies, and closes
+"""One flight in real time, from options to report: open link, camera and log, fly, and close
 them."""
 
 from __future__ import annotations
@@ -45,13 +45,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """The options of one flight, from the command line or else from the profile."""
+    """The options for one flight, from the command line or, if not given there, from the
+    profile."""
 
     profile: Profile
     profile_path: Path
     uri: str
     source: str
-    # for a newcomer's first flight, which should not raise questions
+    # a seed with an uneventful flight, because this is a newcomer's first flight
     seed: int = 11
     log_dir: Path = Path("perchctl-logs")
     record: bool = False
@@ -69,7 +70,7 @@ class FlyOptions:
 
     @property
     def has_own_link(self) -> bool:
-        """True if the URI names your own link, as ``my_module:MyLink``."""
+        """True if the URI names your own link, such as ``my_module:MyLink``."""
         return is_own_uri(self.uri)
 
     def require_lift_check(self) -> None:
@@ -89,7 +90,7 @@ def check_options(options: FlyOptions) -> None:
     if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.source.is_mocap and find_spec("motioncapture") is None:
-        raise no_motion_capture()  # the simulated room has a capture of its own
+        raise no_motion_capture()  # only a real flight needs it: the simulated room has its own
     source = parse_source(options.source)
     if source.is_own:
         load_extension(options.source, "camera.source")
@@ -120,13 +121,13 @@ def fly_session(
 ) -> tuple[FlightReport, float | None]:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
-    Returns the report, and the gear's distance from the target's centre, m, where a simulator
-    measures it.
+    Returns the report and, if a simulator can measure it, the gear's distance from the target's
+    centre, m.
 
     `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`, and
     `climb_withheld`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
     answered. If it raises an exception, the session ends on the ground. `rows` are added to the
-    profile's table.
+    profile's transition table.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
@@ -188,7 +189,7 @@ def fly_session(
                     waiting.enter_context(clock.waiting_for_loop())
                 report = fly(parts)
         finally:
-            switch.listening = switch.closing = True  # Ctrl-C must not interrupt it
+            switch.listening = switch.closing = True  # Ctrl-C must not interrupt the closing
             link.close()
         return report, _true_miss_m(simulated)
 
@@ -202,8 +203,8 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
 
 
 def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
-    """Start the simulated vehicle with its camera's stream. Raises UsageError without the
-    simulator."""
+    """Start the simulated vehicle with its camera's stream. Raises UsageError if the simulator is
+    not installed."""
     if find_spec("mujoco") is None:
         raise no_simulator()
     from perchctl.sim import SimProcess, draw_capture, draw_scenario
@@ -219,13 +220,13 @@ def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProc
     )
 
 
-# --- External positions for one flight in real time: capture, feed, and the thread between ---
+# --- External positions for one flight in real time: motion capture and position feed ---
 
 
 def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
-    """Raise SafetyAbort unless this vehicle was recently compared with the motion capture by hand
-    (`perchctl check --lift`), because swapped axes do not show at rest. A simulated vehicle
-    passes."""
+    """Raise SafetyAbort unless this vehicle was recently lifted by hand and compared with the
+    motion-capture system (`perchctl check --lift`), because swapped axes cannot be detected at
+    rest. A simulated vehicle always passes."""
     if not config.source.is_mocap or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection_and_advice(
@@ -243,8 +244,8 @@ def start_position_feed(
     ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
     """Settle the state estimate, then send positions from motion capture to the vehicle until
-    `stack` closes. That is after the link has closed, because a landing vehicle needs them. Returns
-    None if the profile uses no motion capture.
+    `stack` closes. `stack` must close after the link, because a landing vehicle needs the
+    positions. Returns None if the profile uses no motion capture.
 
     Errors: those of `CflibLink.settle_estimator`, InvalidValue, UsageError, ConnectionFailed."""
     if config.source.is_target:

@@ -1,14 +1,15 @@
-"""Landing in the loop's place: the watchdog for a silent loop, and the rescue after an error.
+"""Land without the flight loop: the watchdog acts if the loop is silent, and the rescue after an
+error.
 
 The watchdog decides what the link sends (`Link.set_guard`), in a thread that a hanging loop cannot
 block. Before the loop's first tick the vehicle does not fly, and the watchdog only obeys the
-operator: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the last
-position, but never one above the vehicle, so that the vehicle neither climbs nor presses against
-the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above itself, which brakes
-it. The lander of `perchctl.mission` takes over after `safety.loop_late_land_s`, on the operator's
-command, or if the loop was already descending or had put the weight on the magnet. With decks or
-motion capture, it commands the firmware's own landing at once, three to six times, because a late
-loop cannot steer. With the target as the only position source, it descends level.
+operator's command: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the
+last position, but never one above the vehicle, so that the vehicle neither climbs nor presses
+against the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above itself, which
+brakes it. The lander of `perchctl.mission` takes over after `safety.loop_late_land_s`, on the
+operator's command, or if the loop was already descending or had put the weight on the magnet. With
+decks or motion capture, it commands the firmware's own landing at once, three to six times, because
+a late loop cannot steer. With the target as the only position source, it descends level.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from perchctl.vehicle import (
 )
 
 REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
-# time for the loop to obey the operator's stop itself, so that the stop is recorded
+# time in which the loop can still obey the operator's stop itself, so that the log contains it
 STOP_AFTER_S = 0.1
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 RESCUE_SINK_MPS = -0.1
@@ -60,7 +61,7 @@ LOOK_S = 0.5  # a rescue ends once telemetry has shown the motors off for this l
 class LastTick:
     """The last tick of the loop whose command was sent."""
 
-    next_due_s: float  # when the next tick is due, from which the loop measures its lateness
+    next_due_s: float  # when the next tick is due; the loop's lateness is measured from this time
     state: PlannerState
     command: Command  # the last setpoint that was sent
     obs: Observation
@@ -72,8 +73,8 @@ class Watchdog:
     `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's. Each
     field is written by only one of the two threads, so no lock is needed.
 
-    `position_age_s` returns the age of the newest external position at a time. `overruled_s` is how
-    late the loop was when the watchdog began a landing in its place, else 0.
+    `position_age_s` returns the age of the newest external position at a given time. `overruled_s`
+    is how late the loop was when the watchdog began a landing in its place; 0 if it never did.
     """
 
     def __init__(
@@ -165,9 +166,9 @@ class Watchdog:
     def _before_first_tick(
         self, operator: OperatorRequest, now_s: float, newest: Telemetry | None
     ) -> Command | None:
-        """Obey the operator's command in the loop's place if the first turn hangs or fails and so
-        does not read it. The command of that turn may have been sent already. A stop therefore cuts
-        the motors, and a landing disarms only on the ground."""
+        """Obey the operator's command if the loop's first iteration hangs or fails, so that the
+        loop does not read it. That iteration may already have sent its own command. A stop
+        therefore cuts the motors, and a landing disarms the vehicle only on the ground."""
         if operator is OperatorRequest.STOP:
             self._cut_ordered = True
             return self._cut(now_s, newest)
@@ -194,7 +195,7 @@ class Watchdog:
         new = [*waiting, *([] if newest is None else [newest])]
         self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
-        if self._profile.positioning.source.is_target:  # detections are not sent without the loop
+        if self._profile.positioning.source.is_target:  # without the loop, it gets no positions
             age_s = last.obs.position_age_s + now_s - last.obs.t_s
         return Observation(
             t_s=now_s,
@@ -218,7 +219,7 @@ class Watchdog:
         if self._held is None and known is not None:
             match last.command:
                 case RawThrust(thrust) if abs(known.velocity_mps[2]) < RESCUE_STILL_MPS:
-                    return RawThrust(thrust)  # keep pressing: a change of mode would end it
+                    return RawThrust(thrust)  # another mode would end the pressing
                 case PositionSetpoint(z_m=z_m):
                     if z_m > known.position_m[2] and known.velocity_mps[2] < RESCUE_SINK_MPS:
                         return last.command
@@ -264,20 +265,20 @@ def rescue(
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
 ) -> RestReport:
-    """Land a vehicle that still flies, without planner, camera and log, within the time of a normal
-    landing. Returns where the vehicle came to rest.
+    """Land a vehicle that still flies, without planner, camera and log, within the time that a
+    normal landing takes. Return where the vehicle came to rest.
 
     Args:
         state: the planner's last state; None before its first tick.
         history: the telemetry so far.
-        position_age_s: age of the newest external position at a time; positions are no longer
-            sent if the target is the positioning system.
-        on_sent: called with each command that was sent.
+        position_age_s: returns the age of the newest external position at a given time; if the
+            target is the positioning system, no more positions are sent.
+        on_sent: called with each command that has been sent.
         motion: the last motion on which images and accelerometer agreed.
     """
 
     def send(command: Command) -> None:
-        with suppress(Exception):  # the link itself may have failed: still send the next command
+        with suppress(Exception):  # if the link itself fails, still try to send the next command
             link.send(command)
             on_sent(SentCommand(clock.now(), "rescue", command))
 

@@ -2,9 +2,9 @@
 continues.
 
 A panel, a page, a callback or a log may fail in any tick. It is then detached, the other observers
-are told, and the flight continues without it. Two kinds of exceptions are raised after the loop has
-landed the vehicle: errors from the judges, without which a simulated flight would prove nothing,
-and requests to exit (KeyboardInterrupt, SystemExit).
+are informed, and the flight continues without it. Two kinds of exceptions are raised after the loop
+has landed the vehicle: errors from the judges, without which a simulated flight would prove
+nothing, and requests to exit (KeyboardInterrupt, SystemExit).
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class FrameWatcher(Watcher, Protocol):
 
 
 class TurnWatcher(Watcher, Protocol):
-    """A watcher that receives everything that a flight log contains, including turns without a tick
-    (before take-off, or with a discarded decision) and the commands that the link sends in the
-    loop's place."""
+    """A watcher that receives everything that a flight log contains: also loop iterations (turns)
+    without a tick, that is, before take-off or with a discarded decision, and the commands that the
+    link sends in the loop's place."""
 
     def turn(self, turn: TickRecord) -> None: ...
 
@@ -79,7 +79,7 @@ class Watchers:
 
     @property
     def problem(self) -> str | None:
-        """The reason why records of the flight are lost; None if they are not."""
+        """The reason why records of the flight are lost; None if none are."""
         for watcher in self._active:
             try:
                 if watcher.problem:
@@ -119,8 +119,8 @@ class Watchers:
                     self._detach(watcher, error)
 
     def take_notes(self) -> list[str]:
-        """Return new notes for the flight's events since the last call: remarks on the recording,
-        and watchers that were slow or detached."""
+        """Return the notes for the flight's events that are new since the last call: remarks on the
+        recording, and watchers that were slow or detached."""
         try:
             remarks = [*self._remarks()]
         except Exception as error:
@@ -147,12 +147,12 @@ class Watchers:
         sentence = f"{watcher_name(watcher)} raised {error_at(error)}"
         with self._lock:
             if all(other is not watcher for other in self._active):
-                return  # in the other thread
+                return  # it was detached in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
             self.detached.append(f"{sentence}: it was detached, and perchctl continued without it")
-            if takes_turns(watcher):  # the loop reports it like any log problem
+            if takes_turns(watcher):  # the loop reports this like any other problem with the log
                 self._log_problem = self._log_problem or sentence
-                with suppress(Exception):  # it has already raised an exception
+                with suppress(Exception):  # it has raised one exception and may raise another
                     watcher.note_detached(sentence)
                 return
         self._report(f"{sentence}: it was detached, and the flight continues")
