@@ -1,4 +1,4 @@
-"""The link to a vehicle: through cflib, or in lockstep with a simulated one."""
+"""The link to a vehicle: through cflib, or to the simulated vehicle in lockstep."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
 """Disarm the vehicle at the end of a session. Every kind of link uses this module.
 
 A vehicle that does not arm itself spins its propellers while it is armed, even on the ground.
-`perchctl.flight` arms it once everything else is ready. Whatever ends the session on the ground,
-the link disarms the vehicle as it closes.
+`perchctl.flight` arms it once everything else is ready. However the session ends on the ground, the
+link disarms the vehicle as it closes.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def disarm(
     may still be armed.
 
     Args:
-        newest: function that returns the newest telemetry, None without any.
+        newest: function that returns the newest telemetry, or None if there is none.
         send: function that queues a command for the vehicle.
-        clock, wait: functions that return the present time, s, and wait for some seconds.
+        clock, wait: functions that return the current time, s, and wait for a number of seconds.
         was_ordered: True if this session has sent `Arm(True)`, which may take effect at any time.
             Only a sample newer than the disarm command then confirms that the vehicle is disarmed.
     """

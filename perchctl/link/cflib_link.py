@@ -1,4 +1,5 @@
-"""Connect a simulated or real Crazyflie with cflib: the flight's only access to the radio.
+"""Connect to a real or simulated Crazyflie with cflib. A flight accesses the radio only through
+this link.
 
 Every call that may block has a timeout, and cflib's callbacks make no blocking calls. The link is
 closed only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
@@ -67,7 +68,7 @@ FAREWELL = RawThrust(0)
 
 
 class CflibLink:
-    """`perchctl.link.protocol.Link` on an unmodified cflib.
+    """`perchctl.link.protocol.Link`, implemented with an unmodified cflib.
 
     `connection` is None while not connected. `landing_wait_s` is the time for which `close` waits
     for a vehicle that still flies. Unless `positioning` uses decks, the estimator is configured for
@@ -98,7 +99,7 @@ class CflibLink:
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
         self._lost_since_s: float | None = None  # time of the last arrival, while the link is lost
-        self._was_armed = False  # armed by a command of this session
+        self._was_armed = False  # True once this session has sent an arming command
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -132,8 +133,8 @@ class CflibLink:
 
     def settle_estimator(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
         """Start the estimator at the vehicle's position according to `feed`; without a feed, at the
-        world's origin with the height `ground_z_m`. On the ground, after `connect`; bounded. Raises
-        ConnectionFailed, NotFound, InvalidValue and TimedOut."""
+        world's origin with the height `ground_z_m`. Must be called on the ground, after `connect`;
+        has a timeout. Raises ConnectionFailed, NotFound, InvalidValue and TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         cf, config, clock = self.connection.cf, self._positioning, self._clock
@@ -225,17 +226,17 @@ class CflibLink:
             time.sleep(UNLOCK_PERIOD_S)
 
     def _ask_guard(self) -> Command | None:
-        """Call the guard, in the sender's thread that never calls cflib."""
+        """Call the guard; runs in the sender's thread that never calls cflib."""
         if self._guard is None:
             return None
         return self._guard(self._clock(), self._blocks.newest, self._blocks.waiting_samples)
 
     def _hand_over(self, packet: Packet) -> bool:
-        """Send a packet, in the sender's thread."""
+        """Pass a packet to cflib; runs in the sender's other thread."""
         return self.connection is not None and self.connection.send(packet)
 
     def _tend(self, stuck_s: float, hangs: bool) -> None:
-        """Maintain the link, in the sender's thread that never calls cflib."""
+        """Maintain the link; runs in the sender's thread that never calls cflib."""
         connection, sender = self.connection, self._sender
         if connection is None or sender is None:
             return

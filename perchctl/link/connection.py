@@ -1,4 +1,4 @@
-"""An open `cflib.crazyflie.Crazyflie`: opening and closing with timeouts, sending, and a lock
+"""A connection to a Crazyflie through cflib: opening and closing with timeouts, sending, and a lock
 against other programs."""
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ class Connection:
             cache.mkdir(parents=True, exist_ok=True)
         self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
-        self.cause = Problem("", "")  # of the newest `lost`
+        self.cause = Problem("", "")  # cause of the newest `lost`
         self._shown_uri = shown_uri
         self.claim = contextlib.ExitStack()
-        self._settled = threading.Event()  # set when connected, or failed
+        self._settled = threading.Event()  # set once connected or failed
         # guards the fields below; cflib is never called with it held
         self._change = threading.Lock()
         self._left = False
@@ -66,8 +66,8 @@ class Connection:
         self._closer: threading.Thread | None = None
         self._opener: threading.Thread | None = None
         self._has_safelink = False
-        self._refused_since_s: float | None = None  # since when the lock was not available
-        # time of the last call of `is_dead`, and time since which the count has not changed
+        self._refused_since_s: float | None = None  # when the lock became unavailable
+        # time of the last call of `is_dead`, and time of the last change of the count
         self._asked_s = self._counted_s = 0.0
         self._counted: object = None
         internals.replace_error_callback(self.cf, partial(self._on_error, self._number))
@@ -78,7 +78,7 @@ class Connection:
     def open(self, uri: str, timeout_s: float) -> bool:
         """Open the link; return True if it was connected or refused (see `lost`) within
         `timeout_s`."""
-        # Opening a radio may block in its driver, so it runs in a thread with a bound.
+        # Opening a radio may block in its driver, so it runs in a thread, with a timeout.
         start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
             return False
@@ -114,7 +114,7 @@ class Connection:
     def is_dead(self) -> bool:
         """True if the driver has been stuck for `DEAD_S` and will never accept a packet again.
 
-        Must be called repeatedly, and only while the driver accepts no packet.
+        Must be called repeatedly while the driver accepts no packet, and only then.
 
         If the vehicle is out of range, the driver counts lost packets and recovers by itself. If
         the dongle was unplugged, the driver counts nothing, but cflib still retries forever.
@@ -365,14 +365,14 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
     return thread
 
 
-# --- One program per vehicle: a lock shared by this user's programs on this computer ---
+# --- One program per vehicle: a lock between the programs of one user on this computer ---
 # Connecting by cflib would reset the log blocks of a vehicle that flies for another program, and
 # two streams of setpoints would conflict.
 
 
 def lock_vehicle(uri: str, shown_uri: str | None = None) -> contextlib.ExitStack:
-    """Lock the vehicle at `uri`, in messages `shown_uri`, for this process until the result is
-    closed.
+    """Lock the vehicle at `uri` (called `shown_uri` in messages) for this process until the result
+    is closed.
 
     Nothing is locked if no lock can be created (no writable folder, or Windows). Raises
     ConnectionFailed if another program holds the lock.

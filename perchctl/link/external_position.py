@@ -1,7 +1,7 @@
 """Set up the estimator of a vehicle that uses external positions: set its parameters, start it, and
 check that estimate and measurement agree.
 
-On the ground only. The filter is reset to the capture's pose while positions already arrive;
+On the ground only. The filter is reset to the measured pose while positions already arrive;
 otherwise it would drift. Positions do not determine the heading, and a wrong heading makes the
 vehicle fly away (docs/positioning.md).
 """
@@ -146,8 +146,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed for a vehicle that stands level at the world's origin, facing along x; its position
-    defines the world. `wait` sends that position `rate_hz` times a second."""
+    """Feed for a vehicle whose standing position defines the world: it stands level at the origin
+    and faces along x. `wait` sends that position `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]

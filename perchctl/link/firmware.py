@@ -25,7 +25,8 @@ _VERSION_CHANNEL, _DEVICE_TYPE = 1, b"\x02"
 
 
 def check_firmware(cf: Any, uri: str) -> None:
-    """Raise ConnectionFailed for an old protocol, NotFound for a missing log variable."""
+    """Raise ConnectionFailed if the protocol is too old, and NotFound if a log variable is
+    missing."""
     version, remedy = cf.platform.get_protocol_version(), "update the firmware to 2026.08 or later"
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
@@ -37,7 +38,8 @@ def check_firmware(cf: Any, uri: str) -> None:
 
 
 def read_device_type(cf: Any) -> str | None:
-    """Return the kind of vehicle as named by its firmware; None without an answer. Bounded.
+    """Return the type of vehicle that the firmware reports; None if it does not answer within a
+    timeout.
 
     cflib 0.1.34 never requests it.
     """

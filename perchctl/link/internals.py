@@ -72,7 +72,7 @@ def _radio_driver() -> Any:
 def _radio_thread() -> Any:
     from cflib.crtp import radiodriver
 
-    return radiodriver._RadioDriverThread(*[None] * 7)  # the thread is not started
+    return radiodriver._RadioDriverThread(*[None] * 7)  # only constructed, never started
 
 
 def _dongle_share() -> Any:
@@ -84,7 +84,7 @@ def _dongle_share() -> Any:
 def _dongle_thread() -> Any:
     from cflib.crtp.radiodriver import _SharedRadio
 
-    return _Named(_SharedRadio.open_instance)  # making one would open a dongle
+    return _Named(_SharedRadio.open_instance)  # constructing an instance would open a dongle
 
 
 def _radio_manager() -> Any:
@@ -265,7 +265,7 @@ def count_answers(driver: Any, on_answer: Callable[[bool | None], None]) -> None
 
 
 def put_packet(driver: Any, packet: Any, wait_s: float) -> bool:
-    """Hand a packet to a radio's driver if it has room within `wait_s`; return True if it had.
+    """Pass a packet to a radio's driver if it has room within `wait_s`; return True if it had.
 
     cflib's `send_packet` would wait for 2 s, and then report an error.
     """
@@ -306,10 +306,10 @@ def forget_dongle(thread: threading.Thread) -> None:
 
 
 def close_radio(driver: Any, dongle: threading.Thread, timeout_s: float) -> None:
-    """Close a radio's driver, also if its dongle's thread has ended; bounded. Sends nothing.
+    """Close a radio's driver, with a timeout, even if its dongle's thread has ended. Sends nothing.
 
-    cflib's `close` joins the driver's thread, which may wait forever for an answer. An answer of
-    None makes it look whether it is to end.
+    cflib's `close` joins the driver's thread, which may wait forever for an answer. Therefore an
+    answer of None is put into its queue, which makes it check if it should end.
     """
     share = driver._radio
     closer = threading.Thread(target=driver.close, name="perchctl-close", daemon=True)

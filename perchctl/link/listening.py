@@ -50,17 +50,17 @@ class ReadOnlyLink(CflibLink):
     closes: the vehicle may be flying for another program."""
 
     def close(self) -> None:
-        """Close at once, without the setpoint that cflib sends as it closes."""
+        """Close at once, without the setpoint that cflib normally sends when it closes."""
         self._leave(farewell=False)
 
     def _may_say_farewell(self) -> bool:
-        return False  # also if connecting fails half-way
+        return False  # even if connecting fails half-way
 
     def _prepare(self, connection: Connection) -> None:
-        """Do nothing; subclasses start what they listen to."""
+        """Do nothing; subclasses start the data that they receive."""
 
 
-# --- Motion by hand: attitude and rotation rates of the same time, in one packet ---
+# --- Motion by hand: attitude and rotation rates at the same time, in one packet ---
 
 
 MOTION_PERIOD_S = 0.01

@@ -1,5 +1,5 @@
-"""The simulated counterpart of the cflib link, in lockstep: same protocol, same packets, no wall
-clock."""
+"""The counterpart of the cflib link for lockstep flights with a simulated vehicle: same protocol,
+same packets, but no wall clock."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ WATCH_PERIOD_S = 0.05
 
 
 class Radio:
-    """A simulated radio, both ways; `bursts` decides which packets are lost (None: no packet)."""
+    """A simulated radio in both directions; `bursts` decides which packets are lost (None:
+    none)."""
 
     def __init__(self, bursts: Any = None) -> None:
         self._bursts = bursts
@@ -103,7 +104,7 @@ class MockLink:
         return float(self.vehicle.t_s)
 
     def advance_to(self, t_s: float) -> None:
-        """Step the vehicle until `t_s`, and send its telemetry on the way."""
+        """Step the vehicle until `t_s`, sending its telemetry meanwhile."""
         while (due_s := min(self._call_due_s, *self._due_s.values())) <= t_s:
             self.vehicle.advance_to(due_s)
             for name, block_due_s in self._due_s.items():

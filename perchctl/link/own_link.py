@@ -47,7 +47,7 @@ class GuardedLink:
         self._trouble: str | None = (
             None  # the link's own problem or exception in the reader's last cycle
         )
-        self._answered_s: float | None = None  # end of the reader's last cycle
+        self._answered_s: float | None = None  # when the reader's last cycle ended
         self._was_armed = False  # armed by a command of this session
         self._first_sample, self._closing = threading.Event(), threading.Event()
         self._guard: Guard | None = None

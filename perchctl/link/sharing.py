@@ -118,13 +118,13 @@ class Carrier:
         self.problem: str | None = None
         self.answered = self.lost = 0
         self.refused = self.missed = (
-            0  # number of successive packets without an answer: from the dongle, from the vehicle
+            0  # successive packets that the dongle, or the vehicle, did not answer
         )
         self.has_stale_packet = False
         """True if the driver must be closed because it holds an outdated packet."""
         self._offered = 0  # packets sent by the current driver
         self._has_carried = (
-            False  # whether the current driver has taken packets from the current flight
+            False  # True once the current driver has accepted packets from the current flight
         )
         self._quality: float | None = None
         self._limit: int | None = None
@@ -134,7 +134,7 @@ class Carrier:
 
     @property
     def has_flight(self) -> bool:
-        """True while a flight's link is open that was heard lately."""
+        """True while a flight's link is open and a datagram from it has arrived recently."""
         return self._flight is not None and time.monotonic() - self.heard_s < LINGER_S
 
     @property
@@ -341,7 +341,7 @@ class Hub:
                 carrier.limit(packets_per_s)
 
     def has_flights(self) -> bool:
-        """True while a flight's link is open that was heard lately."""
+        """True while any flight's link is open and a datagram from it has arrived recently."""
         return any(carrier.has_flight for carrier in self.carriers)
 
     def close(self) -> None:

@@ -94,8 +94,8 @@ def telemetry_from_log(
 
 def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
     """Return the largest of these variances; NaN if one of them is NaN. Return None if one is
-    missing or zero: a running filter keeps each at 1e-6 or more, while a filter that never ran
-    reports zeros (source)."""
+    missing or zero: according to the firmware's source, a running filter keeps each at 1e-6 or
+    more, while a filter that has never run reports zeros."""
     found = [values.get(name, 0.0) for name in names]
     if any(variance == 0.0 for variance in found):
         return None
@@ -239,7 +239,7 @@ class SampleAssembler:
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
-    """Return the values with the position extrapolated to the time of the attitude block."""
+    """Return the values, with the position extrapolated to the time of the attitude block."""
     carried = dict(values)
     step_s = max(-MOST_CARRIED_S, min(MOST_CARRIED_S, ahead_s))
     for axis in "xyz":
@@ -281,7 +281,7 @@ class LogBlocks:
         self._assembler = SampleAssembler()
         self._samples: deque[Telemetry] = deque(maxlen=MOST_TELEMETRY_SAMPLES)
         self._first_sample = threading.Event()
-        self._awaited: set[str] = set()  # slow blocks without data so far
+        self._awaited: set[str] = set()  # slow blocks that have not sent data yet
         self._started_s = 0.0
         self._starting: dict[str, list[Packet]] = {}  # packets that start each block
         self._arrived_s: dict[str, float] = {}  # last arrival of each block
@@ -341,7 +341,7 @@ class LogBlocks:
         return True
 
     def _on_data(self, stamp: int, data: dict[str, float], block: Any) -> None:
-        """Process a packet, in cflib's thread."""
+        """Process a packet; runs in cflib's thread."""
         now_s = self._clock()
         self.last_arrival_s = now_s
         name = block.name.removeprefix(_PREFIX)
@@ -350,7 +350,7 @@ class LogBlocks:
         sent_s = self._timebase.to_loop_s(stamp, now_s)
         sample = self._assembler.accept(name, data, sent_s, self._timebase.start)
         if sample is None or (self._awaited and now_s < self._started_s + AWAIT_SLOW_S):
-            return  # the first sample should contain the battery, too
+            return  # the first sample should also contain the battery
         self.newest = sample
         self._samples.append(sample)
         self._first_sample.set()
