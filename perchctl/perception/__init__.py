@@ -1,4 +1,4 @@
-"""Estimate the target from frames and telemetry: the one session that every command uses."""
+"""Estimate the target's pose from frames and telemetry, in the same way for every command."""
 
 import lazy_loader
 

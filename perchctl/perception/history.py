@@ -1,4 +1,5 @@
-"""The vehicle's recent telemetry, with its attitude and position at a frame's time."""
+"""Store the vehicle's recent telemetry, and interpolate its attitude and position at a frame's
+time."""
 
 from __future__ import annotations
 
@@ -31,10 +32,10 @@ class History:
     """Telemetry of the last `KEEP_S`, oldest first, plus one earlier sample, so that the samples
     cover all of that time at any sample rate.
 
-    `jumped`: the state estimate jumped within the newest samples. `turned_rad`: largest step of the
-    heading within the newest samples, beyond a possible rotation. `battery_changed_s`: time at
-    which the battery's reading last changed, or first arrived. `imu`: motion from the accelerometer
-    over the whole flight.
+    `jumped`: True if the state estimate jumped within the newest samples. `turned_rad`: largest
+    change of the heading within the newest samples in excess of any possible rotation.
+    `battery_changed_s`: time at which the battery's reading first arrived or last changed. `imu`:
+    motion from the accelerometer over the whole flight.
     """
 
     samples: tuple[Telemetry, ...] = ()
@@ -49,7 +50,7 @@ class History:
         return self.samples[-1] if self.samples else None
 
     def battery_age_s(self, now_s: float) -> float:
-        """Seconds since the last new reading of the battery; 0 before there is telemetry."""
+        """Time since the battery's reading last changed, s; 0 before the first telemetry."""
         return 0.0 if self.battery_changed_s is None else now_s - self.battery_changed_s
 
 
@@ -59,8 +60,8 @@ def add_samples(
     """Return the history with new samples.
 
     `jumped` and `turned_rad` describe the new samples; with `late`, also the earlier samples of the
-    same tick. A sample without position or velocity takes both from the previous sample. Other
-    samples with NaN, and samples out of order, are dropped (fault 35).
+    same tick. A sample without position or velocity gets both from the previous sample. Other
+    samples with NaN, and samples that are out of order, are dropped (fault 35).
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
@@ -87,10 +88,11 @@ def add_samples(
 
 def attitude_at(history: History, t_s: float) -> VehicleState | None:
     """Return attitude, position and velocity at `t_s`, interpolated linearly between samples (yaw
-    on the circle).
+    along the shorter arc).
 
-    Before the oldest sample, its values are used. After the newest sample, the position is
-    extrapolated with its velocity for at most 0.1 s. Returns None without samples.
+    Before the oldest sample, the values of that sample are returned. After the newest sample, the
+    position is extrapolated with its velocity for at most 0.1 s. Returns None if there are no
+    samples.
     """
     samples = history.samples
     if not samples:
@@ -118,8 +120,8 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """Return the velocity in world axes of the first sample at or after `t_s`, or else of the
-    newest sample; zero without samples."""
+    """Return the velocity, in world axes, of the first sample at or after `t_s` or, if there is
+    none, of the newest sample; zero if there are no samples."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
@@ -146,7 +148,8 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
 
 
 def _turned_rad(a: Telemetry, b: Telemetry) -> float:
-    """Return the step of the heading beyond a possible rotation between two samples, rad."""
+    """Return by how much the heading changed between two samples in excess of any possible
+    rotation, rad."""
     return abs(wrap_rad(b.yaw_rad - a.yaw_rad)) - FASTEST_TURN_RADPS * (b.t_s - a.t_s)
 
 
@@ -159,7 +162,8 @@ def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
 
 
 def _between_s(a: Telemetry, b: Telemetry) -> float:
-    """Return the seconds between two positions, each of which is as old as its own packet."""
+    """Return the time between two position measurements, s, taking into account how old each
+    position was in its sample."""
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 

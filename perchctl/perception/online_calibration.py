@@ -1,7 +1,7 @@
 """Estimate the camera's latency and mounting image by image during the flight.
 
-With `camera.latency_s: measured`, the estimated latency is also applied: it is subtracted from the
-images' times once it is certain, slowly, and within bounds. The estimation itself uses the
+With `camera.latency_s: measured`, the estimated latency is also applied: once it is certain, it is
+subtracted from the images' times, slowly and within bounds. The estimation itself uses the
 uncorrected times.
 """
 
@@ -47,11 +47,11 @@ LONGEST_STEP_S = 0.1
 class OnlineCalibration:
     """Estimate of the camera's latency and mounting from images and telemetry.
 
-    `newest` is the solution of `sums` at `solved_s`. `applied_delay_s` is the latency beyond the
-    profile's that is subtracted from the images' times, since the image at `last_picture_s`.
-    `coarse_delay_s` is the goal of a correction in progress, None once it is reached. `changed_s`
-    is the newest change of a latency that had been certain: its old and new value, s beyond the
-    profile's.
+    `newest` is the solution of `sums` at `solved_s`. All latencies are in excess of the profile's.
+    `applied_delay_s` is the latency that is subtracted from the images' times since the image at
+    `last_picture_s`. `coarse_delay_s` is the goal of a correction in progress; None once it is
+    reached. `changed_s` contains the old and the new value, s, of the newest change of a latency
+    that had already been certain.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
@@ -64,8 +64,8 @@ class OnlineCalibration:
 
     @property
     def delay_sigma_s(self) -> float:
-        """Standard deviation of a measured latency, s: that of `newest`, at most that of an unknown
-        latency, however much the images scatter."""
+        """Standard deviation of a measured latency, s: that of `newest`, limited to that of an
+        unknown latency."""
         if self.newest is None:
             return UNKNOWN_SIGMA_S
         return min(UNKNOWN_SIGMA_S, self.newest.delay_sigma_s)
@@ -82,8 +82,8 @@ def update_calibration(
     """Return the estimate with one more image in its sums and, once a second, the solution of the
     sums.
 
-    `t_s` is the image's arrival minus the profile's latency. A pose is ignored if it is not
-    finite, too close, or without the attitude at its time.
+    `t_s` is the image's arrival time minus the profile's latency. A pose is ignored if it is not
+    finite or too close, or if the attitude at its time is unknown.
     """
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
@@ -108,14 +108,14 @@ def update_calibration(
 def apply_latency(
     old: OnlineCalibration, t_s: float, start_latency_s: float, correction_s: float | None
 ) -> OnlineCalibration:
-    """Return the calibration with the latency by which the next image's time is corrected, for
-    `camera.latency_s: measured`; `t_s` as in `update_calibration`.
+    """Return the calibration with the latency by which the next image's time is to be corrected,
+    for `camera.latency_s: measured`; `t_s` as in `update_calibration`.
 
-    `correction_s`, a very different latency according to the accelerometer
-    (`VisualInertialWindow.correction_s`), is applied within half a second: the sums take seconds,
-    during which a vehicle that flies with the target alone oscillates. A certain solution of the
-    sums is more accurate and is followed slowly. Sums that contradict the correction belong to an
-    earlier latency and restart.
+    If the accelerometer shows that the latency is very different, `correction_s` is given
+    (`VisualInertialWindow.correction_s`) and applied within half a second: the sums would take
+    seconds, during which a vehicle that flies with the target alone oscillates. A certain solution
+    of the sums is more accurate and is approached slowly. Sums that contradict the correction
+    belong to an earlier latency, and are restarted.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
     sure_s = found.delay_s if found is not None and found.delay_sigma_s <= USED_SIGMA_S else None
@@ -188,9 +188,9 @@ LEAST_FRAMES = 30
 class ConsistencySums:
     """A flight's sums for `solve_consistency`.
 
-    `level` (3, 8) holds the filtered rows and `variance` (3,) their variance after the newest
-    frame; `level` is None before the first. `information` (8, 8) is that of the innovations, and
-    `row_count` the number of rows in it.
+    `level` (3, 8) contains the filtered rows, and `variance` (3,) their variance after the newest
+    frame; `level` is None before the first frame. `information` (8, 8) is the information matrix of
+    the innovations, and `row_count` the number of rows in it.
     """
 
     t_s: float = -math.inf
@@ -212,8 +212,8 @@ def consistency_rows(
     """Return a frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
     variance (3,) of each row's noise; and the target's range, m.
 
-    `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time minus `delay_s`, the likely delay; `velocity_mps` is the vehicle's velocity at that time.
+    `before` and `after` are the vehicle's attitudes `ATTITUDE_STEP_S` before and after the frame's
+    time minus `delay_s`, the probable delay. `velocity_mps` is the vehicle's velocity at that time.
     """
     assert pose.xyz_yaw_cov is not None
     T_body_cam = setup.T_body_cam
@@ -273,7 +273,7 @@ def add_rows(
 ) -> ConsistencySums:
     """Return the sums with one more frame, given by its `consistency_rows`.
 
-    After a gap or a jump, the level restarts; the information on delay and rotation is kept.
+    After a gap or a jump, the level is restarted; the information on delay and rotation is kept.
     """
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -303,7 +303,7 @@ def add_rows(
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
-    """Return the errors of latency and mounting; None with less than a second of frames.
+    """Return the errors of latency and mounting; None if the frames cover less than a second.
 
     `attitude_sigma_rad` is the standard deviation of the bias of the estimated roll and pitch.
     """

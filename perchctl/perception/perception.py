@@ -46,16 +46,18 @@ MIRRORED_FRAMES = 5
 
 @dataclass(eq=False)
 class Perception:
-    """The session that estimates the target from the frames of one stream.
+    """Estimates the target from the frames of one stream, with everything that is remembered
+    between frames.
 
     Attributes:
-        stills: each frame is searched thoroughly and independently of other frames.
-        history: the vehicle's telemetry; empty without a vehicle.
-        attitude: function that returns the vehicle's attitude at a time; replaces the history's.
+        stills: True if each frame is searched thoroughly and independently of other frames.
+        history: the vehicle's telemetry; empty if there is no vehicle.
+        attitude: function that returns the vehicle's attitude at a given time; used instead of the
+            history.
         state: the pipeline's memory.
-        calibration, motion: estimates, from images and telemetry, of latency and mounting, and of
-            the vehicle's motion.
-        refused: why a target was rejected as another vehicle's; None if none was.
+        calibration, motion: estimates of latency and mounting, and of the vehicle's motion, from
+            images and telemetry.
+        refused: why a target was rejected as belonging to another vehicle; None if none was.
         health: decides whether a frame can be used as a measurement.
     """
 
@@ -72,10 +74,10 @@ class Perception:
     _mirrored: int = 0  # successive frames with the target's mirror image
 
     def exposure_s(self, frame: Frame) -> float:
-        """Return the time of a frame's exposure, s on the loop's clock, as far as it is known.
+        """Return the best estimate of a frame's exposure time, s, on the loop's clock.
 
-        The source stamps a frame with its arrival minus the profile's latency. Only this function
-        subtracts the additional latency that the flight has measured.
+        The source gives a frame its arrival time minus the profile's latency. The additional
+        latency measured in flight is subtracted here and nowhere else.
         """
         return frame.t_s - self.calibration.applied_delay_s
 
@@ -109,8 +111,8 @@ class Perception:
         return self._mirrored >= MIRRORED_FRAMES
 
     def target(self, t_s: float) -> TargetEstimate | None:
-        """Return the target at `t_s` (now) for the vehicle's newest attitude; None before the first
-        sighting."""
+        """Return the target's pose at `t_s` (now) for the vehicle's newest attitude; None before
+        the first sighting."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline)

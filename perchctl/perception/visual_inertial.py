@@ -1,9 +1,10 @@
-"""Check whether the images show the motion that the accelerometer measures.
+"""Check that the images show the same motion as the accelerometer measures.
 
-The vector from the body to the target, rotated by the attitude at the exposure, plus the body's own
-motion from the accelerometer, is a fixed position, except for the unknown speed at the start of the
-window and a constant accelerometer offset. If the images are later than assumed, or if the camera
-is rotated about the upward axis, the sum moves; with the correct delay or rotation, it is at rest.
+Take the vector from the body to the target, rotated by the attitude at the exposure, and add the
+body's own motion from the accelerometer. This sum is a fixed position, except for the unknown speed
+at the start of the window and a constant offset of the accelerometer. If the images are later than
+assumed, or if the camera is rotated about the upward axis, the sum moves; with the correct delay or
+rotation (a hypothesis), it is at rest.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
 delay in use."""
 # standard deviations of the offset (with 1 deg of attitude) and of a sighting
 OFFSET_MPS2, SIGMA_M = 0.2, 0.003
-# a smaller error makes an alignment oscillate by centimetres and is reported after the flight
+# a smaller error only makes the alignment oscillate by centimetres, and is reported after the
+# flight
 LEAST_LATER_S = 0.1
 BEYOND_S = 0.03
 """Tolerance of a measured latency beyond the usable range, s: the step of the grid plus an image's
@@ -55,7 +57,7 @@ MEASURED_LATER_S = 0.03
 accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment
 oscillates for longer. Smaller: the step of the grid and the jitter of single images count as an
 error."""
-# m, and ratio to the motion with the right delay, that show a mismatch
+# least motion of the sum, m, and least ratio to its motion with the best hypothesis, for a mismatch
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
 ROUGH_M = 0.03  # a sum that moves by this much within a second yields the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
@@ -78,8 +80,9 @@ class MeasuredLatency:
 
 @dataclass(frozen=True, eq=False)
 class FeltSamples:
-    """The values of telemetry samples that the hypotheses need, cached between sightings because
-    computing them for two seconds takes as long as the fit itself.
+    """The values from telemetry samples that are needed to test the hypotheses. They are cached
+    between sightings, because computing them for two seconds of samples takes as long as the fit
+    itself.
 
     Attributes:
         rows: (n, 7) for each sample: time, roll, pitch, yaw, and the acceleration in world axes.
@@ -90,8 +93,8 @@ class FeltSamples:
     rows: Array = field(default_factory=lambda: np.empty((0, 7)))
 
     def of(self, samples: tuple[Telemetry, ...], offset_g: Vector) -> FeltSamples:
-        """Return the values for these samples, oldest first, and for the accelerometer's offset
-        `offset_g`; rows that are known already are reused."""
+        """Return the values for these samples, oldest first, with the accelerometer's offset
+        `offset_g`; rows that are already known are reused."""
         begin = bisect.bisect_left(self.samples, samples[0].t_s, key=attrgetter("t_s"))
         known = len(self.samples) - begin
         if self.offset_g != offset_g or self.samples[begin:] != samples[:known]:
@@ -115,9 +118,9 @@ class VisualInertialWindow:
     """The sightings of the last `MISMATCH_WINDOW_S`, and the mismatch and motion computed from
     them.
 
-    Times and delays are relative to the profile's latency. `mismatch` is for the planner: None if
+    Times and delays are relative to the profile's latency. `mismatch` is for the planner; None if
     there is none, or if it is being corrected. `correction_s` is the delay to which a measured
-    latency should be corrected, None while the latency in use fits.
+    latency should be corrected; None while the latency in use fits.
     """
 
     sights: tuple[tuple[float, Vector], ...] = ()  # time, vector from body to target, body axes, m
@@ -147,14 +150,14 @@ class VisualInertialWindow:
 
     @property
     def correction_s(self) -> float | None:
-        """The measured latency beyond the profile's if it differs from the latency in use, else
-        None."""
+        """The measured latency in excess of the profile's if it differs from the latency in use,
+        else None."""
         enough = self.is_corrected and self.agree_count >= AGREED_MEASURED
         return self.latest.camera_latency_error_s if self.latest is not None and enough else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """Return the window without its sightings; from now on, it accepts a less accurate motion."""
+    """Return the window without its sightings. From then on, it accepts a less accurate motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -169,11 +172,11 @@ def estimate_motion(
     """Return the window with one more sighting, `body_to_target_m` in body axes at `t_s`.
 
     Args:
-        t_s: arrival of the sighting minus the profile's latency.
+        t_s: arrival time of the sighting minus the profile's latency.
         samples: telemetry of the last 2 s, oldest first.
         offset_g: offset of the accelerometer.
-        measured: the latency in use with `camera.latency_s: measured`; without it, the latency is
-            the profile's, and a mismatch stays.
+        measured: the latency in use with `camera.latency_s: measured`. If None, the latency is the
+            profile's, and a mismatch persists once it is found.
     """
     kept = tuple(s for s in old.sights if t_s - MISMATCH_WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, body_to_target_m)))
@@ -185,7 +188,7 @@ def estimate_motion(
     wanders_m, upwards_m, velocity_mps, bias_mps2 = fit_hypotheses(
         new.sights, new.felt, hypotheses_s
     )
-    if old.mismatch is None or measured is not None:  # otherwise the mismatch stays
+    if old.mismatch is None or measured is not None:  # otherwise the mismatch persists
         found, before = _found(wanders_m, hypotheses_s, measured), old.latest
         if found is None and measured is not None:
             # During an ascent there is little lateral motion, and a camera rotation does not affect
@@ -228,7 +231,8 @@ def estimate_motion(
 
 
 def delay_hypotheses(in_use_s: float) -> Array:
-    """Return the delay of each hypothesis, s, (n,); those of `TURNS_RAD` have the delay in use."""
+    """Return the delay of each hypothesis, s, (n,); hypotheses with a rotation (`TURNS_RAD`) have
+    the delay in use."""
     return np.concatenate([_DELAYS_S, np.full(len(_QUARTERS_RAD), in_use_s)])
 
 
@@ -245,10 +249,10 @@ def _found(
     """Return the mismatch that explains the images; None if the current latency, or one close to
     it, explains them.
 
-    A measured latency is first searched among the usable ones: just after the lift-off, any delay
-    explains a target that stood still. A usable latency that leaves more motion than the pictures'
-    noise, and hardly less than the latency in use, explains nothing: it is only the closest to one
-    that is too long to use.
+    A measured latency is first searched for among the usable ones: just after lift-off, any delay
+    explains a target that stood still. A usable latency explains nothing if it leaves more motion
+    than the images' noise, and hardly less than the latency in use: it is then only the closest one
+    to a latency that is too long to be used.
     """
     in_use_s, least_later_s = 0.0, LEAST_LATER_S
     if measured is not None:
@@ -333,6 +337,6 @@ def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
 
 
 def _integral(t_s: Array, values: Array) -> Array:
-    """Return the integral by the trapezoid rule, (n, k); 0 at the first sample."""
+    """Return the integral by the trapezoidal rule, (n, k); 0 at the first sample."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
