@@ -1,4 +1,4 @@
-"""Position sources for a vehicle without a deck: motion capture, or the target itself."""
+"""Position sources for a vehicle without a deck: a motion-capture system, or the target itself."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
 """Read a motion-capture system with the library `motioncapture`, in a separate process.
 
 The systems differ in how they report a hidden body. Vicon, OptiTrack and Qualisys send complete
-frames and omit a hidden body. VRPN sends one body at a time, nothing for a hidden one, and does not
-report that its server is gone. With VRPN, only the silence can be detected.
+frames and leave out a hidden body. VRPN sends one body at a time and nothing for a hidden one, and
+does not report that its server is gone, so with VRPN only silence can be detected.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ CAPTURE_PROGRAM = "from perchctl.positioning.capture import serve_parent; serve_
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """The connection of the child process: the library's name of the system, and options for it.
+    """The connection settings for the child process: the library's name for the system, and
+    options.
 
-    `skip_empty` drops frames without a body, which the library returns without any arrival.
+    `skip_empty`: drop frames without a body, which the library also returns if nothing has arrived.
     """
 
     kind: str
@@ -66,15 +67,16 @@ class CaptureFailure:
 
 @dataclass(frozen=True)
 class LateFrames:
-    """Frames after a pause of `pause_s`, which are not used because their waiting time is unknown.
-    `count` is the number of frames that arrived at once after the previous pause; 0 if they were no
-    burst."""
+    """Reports frames after a pause of `pause_s`, which are not used because it is unknown how long
+    they waited. `count` is the number of frames that arrived at once after the previous pause; 0 if
+    there was no such burst."""
 
     count: int
     pause_s: float
 
     def error(self, who: str) -> ConnectionFailed:
-        """Return an error that says what is wrong with the capture `who` and what to do."""
+        """Return an error that says what is wrong with the motion-capture system `who`, and what to
+        do."""
         if self.count == 0:
             return ConnectionFailed(
                 f"{who} has paused for {self.pause_s:.2f} s: frames after a pause may be old, "
@@ -93,8 +95,8 @@ class LateFrames:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return the connection of the child process. Vicon and VRPN expect the port as part of the
-    host name, the other systems as a separate option."""
+    """Return the connection settings for the child process. Vicon and VRPN expect the port as part
+    of the host name, the other systems as a separate option."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -105,11 +107,11 @@ def capture_setup(config: PositioningConfig) -> CaptureSetup:
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
 ) -> CaptureSource:
-    """Return the motion capture once it is connected and its first frame has arrived. Your own
-    source, ``my_module:MySource``, is called with `clock` and `config`.
+    """Connect to the motion-capture system and return it once its first frame has arrived. For your
+    own source, ``my_module:MySource``, the class is called with `clock` and `config`.
 
-    Raises InvalidValue, UsageError if the library cannot be loaded, and ConnectionFailed without an
-    answer within `config.connect_timeout_s`.
+    Raises InvalidValue, UsageError if the library cannot be loaded, and ConnectionFailed if there
+    is no answer within `config.connect_timeout_s`.
     """
     PositionFeed.check_config(config)
     if ":" in config.system:
@@ -123,8 +125,8 @@ def open_capture(
 class MotionCapture:
     """A `perchctl.positioning.feed.CaptureSource` whose child process ends with it.
 
-    `who` names the capture in messages; `poll` prefers a frame that contains `body`. The
-    constructor waits for the first frame. It raises ConnectionFailed, and UsageError if the library
+    `who` is the system's name in messages; `poll` prefers a frame that contains `body`. The
+    constructor waits for the first frame. It raises ConnectionFailed, or UsageError if the library
     cannot be loaded.
     """
 
@@ -134,8 +136,8 @@ class MotionCapture:
         self._setup, self._who, self._body, self._clock = setup, who, body, clock
         self._frames: deque[CaptureFrame] = deque(maxlen=KEPT)
         self._framed_s: float | None = None
-        self._late: tuple[float, LateFrames] | None = None  # time of its arrival, and message
-        self._settled = threading.Event()  # set by the first frame, or by an end before it
+        self._late: tuple[float, LateFrames] | None = None  # arrival time and message
+        self._settled = threading.Event()  # set by the first frame, or if the child ends before it
         self._closed = False
         self._ended: str | None = None
         self._failed: CaptureFailure | None = None
@@ -150,8 +152,8 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame since the last call, preferably with the body; None without a
-        frame."""
+        """Return the newest frame since the last call, preferably one with the body; None if there
+        is no frame."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None
@@ -178,7 +180,7 @@ class MotionCapture:
         return ConnectionFailed(f"{self._who} has sent {what} for {silent_s:.1f} s")
 
     def close(self) -> None:
-        """End the child process in bounded time, whatever its library is doing."""
+        """End the child process, with a timeout, whatever its library is doing."""
         self._closed = True
         if self._child.poll() is None:
             self._child.kill()
@@ -278,7 +280,7 @@ boundary."""
 
 
 def serve_parent() -> None:
-    """Send the capture's frames to the parent process until it ends or the library fails."""
+    """Send the system's frames to the parent process until the parent ends or the library fails."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_to_parent()
     setup = channel.receive(START_TIMEOUT_S)
@@ -301,14 +303,14 @@ def serve_parent() -> None:
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
-    """Send frames as they arrive, but never a frame of unknown age.
+    """Pass frames on to the parent as they arrive, but never a frame of unknown age.
 
     After a pause, the library may return frames that waited in its queue. The first frame, and each
     further one that arrives without any waiting, is therefore not sent, and the parent receives the
     reason.
     """
     sent_s, behind = -1.0, False
-    # start, newest and count of the frames since the last pause
+    # time of the first and the newest frame since the last pause, and their number
     began_s, newest_s, count = -1.0, -1.0, 0
     while True:
         asked_s = time.monotonic()
@@ -333,8 +335,8 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
 
 
 def _end_with(channel: Channel) -> None:
-    """End the process with the parent, which sends nothing more; the library may be blocked
-    anywhere."""
+    """End this process when the parent ends, even if the library is blocked. The parent sends no
+    more messages."""
     with contextlib.suppress(EOFError, OSError):
         channel.recv()
     os._exit(0)

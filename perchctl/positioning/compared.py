@@ -1,9 +1,9 @@
-"""The result of comparing a motion capture with the vehicle by hand (`perchctl check --lift`),
-stored for `fly`.
+"""The result of comparing a motion-capture system with the vehicle, which is lifted by hand
+(`perchctl check --lift`), stored for `fly`.
 
-Swapped axes do not show while a vehicle stands as it did when its body was defined; they show only
-when it is lifted and rotated by hand. Each comparison is therefore stored for its vehicle and
-set-up, and a flight requires one that passed at most `VALID_S` ago.
+Swapped axes cannot be detected while a vehicle stands in the same way as when its rigid body was
+defined, but only when it is lifted and rotated by hand. Each comparison is therefore stored for its
+vehicle and set-up, and a flight requires one that passed at most `VALID_S` ago.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ _TRUE_OF = {"system", "host", "body", "body_rpy_deg", "body_position_m"}
 
 
 class CaptureComparison(BaseModel):
-    """The result of comparing one vehicle with its motion capture by hand, in the form of its file.
+    """The result of comparing one vehicle with its motion-capture system by hand, with the fields
+    of the stored file.
 
-    `set_up` identifies vehicle, capture, body and mounting of the body; the result applies to that
-    set-up only. `at` is None if no comparison was made. `found` is the result in words.
+    `set_up` identifies the vehicle, the motion-capture system, the rigid body and its mounting; the
+    result applies to that set-up only. `at` is None if no comparison was made. `found` is the
+    result in words.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -45,7 +47,8 @@ class CaptureComparison(BaseModel):
 
     def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
         """Return why a flight must not rely on this comparison, and what to do; None if the
-        comparison passed at most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
+        comparison passed at most `VALID_S` ago. `now` must have a time zone, in which dates are
+        shown."""
         if self.at is None:
             return "the motion-capture system has never been compared with this vehicle", AGAIN
         when, age_s = self.text(now), (now - self.at).total_seconds()
@@ -75,7 +78,8 @@ def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """Return the vehicle's comparison in this set-up; its `at` is None if no file can be read."""
+    """Return the stored comparison for the vehicle in this set-up; its `at` is None if no file can
+    be read."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
@@ -89,8 +93,8 @@ def save_comparison(
 ) -> str | None:
     """Replace the stored comparison of this vehicle and set-up.
 
-    `at` has a time zone; `found` is the result in words. Returns None, or why the file could not be
-    written; then the old comparison is deleted if the new comparison did not pass.
+    `at` must have a time zone; `found` is the result in words. Returns None, or why the file could
+    not be written. In that case, the old comparison is deleted if the new one did not pass.
     """
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)

@@ -32,8 +32,9 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 @dataclass(frozen=True)
 class BodyPose:
-    """A rigid body's pose in the capture's world: the position of its origin, m, and the rotation
-    from its axes to the world's, as the system reports them, before the profile's offsets."""
+    """A rigid body's pose in the motion-capture system's world: the position of its origin, m, and
+    the rotation from its axes to the world's, as reported by the system, before the profile's
+    offsets are applied."""
 
     position_m: tuple[float, float, float]
     quaternion: Quaternion
@@ -41,17 +42,17 @@ class BodyPose:
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """A frame that arrived at `t_s` on the loop's clock; an occluded body is not in it."""
+    """A frame that arrived at `t_s` on the loop's clock; it does not contain occluded bodies."""
 
     t_s: float
     bodies: Mapping[str, BodyPose] = field(default_factory=dict)
 
 
 class CaptureSource(Protocol):
-    """A motion-capture system, real or simulated. None of its methods may block. Your own source is
-    called with the clock and the profile's section `positioning`. It may have another method,
-    `error`, which returns the problem as a `perchctl.errors.PerchError`: `perchctl check` then
-    shows the error's advice."""
+    """A motion-capture system, real or simulated. None of its methods may block. The class of your
+    own source is called with the clock and the profile's section `positioning`. It may have an
+    additional method, `error`, which returns the problem as a `perchctl.errors.PerchError`;
+    `perchctl check` then shows the error's advice."""
 
     def poll(self, now_s: float) -> CaptureFrame | None:
         """Return the newest frame that has arrived by `now_s`; None if no frame is new."""
@@ -86,8 +87,8 @@ class FeedStatus:
     `problem`: None while positions are sent, otherwise one sentence with the cause. `sent`: number
     of positions sent so far; `rate_hz`: their rate in the last second. `pose`: the newest position
     sent. `measured`: the same position with its attitude, even if only the position is sent.
-    `beside_m`: distance of the newest sighting from the estimate if it is too large to be accepted,
-    else 0.
+    `beside_m`: distance of the newest sighting from the estimate if that is too large to be
+    accepted, else 0.
     """
 
     age_s: float = math.inf
@@ -112,8 +113,8 @@ class SendingRate:
         return now_s >= self._due_s - 1e-6
 
     def note_sent(self, now_s: float) -> None:
-        """Record that a position was sent. A late position neither delays later ones nor is made up
-        for by a burst."""
+        """Record that a position was sent. A late position does not delay later ones, and is not
+        followed by a burst."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -130,7 +131,7 @@ class SendingRate:
 
 
 class PositionFeed:
-    """Send the positions of a motion capture to the vehicle.
+    """Send positions from a motion-capture system to the vehicle.
 
     `poll_and_send` is called every `PERIOD_S`: by a thread from `start` until `close`, or in
     lockstep. `status` may be called from any thread.
@@ -158,7 +159,8 @@ class PositionFeed:
 
     @staticmethod
     def check_config(config: PositioningConfig) -> None:
-        """Raise InvalidValue without a host, UsageError without the library; opens nothing."""
+        """Raise InvalidValue if the host is missing, and UsageError if the library is not
+        installed. Opens nothing."""
         if ":" in config.system:
             return  # your own source checks its configuration itself
         if not config.host.strip():
@@ -172,8 +174,8 @@ class PositionFeed:
             raise no_motion_capture()
 
     def start(self, clock: Callable[[], float]) -> None:
-        """Call `poll_and_send` in a thread from now on. `clock` is the flight loop's. If a call
-        blocks in the link's library, `status` reports it."""
+        """Start a thread that calls `poll_and_send`. `clock` is the flight loop's. If a call blocks
+        in the link's library, `status` reports it."""
 
         def run() -> None:
             due_s = clock()
@@ -192,7 +194,7 @@ class PositionFeed:
             self._thread.join(END_TIMEOUT_S)
 
     def stop(self) -> None:
-        """Stop sending, because the positions contradict the vehicle's own sensors."""
+        """Stop sending permanently, because the positions contradict the vehicle's own sensors."""
         self._stopped = True
 
     def poll_and_send(self, now_s: float) -> None:
@@ -252,10 +254,10 @@ class PositionFeed:
         return f"no frame has arrived from {who} {for_s}"
 
 
-# --- Validation of a capture's frames, and the vehicle's pose in them ---
-# Faults of motion capture look like valid data: a hidden body keeps its last pose, two bodies swap
-# names, a symmetric body flips, a pose arrives late (faults 10 and 11). Each of these poses is
-# rejected with one sentence that names the cause.
+# --- Validate motion-capture frames, and compute the vehicle's pose from them --- Faults of motion
+# capture look like valid data: a hidden body keeps its last pose, two bodies swap names, a
+# symmetric body flips, a pose arrives late (faults 10 and 11). Each of these poses is rejected with
+# one sentence that names the cause.
 
 
 STALE_FRAME_S = 0.05
@@ -281,7 +283,8 @@ vehicle holds its position and drifts."""
 
 @dataclass(frozen=True, eq=False)
 class VehiclePose:
-    """The vehicle's position (3,) and rotation (3, 3) in the capture's world at `t_s`."""
+    """The vehicle's position (3,) and rotation (3, 3) in the motion-capture system's world at
+    `t_s`."""
 
     t_s: float
     position_m: Array
@@ -289,7 +292,7 @@ class VehiclePose:
 
     @classmethod
     def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> VehiclePose:
-        """Return the vehicle's pose from the capture's rigid body and the profile's offset:
+        """Return the vehicle's pose, computed from the rigid body's pose and the profile's offset:
         ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
         length = math.sqrt(sum(part * part for part in pose.quaternion))
@@ -317,9 +320,9 @@ class PoseValidator:
         """Why the newest frame with a new pose was rejected; None if it was accepted."""
 
     def validate(self, frame: CaptureFrame, now_s: float) -> VehiclePose | None:
-        """Return the vehicle's pose at the frame's exposure; None if it must not be sent, for the
-        cause in `problem`, or if the frame is not new."""
-        arrived_s = min(frame.t_s, now_s)  # no frame arrives in the future
+        """Return the vehicle's pose at the frame's exposure; None if the frame is not new, or if
+        the pose must not be sent, for the reason in `problem`."""
+        arrived_s = min(frame.t_s, now_s)  # a frame cannot arrive in the future
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:
             return None
         self._arrived_s = arrived_s

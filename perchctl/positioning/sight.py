@@ -3,12 +3,12 @@ position in a world fixed to the target, add the motion of the vehicle's estimat
 exposure, and send the result to its estimator.
 
 The world is that of the vehicle at rest on the ground, where its estimate is reset. The world's
-origin is sent until the target was seen often enough from there; then the target's position is
-fixed. Ground, fence and heights thus keep their meaning.
+origin is sent until the target has been seen often enough from there; then the target's position is
+fixed. Ground, safety limits and heights therefore keep their meaning.
 
-Exposures are never sent twice, out of order, or when older than `OLDEST_S`. A position is rejected
-if it is further from the estimate than the errors of both explain. Its age then grows, and the
-planner holds, sinks and lands because of it.
+No exposure is used twice, out of order, or when it is older than `OLDEST_S`. A position is rejected
+if it is farther from the estimate than the errors of both can explain. The age of the position then
+grows, which makes the planner hold, descend and land.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ class TargetFeed:
     """Sends the vehicle's position, measured from sightings of the target. Called from the flight
     loop's thread.
 
-    `target` is the target's place, None until it was seen from the ground. `off` is the body's
-    place from the sightings minus its estimate, low-passed against noise: the estimator lags behind
-    late positions.
+    `target` is the target's position and heading; None until it has been seen from the ground.
+    `off` is the body's position and heading from the sightings minus the estimate, low-pass
+    filtered to reduce noise. It is not zero, because the estimator lags behind late positions.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
@@ -99,13 +99,13 @@ class TargetFeed:
             self.send_known(self._origin_m, now_s)
 
     def send_known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """Send a position that is known without an image because the vehicle stands, is in contact
-        or hangs."""
+        """Send a position that is known without an image, because the vehicle stands, hangs or is
+        in contact with the ceiling."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
-        """Return the position, m, of a level body with the gear in the target's centre and the
-        estimated heading `yaw_rad`; None before the target's place is known."""
+        """Return the position, m, of a level body whose gear is at the target's centre, for the
+        estimated heading `yaw_rad`; None before the target's position is known."""
         if self.target is None:
             return None
         way_m = rot_z(yaw_rad + self.off.yaw_rad).dot(self._setup.gear_body_m)
@@ -113,8 +113,9 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, attitude: VehicleState) -> TargetEstimate:
-        """Return `seen` with the target at the place known to the feed, in the world frame of the
-        state estimate, for a vehicle with this `attitude`; unchanged while the place is unknown."""
+        """Return `seen` with the target at the position known to the feed, in the world frame of
+        the state estimate, for a vehicle with this `attitude`; unchanged while that position is
+        unknown."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
@@ -133,12 +134,12 @@ class TargetFeed:
         *,
         at_rest: bool,
     ) -> None:
-        """Send the vehicle's position from a pose in this tick's image. While the target's place
-        is unknown, learn it instead if the vehicle is `at_rest`. `then` and `now` are the vehicle's
-        attitude and estimated position at the exposure and at `now_s`."""
+        """Send the vehicle's position, computed from a pose in this tick's image. While the
+        target's position is unknown, determine that instead if the vehicle is `at_rest`. `then` and
+        `now` are the vehicle's attitude and estimated position at the exposure and at `now_s`."""
         if pose.t_s <= self._seen_s:
             return
-        # A known position may be newer than an image that has not arrived yet.
+        # A position that was sent without an image may be newer than this image's exposure.
         silent_s = max(0.0, min(pose.t_s - max(self._seen_s, self._placed_s), GATE_LONGEST_S))
         if self.target is None:
             self._seen_s = pose.t_s
@@ -160,8 +161,8 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the feed's status. It also reports as a problem that the target was not seen from
-        the ground."""
+        """Return the feed's status. Its problem may also be that the target was not seen from the
+        ground."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -212,8 +213,8 @@ class TargetFeed:
         )
 
     def _hand_over(self, place: ExternalPosition, placed_s: float, now_s: float) -> None:
-        """Send a position and heading; `placed_s` is the time at which the body was there. If
-        sending is not due yet, it is dropped, because the next one will be newer."""
+        """Send a position and heading; `placed_s` is the time at which the body was there. If no
+        position is due yet, this one is dropped, because the next one will be newer."""
         if self._rate.is_due(now_s) and self._send(place) is not False:
             self._rate.note_sent(now_s)
             self._placed_s, self._pose = placed_s, place
