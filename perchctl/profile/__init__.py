@@ -1,11 +1,11 @@
 """Profiles: one YAML file contains everything that a flight depends on.
 
-schema is the whole profile. vision, mission, positioning and simulation hold its sections, with the
-bounds of each key. limits relates keys that must fit each other. load reads a profile, resolves
-`extends`, and finds the files of weights, calibration and mask. edit changes a profile in memory or
-in its file. keys describes each key with unit, bounds and meaning, as a commented file or as a
-schema for editors. base holds the parts that all sections share, and handles keys that have become
-constants. The ArUco dictionaries are in vision.
+The module schema contains the whole profile; vision, mission, positioning and simulation contain
+its sections, with the bounds of each key. limits checks keys that must be consistent with each
+other. load reads a profile, resolves `extends`, and finds the files for weights, calibration and
+mask. edit changes a profile in memory or in its file. keys describes each key with its unit, bounds
+and meaning, as a commented file or as a schema for editors. base contains the parts that all
+sections share, and handles keys that have become constants. The ArUco dictionaries are in vision.
 """
 
 import lazy_loader

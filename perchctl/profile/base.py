@@ -16,8 +16,8 @@ BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def key(default: Any, meaning: str, **constraints: Any) -> Any:
-    """The pydantic `Field` of a profile key, with the description that users read. A
-    default of ... makes the key required."""
+    """The pydantic `Field` for a profile key, with the description that users read. If the default
+    is ``...``, the key is required."""
     return Field(default, description=meaning, **constraints)
 
 
@@ -44,7 +44,7 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse YAML's yes, no, on and off for numbers, because pydantic would read them as 1 and
+        """Reject YAML's yes, no, on and off as numbers, because pydantic would read them as 1 and
         0."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if _takes_numbers(kind) and _holds_switch(value):
@@ -99,7 +99,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """The unit that the ending of a key's name stands for; empty without such an ending."""
+    """The unit given by the suffix of a key's name; empty if there is no such suffix."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
@@ -112,8 +112,9 @@ def split_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
     """Return a profile's values without the keys that have become constants (class variables of
-    `model` or of its nested models), a note on each such key with the constant's value, and the
-    problem of each key with another value. `path` is the prefix of the keys in these texts."""
+    `model` or of its nested models), a note for each such key that has the constant's value, and an
+    error for each such key that has another value. `path` is the prefix of the keys in these
+    texts."""
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None

@@ -28,12 +28,12 @@ from perchctl.profile.schema import Profile
 
 
 def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
-    """The profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
-    YAML. `option` names the command-line option in messages; empty if there is none.
+    """The profile with each ``key=value`` applied, such as ``planner.align.xy_m=0.03``; values are
+    in YAML. `option` is the name of the command-line option in messages; empty if there is none.
 
     Raises:
         UsageError: a setting is not ``key=value``.
-        InvalidValue: the key is unknown, or its value not allowed.
+        InvalidValue: the key is unknown, or its value is not allowed.
     """
     values: dict[str, Any] = {}
     for key, text in [_parsed(setting, option) for setting in settings]:
@@ -75,7 +75,7 @@ _DECIMALS = 6
 
 
 def writable_profile(name: str) -> Path:
-    """Return the file of a user's own profile, with links resolved.
+    """Return the path of a user's own profile, with symbolic links resolved.
 
     Raises NotFound if there is no such profile, and InvalidValue if the profile is shipped with
     perchctl or not writable.
@@ -95,8 +95,8 @@ def writable_profile(name: str) -> Path:
 
 
 def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
-    """Write the values under their dotted keys into the file; return the path of the backup
-    beside it, which has the same permissions.
+    """Write the values into the file under their dotted keys; return the path of the backup next to
+    it, which has the same permissions.
 
     Raises:
         InvalidValue: the values do not fit into the YAML layout, the profile would not load with
@@ -125,13 +125,13 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 
 
 def replace_values(text: str, values: Mapping[str, Value]) -> str:
-    """A profile's text with the values under their dotted keys, as in ``camera.latency_s``.
+    """The text of a profile with new values for dotted keys such as ``camera.latency_s``.
 
-    Comments, order and quotes stay. A list of the same length keeps its layout; a missing key is
-    added at its section's end, a missing section at the file's end.
+    Comments, order and quotation marks are preserved. A list of the same length keeps its layout. A
+    missing key is added at the end of its section, and a missing section at the end of the file.
 
     Raises:
-        ValueError: what should be a section of `text` holds no keys.
+        ValueError: something in `text` that should be a section contains no keys.
     """
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, 10**6
@@ -157,7 +157,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     stream = io.StringIO()
     yaml.dump(document, stream)
     written = stream.getvalue()
-    if _values_of(written) != wanted:  # also if the value is an anchor that another key refers to
+    if _values_of(written) != wanted:  # also if another key refers to an anchor
         raise ValueError("the values cannot be written into this file's layout")
     return written
 

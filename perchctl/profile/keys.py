@@ -23,8 +23,8 @@ from perchctl.profile.schema import Profile
 class Key:
     """One key of the profile, such as ``camera.latency_s`` (its `path`).
 
-    `meaning` is the schema's description, with backticks around literals; `allowed` the bounds or
-    choices, in words; `default` its value in the section given to `keys`.
+    `meaning` is the schema's description, with backticks around literals. `allowed` is the bounds
+    or choices, in words. `default` is the value in the section given to `keys`.
     """
 
     path: str
@@ -35,7 +35,8 @@ class Key:
 
 
 def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
-    """Yield every leaf below a section of a profile with its value, in the schema's order."""
+    """Yield every key below a section of a profile that has a value of its own, with that value, in
+    the order of the schema."""
     properties = _properties(type(section))
     for name in type(section).model_fields:
         value = getattr(section, name)
@@ -100,9 +101,11 @@ _WIDTH = 80
 
 
 def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
-    """A profile's keys as YAML, each under a comment with meaning, unit and allowed values.
+    """The keys of a profile as YAML, each below a comment with its meaning, unit and allowed
+    values.
 
-    Read back, the keys have the same values. `paths`: dotted paths of the keys; None: all.
+    When the text is read back, the keys have the same values. `paths`: dotted paths of the keys to
+    include; None: all.
     """
     lines: list[str] = []
     before: list[str] = []
@@ -140,14 +143,14 @@ def _comment(key: Key) -> str:
 
 
 def yaml_scalar(value: Any) -> str:
-    """The value in YAML, on one line."""
+    """The value as YAML, on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)
     return text.strip()[1:-1]
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
+    """The JSON schema for profile files: types, bounds, defaults, meanings and units."""
     schema = Profile.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         section.pop("title", None)

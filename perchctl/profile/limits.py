@@ -1,7 +1,7 @@
-"""Keys that must fit each other.
+"""Check keys whose values must be consistent with each other.
 
-A profile that breaks a limit of `IMPOSSIBLE` is refused when it is read; `perchctl check` and
-`fly` warn where it breaks one of `DOUBTFUL`.
+A profile that violates a limit in `IMPOSSIBLE` is refused when it is read; `perchctl check` and
+`fly` warn if it violates one in `DOUBTFUL`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Limit:
     """A relation between keys that a profile must fulfil.
 
     Attributes:
-        relation: a Python expression, as in ``kalman.k1 + 0.1 < kalman.k2``.
-        consequence: what happens if it is broken.
+        relation: a Python expression such as ``kalman.k1 + 0.1 < kalman.k2``.
+        consequence: what happens if it is violated.
     """
 
     relation: str
@@ -39,16 +39,16 @@ class Limit:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The dotted paths in the relation, in their order."""
+        """The dotted keys in the relation, in order."""
         return tuple(_KEY.findall(self.relation))
 
     def holds(self, profile: Any) -> bool:
-        """True if the profile's values fulfil the relation."""
-        # The relations come from this module and only contain keys and numbers.
+        """True if the profile's values satisfy the relation."""
+        # eval is safe: the relations are written in this module, and contain only keys and numbers.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def violation_text(self, profile: Any) -> str:
-        """A sentence: the broken relation with each key's value, and the consequence."""
+        """A sentence with the violated relation, each key's value, and the consequence."""
 
         def shown(found: re.Match[str]) -> str:
             value = eval(_read(found), {"profile": profile})
@@ -87,7 +87,7 @@ _IMPOSSIBLE = {
 
 _DOUBTFUL = {
     "heights": {
-        # A climb passes its setpoint by 0.1 m (docs/firmware.md, "Position take-off").
+        # A climb overshoots its setpoint by 0.1 m (docs/firmware.md, "Position take-off").
         "0.1 + planner.search.max_height_m <= safety.max_height_m": (
             "a climb overshoots by 0.1 m, which would make the vehicle land"
         ),
@@ -100,8 +100,7 @@ _DOUBTFUL = {
     },
     "battery limits": {
         "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
-        # The thrust that a full battery leaves for a light vehicle (docs/firmware.md, "Thrust to
-        # PWM").
+        # A full battery when a light vehicle hovers (docs/firmware.md, "Thrust to PWM").
         "safety.min_load_v < 3.7": (
             "hovering takes even a full battery below it, so the vehicle would land as "
             "soon as it takes off"
@@ -137,7 +136,7 @@ _DOUBTFUL = {
         f"{AscendConfig.near_speed_mps:g} <= planner.ascend.speed_mps": (
             "the vehicle would climb faster near the target than far from it"
         ),
-        # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
+        # The thrust at which a vehicle of 30 g hovers (docs/firmware.md, "Thrust to PWM").
         "40200 <= planner.perch.thrust": "this raw thrust is too small to press against the target",
         "20 <= safety.max_tilt_deg": (
             "a gust can tilt the vehicle that far, which would cut the motors"

@@ -33,12 +33,12 @@ up."""
 
 
 def is_profile_path(name: str) -> bool:
-    """True if `name` is the path of a profile's file, not a bare name."""
+    """True if `name` is the path of a profile file rather than a bare name."""
     return "/" in name or name.endswith((".yaml", ".yml"))
 
 
 def find_profile(name: str) -> Path:
-    """Return the file of a profile, given its path or name. Errors: NotFound, which lists the
+    """Return the file of a profile that is given by path or name. Errors: NotFound, which lists the
     available names; InvalidValue for another kind of file."""
     if is_profile_path(name):
         path = Path(name).expanduser()
@@ -55,10 +55,11 @@ def find_profile(name: str) -> Path:
 
 
 def load_profile(name: str | Path | Profile, *, with_weights: bool = True) -> Profile:
-    """The profile with path or name `name`, its `extends` resolved, checked; a `Profile` as it is.
+    """Load the profile with the path or name `name`, resolve its `extends`, and check it. A
+    `Profile` is returned unchanged.
 
-    `with_weights`: `merge.weights` are read from `merge.weights_file`. Keys that have become
-    constants are dropped with a `ProfileNote` as warning.
+    `with_weights`: read `merge.weights` from `merge.weights_file`. Keys that have become constants
+    are dropped, with a `ProfileNote` as a warning.
 
     Errors: NotFound, InvalidValue.
     """
@@ -88,7 +89,7 @@ def layered_profile(path: Path, base: str, *layers: dict[str, Any]) -> Profile:
     all `layers`; later layers override earlier ones. File names in them are relative to the folder
     of `path`.
 
-    Errors: NotFound, InvalidValue, both beginning with `path`.
+    Errors: NotFound, InvalidValue; both messages begin with `path`.
     """
     values: dict[str, Any] = {"extends": base}
     for layer in layers:
@@ -104,7 +105,7 @@ def _by_in_full(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def target_keys(path: Path) -> dict[str, Any]:
-    """Return the keys of the section `target` in the profile at `path`, which may be incomplete.
+    """Return the keys in the section `target` of the profile at `path`, which may be incomplete.
 
     Errors: NotFound, InvalidValue.
     """
@@ -115,7 +116,8 @@ def target_keys(path: Path) -> dict[str, Any]:
 
 
 def check_profile(path: Path, text: str) -> None:
-    """Raise NotFound or InvalidValue if the profile would not load with `text` as its content."""
+    """Raise NotFound or InvalidValue if the profile could not be loaded with `text` as its
+    content."""
     with warnings.catch_warnings():
         # these notes were already shown when the profile was loaded
         warnings.simplefilter("ignore", ProfileNote)
@@ -139,8 +141,8 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
 
 
 def _read_weights(name: str) -> WeightsConfig:
-    """Return the weights from the file that a loaded profile names: an absolute path, or a name in
-    the user's folder. Raises NotFound, InvalidValue."""
+    """Return the weights from the file named in a loaded profile, by an absolute path or by a name
+    in the user's folder. Raises NotFound, InvalidValue."""
     given = Path(name)
     path = given if given.is_file() else data_file("weights", name)
     if path is None:
@@ -163,7 +165,7 @@ def _read_weights(name: str) -> WeightsConfig:
 
 
 def find_calibration(name: str) -> Path:
-    """The calibration file at path `name`, or of that name in `calib/`. Raises NotFound."""
+    """The calibration file at the path `name`, or with that name in `calib/`. Raises NotFound."""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -182,7 +184,7 @@ _WHITE = 127
 
 
 def find_mask(name: str) -> Path:
-    """The mask file at path `name`. Raises NotFound."""
+    """The mask file at the path `name`. Raises NotFound."""
     path = Path(name)
     if not path.is_file():
         raise NotFound(
@@ -229,7 +231,7 @@ def _choices() -> str:
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
-    """Return the content of the file at `path` itself, on top of what it extends."""
+    """Return the content of the file at `path`, merged over that of the profile that it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles refers back to itself")
     values = _without_constants(own, path)
