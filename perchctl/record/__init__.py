@@ -1,4 +1,4 @@
-"""Write, read, summarise and export flight logs and their recordings."""
+"""The flight log and the recording of a flight: write, read, summarise and export them."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Files that only contain complete records, and a thread for writing to a disk that may hang."""
+"""Files that contain only complete records, and a thread for writing to a disk that may hang."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class DiskFile:
-    """A file that only contains complete records: a failed write leaves no partial record."""
+    """A file that contains only complete records: a failed write leaves no partial record."""
 
     def __init__(self, path: Path, sync: bool = True) -> None:
         """Create the file. With `sync`, flushing writes the data to the disk instead of only
@@ -58,14 +58,14 @@ class DiskFile:
         fd, self._fd = (
             self._fd,
             -1,
-        )  # by the second call, the file descriptor may belong to another file
+        )  # before a second call, the descriptor may have been reused for another file
         if fd >= 0:
             os.close(fd)
 
 
 def create_file(path: Path, sync: bool, build: Callable[[DiskFile], T]) -> T:
-    """Create a file and return the object that `build` makes with it; delete it if `build` raises.
-    Raises OSError as `DiskFile` does."""
+    """Create a file and return the object that `build` makes from it. If `build` raises an
+    exception, delete the file. Raises OSError as `DiskFile` does."""
     file = DiskFile(path, sync)
     try:
         return build(file)
@@ -76,16 +76,16 @@ def create_file(path: Path, sync: bool, build: Callable[[DiskFile], T]) -> T:
 
 
 class BackgroundWriter:
-    """Runs jobs in order: at once or, if `live`, in a thread from a bounded queue.
+    """Runs jobs in order: at once or, if `live`, in a thread that takes them from a bounded queue.
 
-    Exceptions from a job are ignored; the job itself must record failures.
+    Exceptions raised by a job are ignored; the job itself must record failures.
 
     Attributes:
         refused_jobs: number of jobs refused because the queue was full.
     """
 
     def __init__(self, most: int, name: str, live: bool) -> None:
-        """Start with room for jobs with a total weight of `most`. `name` is the name of the
+        """Start with a queue for jobs of a total weight up to `most`. `name` is the name of the
         thread."""
         self.refused_jobs = 0
         self._most = most
@@ -112,7 +112,7 @@ class BackgroundWriter:
         return True
 
     def finish(self, job: Job, timeout_s: float) -> int:
-        """Queue the last job and wait at most `timeout_s`; return the number of jobs not done."""
+        """Queue the last job, wait at most `timeout_s`, and return the number of jobs not done."""
         if self._thread is None:
             _do(job)
             return 0
@@ -133,5 +133,5 @@ class BackgroundWriter:
 
 
 def _do(job: Job) -> None:
-    with suppress(Exception):  # the next job is done anyway
+    with suppress(Exception):  # continue with the next job
         job()

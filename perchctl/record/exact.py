@@ -1,9 +1,10 @@
 """Convert values to JSON and back bit for bit, as a replay requires.
 
-A float is written as the shortest text that reads back as the same float, infinities and NaN as
-``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its type and
-shape; an enum by its value; if a field may hold one of several dataclasses, such as a command, the
-class name comes first. None is left out if it is the field's default.
+A float is written as the shortest text that reads back as the same float; infinities and NaN are
+written as ``"inf"``, ``"-inf"``, ``"nan"``. A one-dimensional float64 array becomes a list, and any
+other array is written with its type and shape. An enum is written as its value. If a field can
+contain one of several dataclasses, such as a command, the class name comes first. None is left out
+if it is the field's default.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ import numpy as np
 from perchctl.record.keys import log_names
 
 T = TypeVar("T")
-_GONE = {"timing"}  # fields of a flight in real time by 0.2.0
+_GONE = {"timing"}  # removed fields, written by version 0.2.0 for flights in real time
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
-_AS_IT_IS = (bool, int, str)  # in JSON, too
+_AS_IT_IS = (bool, int, str)  # types that JSON has as well
 
 
 def to_exact_json(value: Any) -> Any:
-    """Convert a value to JSON types from which `from_exact_json` restores it exactly.
+    """Convert a value to JSON types, from which `from_exact_json` restores it exactly.
 
     Raises TypeError for a value that has no exact form.
     """
     kind = type(value)
-    if kind is float:  # nearly all of a record
+    if kind is float:  # first, because nearly all values in a record are floats
         return value if math.isfinite(value) else repr(value)
     if value is None or kind in _AS_IT_IS:
         return value
-    if isinstance(value, float):  # numpy's float64, too
+    if isinstance(value, float):  # includes numpy's float64
         return to_exact_json(float(value))
     if isinstance(value, (list, tuple)):
         return [to_exact_json(v) for v in value]
@@ -99,13 +100,13 @@ def _members(hint: Any) -> tuple[Any, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class ExactField:
-    """A field of a dataclass at some depth of a type, for example ``observation.imu.t_s``.
+    """A field of a dataclass at any depth within a type, for example ``observation.imu.t_s``.
 
-    All names are those in the log (`perchctl.record.keys`).
+    All names are those used in the log (`perchctl.record.keys`).
 
     Attributes:
-        path: the dotted names that lead to it.
-        owner: name of the dataclass that has it.
+        path: the dotted names that lead to the field.
+        owner: name of the dataclass to which the field belongs.
         is_always_written: False if `to_exact_json` leaves the field out while it is None.
     """
 
@@ -135,8 +136,8 @@ def exact_fields(hint: Any, path: str = "") -> list[ExactField]:
 
 
 def collect_written_names(hint: Any, data: Any, names: dict[str, set[str]]) -> None:
-    """Add to `names`, by dataclass, the fields that `data` holds: JSON from which `from_exact_json`
-    makes a value of type `hint`."""
+    """Add the fields that `data` contains to `names`, keyed by dataclass. `data` is JSON from which
+    `from_exact_json` makes a value of type `hint`."""
     members = _members(hint)
     if data is None:
         return
@@ -161,10 +162,9 @@ def collect_written_names(hint: Any, data: Any, names: dict[str, set[str]]) -> N
 
 
 def from_exact_json(kind: type[T], data: Any) -> T:
-    """Restore the value of type `kind` that `to_exact_json` has written. A missing field gets its
-    default.
+    """Restore a value of type `kind` written by `to_exact_json`. A missing field gets its default.
 
-    Raises ValueError, which names the field, for data in any other form.
+    Raises ValueError, naming the field, for data in any other form.
     """
     try:
         return typing.cast(T, _from_exact(kind, data))
@@ -216,7 +216,7 @@ _hints = cache(typing.get_type_hints)
 
 
 def _plain_from(data: Any, kind: type) -> Any:
-    if isinstance(data, dict):  # a number of numpy's
+    if isinstance(data, dict):  # a number of a numpy type
         return _array_from(data)[()]
     if kind is float and isinstance(data, str):
         return _NOT_FINITE[data]
@@ -233,21 +233,22 @@ def _array_from(data: Any) -> Any:
     return np.array(flat, dtype=np.dtype(data["dtype"])).reshape(data["shape"])
 
 
-# --- rounded, and as lines ---
+# --- Convert to rounded JSON, and encode as lines ---
 
 DECIMALS = 6
 
 
 def to_rounded_json(value: Any) -> Any:
-    """Return JSON's own types: numbers rounded to `DECIMALS`, NaN and infinities as None.
+    """Convert a value to JSON types, with numbers rounded to `DECIMALS`, and NaN and infinities as
+    None.
 
-    Raises TypeError for a value that has no place in a log.
+    Raises TypeError for a value that cannot be written to a log.
     """
     if value is None or type(value) is str:
         return value
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, float):  # nearly all of a record
+    if isinstance(value, float):  # first, because nearly all values in a record are floats
         return round(value, DECIMALS) + 0.0 if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(k): to_rounded_json(v) for k, v in value.items()}
@@ -257,7 +258,8 @@ def to_rounded_json(value: Any) -> Any:
 
 
 def encode_line(record: Mapping[str, Any]) -> bytes:
-    """The record as one JSON line with its newline, numbers rounded, keys in their own order.
+    """Encode the record as one JSON line with a newline; numbers are rounded, and keys keep their
+    order.
 
     Top-level keys whose value is None are left out.
     """
@@ -267,20 +269,20 @@ def encode_line(record: Mapping[str, Any]) -> bytes:
 _ENCODER = json.JSONEncoder(
     ensure_ascii=False,
     allow_nan=False,
-    check_circular=False,  # a value that contains itself has no exact form
+    check_circular=False,  # not needed: the conversion fails for a value that contains itself
     separators=(",", ":"),
 )
 """Created once, because `json.dumps` would create one for each line."""
 
 
 def json_line(values: Mapping[str, Any]) -> bytes:
-    """Return values of JSON types as one UTF-8 line with its newline, without rounding."""
+    """Encode values of JSON types as one UTF-8 line with a newline, without rounding."""
     return _ENCODER.encode(values).encode("utf-8", errors="backslashreplace") + b"\n"
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
-    """Return the record in a line. Raises ValueError for anything that is not a single JSON
-    object."""
+    """Decode one line of a log to its record. Raises ValueError for anything other than a single
+    JSON object."""
     try:
         record = json.loads(line.decode("utf-8"))
     except RecursionError:

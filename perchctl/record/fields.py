@@ -1,8 +1,8 @@
 """The keys that one tick of the loop writes to the flight log, with their units and meanings.
 
-Keys are flat and carry their unit; SI and radians, frames as in
-`perchctl.geometry`. A missing value is None (absent in the file, None again
-once read). `FIELDS` is copied into each log's header, so that a log explains
+The record is flat, and each key ends with its unit. Values are in SI units and radians, in the
+frames of `perchctl.geometry`. A missing value is None; it is left out of the file and None again
+when the file is read. `FIELDS` is copied into the header of each log, so that a log explains
 itself.
 """
 
@@ -54,8 +54,8 @@ FIELDS: dict[str, str] = {
     "reason": "why the phase was entered",
     "hold": "why the vehicle is held in place, empty when it is not",
     "attempts": "failed perching attempts so far",
-    # the vehicle's own estimate, world axes
-    **_axes("{}_m", "position of the body in the world frame of the state estimate, z up"),
+    # the vehicle's own state estimate, world axes
+    **_axes("{}_m", "body in the world of the state estimate, z up"),
     **_axes("v{}_mps", "velocity, world axes"),
     "roll_rad": "roll, right-handed about body x",
     "pitch_rad": "pitch, right-handed about body y: positive is nose down",
@@ -74,11 +74,11 @@ FIELDS: dict[str, str] = {
     "pos_var_m2": "largest of the estimator's position variances; with a Flow deck always 100",
     "height_var_m2": "the estimator's variance of the height",
     "tel_age_s": "age of the telemetry sample",
-    # positions from outside, as they are sent to the vehicle; None where its decks measure them
+    # external positions, as sent to the vehicle; None if its decks measure the position
     "pos_age_s": "age of the last external position sent, since its exposure",
     "pos_note": "why no external position is sent now",
-    **_axes("pos_{}_m", "last external position sent, in the world frame of the state estimate"),
-    # the camera; None in a tick without a new frame
+    **_axes("pos_{}_m", "last external position sent, in the world of the state estimate"),
+    # the camera frame; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
     "frame_t_s": "the frame's time of exposure on the loop's clock",
     "large_px": "corners of the large marker, x y of TL TR BR BL",
@@ -98,7 +98,7 @@ FIELDS: dict[str, str] = {
     "cam_age_s": "time since the last good frame",
     "delay_s": "measured latency beyond the profile's camera.latency_s",
     "delay_used_s": "correction of the frames' times, with `camera.latency_s: measured`",
-    # the target's estimate at t_s, which the planner steers by: the paper's error vector
+    # the estimate of the target at t_s, by which the planner steers: the paper's error vector
     **_axes("e{}_m", "target relative to the gear, level frame"),
     "eyaw_rad": "heading of the target in the level frame",
     **_axes("ev{}_mps", "target velocity from the filter, level axes"),
@@ -144,7 +144,7 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """Return a tick as a flat record of all `FIELDS` in order. The ground truth is only known in
+    """Return a tick as a flat record with all `FIELDS`, in order. The ground truth is known only in
     simulation."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
@@ -250,7 +250,7 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
 
 
 def command_values(command: Command) -> Mapping[str, Any]:
-    """Return the values of a command under the tick's field names: ``cmd`` and its numbers."""
+    """Return a command as values of the tick's fields: ``cmd`` and the command's numbers."""
     match command:
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}

@@ -1,8 +1,9 @@
-"""The log's header: the setup of a flight, complete enough to replay it on another computer.
+"""The log's header: the setup of a flight, complete enough to replay the flight on another
+computer.
 
-It contains the profile with every key. The camera files that the profile names may have changed by
-the time of a replay, so their content is included, too, and so is a fingerprint of the computer's
-arithmetic.
+It contains the profile with every key. The calibration and mask files named in the profile may have
+changed by the time of a replay, so their content is included as well, and so is a fingerprint of
+the computer's arithmetic.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """A log's first record. Without `started`, it only depends on the other arguments and the files
-    named in the profile. `t0_s` is the loop time at the start of the log."""
+    """The first record of a log. Without `started`, it depends only on the other arguments and on
+    the files named in the profile. `t0_s` is the time on the loop's clock at the start of the
+    log."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -63,10 +65,12 @@ def make_header(
 
 @cache
 def turn_fields() -> dict[str, list[str]]:
-    """Return the names of the fields that are written for a turn, by dataclass.
+    """Return the names of the fields that are written for a turn (one iteration of the flight
+    loop), keyed by dataclass.
 
-    They tell a later version of perchctl which of its fields this log cannot contain. Otherwise a
-    field that is left out because it is None would look like one that did not exist yet.
+    They show a later version of perchctl which of its fields did not exist yet when the log was
+    written. Without them, such a field could not be distinguished from a field that is left out
+    because it is None.
     """
     names: dict[str, list[str]] = {}
     for field in exact_fields(TickRecord):
@@ -77,8 +81,8 @@ def turn_fields() -> dict[str, list[str]]:
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:
-    """Return ``camera``, the calibration, and ``mask``, the pixels that the gear covers; an
-    unreadable file is left out."""
+    """Return the header's ``camera`` (the calibration) and ``mask`` (the pixels that the gear
+    covers); an unreadable file is left out."""
     with contextlib.suppress(PerchError):
         camera = profile_camera(profile.camera)
         record = {"camera": to_exact_json(camera)}
@@ -89,7 +93,7 @@ def camera_record(profile: Profile) -> dict[str, Any]:
 
 
 def computer_record() -> dict[str, Any]:
-    """Return ``computer``: the hardware and libraries that rounding may depend on."""
+    """Return the header's ``computer``: the hardware and libraries that rounding may depend on."""
     return {
         "computer": {
             "system": platform.system(),
@@ -107,8 +111,9 @@ def _packed(mask: NDArray[np.bool_]) -> str:
 
 
 # --- A fingerprint of this computer's arithmetic ---
-# Libraries choose code for the processor: numpy's BLAS and vector functions, OpenCV's filters, the
-# sine of the C library. The last bits of a pose therefore depend on the processor.
+# Libraries choose different code for different processors: numpy's BLAS and vector functions,
+# OpenCV's filters, the sine of the C library. The last bits of a pose therefore depend on the
+# processor.
 
 
 _SIDES = (2, 3, 4, 6, 8, 12)

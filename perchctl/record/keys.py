@@ -1,7 +1,8 @@
-"""Names in a log's turns that differ from the names in the program.
+"""Names in the turn records of a log that differ from the names in the program.
 
-A turn is written field by field. The log keeps its original names when a field or dataclass is
-renamed, so that old and new versions of perchctl can read each other's logs.
+A turn (one iteration of the flight loop) is written field by field. If a field or dataclass is
+renamed in the program, the log continues to use the original name, so that old and new versions of
+perchctl can read each other's logs.
 """
 
 from __future__ import annotations
@@ -117,8 +118,8 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True)
 class LogNames:
-    """The names of a dataclass in a log: its own, and the key of each field by the field's name in
-    the program."""
+    """The names of a dataclass in a log: that of the class, and for the name of each field in the
+    program, its key in the log."""
 
     owner: str
     keys: dict[str, str]
@@ -126,7 +127,7 @@ class LogNames:
 
 @cache
 def log_names(kind: type) -> LogNames:
-    """Return the names of a dataclass and its fields in a log."""
+    """Return the names that a log uses for a dataclass and its fields."""
     keys = FIELD_KEYS.get(kind.__name__, {})
     names = (each.name for each in dataclasses.fields(kind))
     owner = CLASS_KEYS.get(kind.__name__, kind.__name__)

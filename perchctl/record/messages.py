@@ -1,8 +1,8 @@
-"""Build the messages of a flight's recording from the records of its log.
+"""Build the messages in a flight's recording from the records of its log.
 
 They are Foxglove's protobuf messages, as defined in Foxglove's package. Values for which Foxglove
-has no message are JSON. Frames: `world` (of the state estimate), `body`, `gear`, `camera` (OpenCV's
-axes, which are Foxglove's), `target` and `setpoint`.
+has no message are JSON. Frames: `world` (that of the state estimate), `body`, `gear`, `camera`
+(OpenCV's axes, which Foxglove also uses), `target` and `setpoint`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ TICK_SCHEMA = {
     "properties": {
         key: {
             "type": _TYPES.get(key, "number"),
-            "items": {"type": "number"},  # of an array
+            "items": {"type": "number"},  # the items of an array
             "description": text,
         }
         for key, text in FIELDS.items()
@@ -79,7 +79,7 @@ _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 
 def to_stamp(time_ns: int) -> Timestamp:
-    """Return nanoseconds since 1970 as protobuf's time stamp."""
+    """Convert nanoseconds since 1970 to a protobuf time stamp."""
     return Timestamp(seconds=time_ns // NS, nanos=time_ns % NS)
 
 
@@ -103,7 +103,7 @@ def corners_message(time_ns: int, record: Mapping[str, Any]) -> ImageAnnotations
 
 
 def fixed_transforms(profile: Profile) -> list[FrameTransform]:
-    """The transforms from the body to camera and gear, which are fixed."""
+    """The fixed transforms from the body to the camera and to the gear."""
     T_body_cam, gear_m = profile.camera.mount.T_body_cam, profile.vehicle.gear_body_m
     q = quaternion_from_rotation(T_body_cam[:3, :3])
     level = (1.0, 0.0, 0.0, 0.0)
@@ -116,8 +116,8 @@ def fixed_transforms(profile: Profile) -> list[FrameTransform]:
 def moving_transforms(
     time_ns: int, sampled_ns: int, record: Mapping[str, Any]
 ) -> Iterator[FrameTransform]:
-    """Yield the transforms from the world to a tick record's body (at `sampled_ns`), target and
-    setpoint, without any that is missing or not finite."""
+    """Yield the transforms from the world to the body (at `sampled_ns`), the target and the
+    setpoint in a tick's record. A transform that is missing or not finite is left out."""
     for child, at_ns, keys in (
         (BODY, sampled_ns, BODY_KEYS),
         (TARGET, time_ns, TARGET_KEYS),

@@ -1,4 +1,8 @@
-"""Read a flight log, even if its last line is incomplete."""
+"""Read a flight log, even if its last line is incomplete.
+
+A turn is one iteration of the flight loop, and a tick is a turn in which the vehicle was flown.
+Unless stated otherwise, times are in seconds since the flight's first turn.
+"""
 
 from __future__ import annotations
 
@@ -48,12 +52,13 @@ _GZIP = b"\x1f\x8b"
 
 @dataclass(frozen=True)
 class PhaseSpan:
-    """A period in one phase; times since the flight's first turn, `end_s` the next phase's start.
+    """A period in one phase. Times are since the flight's first turn; `end_s` is the start of the
+    next phase.
 
     Attributes:
         reason: why the phase was entered.
         row: the row of the mission's transition table that led to the phase.
-        severity: as in the log's event.
+        severity: severity in the log's event.
         simulated: the event in the simulated scenario that led to the phase. Empty texts if
             unknown.
     """
@@ -73,11 +78,11 @@ class PhaseSpan:
 
 @dataclass(frozen=True, eq=False)
 class FlightLog:
-    """One flight as it was written.
+    """The log of one flight.
 
     Attributes:
         records: the ticks, each with all keys of `FIELDS` (None where missing).
-        truncated: the summary is missing, or the end of the file is cut off.
+        truncated: True if the summary is missing, or if the end of the file is cut off.
         ignored_bytes: length of the unreadable tail.
     """
 
@@ -95,15 +100,16 @@ class FlightLog:
 
     @cached_property
     def turns(self) -> list[TickRecord]:
-        """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
+        """The exact records of all loop turns; empty in a log of version 1 or 2. Errors:
+        InvalidValue."""
         return [parse_turn(record) for record in self.turn_records]
 
     @cached_property
     def unknown_fields(self) -> tuple[ExactField, ...]:
-        """The fields of a turn that this log cannot hold, because an older perchctl wrote it; in
-        `turns` they have their default. Errors: InvalidValue.
+        """The fields of a turn that this log cannot contain, because an older version of perchctl
+        wrote it; in `turns`, they have their defaults. Errors: InvalidValue.
 
-        A field of a command is never unknown: its default is what the older perchctl sent.
+        A field of a command is never unknown: its default is what the older version sent.
         """
         known = self.header.get("turn_fields")
         if not isinstance(known, dict):
@@ -117,18 +123,19 @@ class FlightLog:
         return tuple(found)
 
     def _written_names(self) -> dict[str, set[str]]:
-        """By dataclass the names of the fields that a log without ``turn_fields`` may hold.
+        """The names of the fields that a log without ``turn_fields`` may contain, keyed by
+        dataclass.
 
         A field that is left out while it is None counts as contained, because its value may have
         been None.
         """
         names: dict[str, set[str]] = {}
-        if self.turns:  # readable
+        if self.turns:  # raises an error if they are unreadable
             for record in self.turn_records:
                 collect_written_names(TickRecord, _whole_turn(record), names)
         for each in exact_fields(TickRecord):
             is_since_4 = each.owner == "Turn" and each.name in ("outcome", "reason", "error")
-            # No log without ``turn_fields`` is as new as this one.
+            # Logs without ``turn_fields`` are all older than this field.
             is_newer = each.owner == "TargetEstimate" and each.name.startswith("measured_offset")
             is_newer = is_newer or (is_since_4 and self.header["version"] < 4)
             if each.is_always_written or is_newer:
@@ -145,7 +152,7 @@ class FlightLog:
     def column(self, key: str) -> Array:
         """The values of field `key` in all ticks, shape (n,); NaN where missing.
 
-        Raises InvalidValue for a value that is no number.
+        Raises InvalidValue for a value that is not a number.
         """
         try:
             values = [np.nan if r.get(key) is None else float(r[key]) for r in self.records]
@@ -159,8 +166,8 @@ class FlightLog:
 
     @cached_property
     def phases(self) -> tuple[PhaseSpan, ...]:
-        """The phases in the order in which they were entered, with the transition's row if the log
-        has events; a final phase without ticks is included."""
+        """The phases in the order in which they were entered, including a final phase without
+        ticks. If the log contains events, each has the row of its transition."""
         spans: list[PhaseSpan] = []
         for record in self.records:
             t_s, phase = self.to_flight_s(float(record["t_s"])), str(record.get("phase") or "")
@@ -183,8 +190,8 @@ class FlightLog:
         return tuple(spans)
 
     def csv(self) -> str:
-        """The ticks as CSV: a line of names, then a line each tick, with times from 0; a
-        missing value is empty. Errors: InvalidValue for a log without ticks."""
+        """The ticks as CSV: a line with the field names, then one line per tick, with times from 0;
+        missing values are empty. Errors: InvalidValue for a log without ticks."""
         if not self.records:
             raise InvalidValue(f"{self.path}: the log has no ticks, so there is nothing to export")
         text = StringIO()
@@ -200,7 +207,8 @@ class FlightLog:
 
     @property
     def start_s(self) -> float:
-        """Loop time of the first flown turn, the zero of all outputs; 0 if none was flown."""
+        """Time of the first flown turn on the loop's clock, the zero of all times that are output;
+        0 if no turn was flown."""
         flown = (r for r in self.turn_records if r.get("role") == "flown")
         first = self.records[0] if self.records else next(flown, None)
         return 0.0 if first is None else float(first["t_s"])
@@ -211,24 +219,25 @@ class FlightLog:
 
     @cached_property
     def t_s(self) -> Array:
-        """Times of the ticks since the flight's first turn, shape (n,)."""
+        """Times of the ticks, measured from the flight's first turn, shape (n,)."""
         return self.to_flight_s(self.column("t_s"))
 
     @property
     def end_s(self) -> float:
-        """Time of the last tick since the flight's first turn; 0 without any."""
+        """Time of the last tick, measured from the flight's first turn; 0 if there are no ticks."""
         return self.to_flight_s(float(self.records[-1]["t_s"])) if self.records else 0.0
 
     def tick_index_at(self, t_s: float) -> int:
-        """Index of the last tick up to `t_s`, a time since the first turn; 0 before any tick."""
+        """Index of the last tick at or before `t_s`, which is measured from the first turn; 0
+        before the first tick."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
     def tick_slice(self, start_s: float, end_s: float) -> slice:
-        """Slice of the ticks in [start_s, end_s), times since the first turn."""
+        """Slice of the ticks in [start_s, end_s), measured from the first turn."""
         first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
         return slice(int(first), int(last))
 
-    # --- the setup that was flown
+    # --- the setup of the flight
 
     @property
     def profile_name(self) -> str | None:
@@ -239,14 +248,14 @@ class FlightLog:
 
     @property
     def setup_text(self) -> str:
-        """The flown profile's name, and a simulated flight's seed, for messages."""
+        """The flown profile's name and, for a simulated flight, the seed, for messages."""
         seed = self.header.get("seed")
         return f"profile {self.profile_name or '?'}" + ("" if seed is None else f", seed {seed}")
 
     @property
     def flown_profile(self) -> Profile:
-        """The flown profile, without passwords. A `Note` warns of each key that has become a
-        constant and was flown with another value. Errors: InvalidValue."""
+        """The flown profile, without passwords. A `Note` warns about each key that has become a
+        constant but was flown with another value. Errors: InvalidValue."""
         values = self.header.get("profile")
         for found in Profile.constant_key_errors(values) if isinstance(values, dict) else ():
             warnings.warn(f"an older perchctl flew this flight: {found}", Note, stacklevel=2)
@@ -261,7 +270,8 @@ class FlightLog:
 
     @property
     def flown_camera(self) -> CameraModel | None:
-        """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+        """The calibration used in the flight; None if the log does not contain it. Errors:
+        InvalidValue."""
         if self.header.get("camera") is None:
             return None
         try:
@@ -275,7 +285,8 @@ class FlightLog:
         return bool(self.header.get("version", 0) >= NAMED_VERSION)
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """The mask (height, width), True on the gear; None without a mask. Errors: InvalidValue."""
+        """The mask used in the flight (height, width), True on the gear; None without a mask.
+        Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None
@@ -311,8 +322,8 @@ TIMES = ("t_s", "frame_t_s")
 def read_log(path: Path | str) -> FlightLog:
     """Read a flight log, compressed by gzip or not. An unreadable tail is ignored and counted.
 
-    Raises NotFound when there is no such file, and InvalidValue, with the line, when it is not a
-    flight log or is damaged elsewhere than at its end.
+    Raises NotFound if there is no such file, and InvalidValue, with the line number, if it is not a
+    flight log or is damaged anywhere but at its end.
     """
     path = Path(path)
     lines = _lines(path)
@@ -352,7 +363,7 @@ def read_log(path: Path | str) -> FlightLog:
 
 @contextlib.contextmanager
 def wrap_log_errors(path: Path) -> Iterator[None]:
-    """Context manager: turns errors by damaged log values into InvalidValue."""
+    """Context manager that converts errors caused by damaged values in a log to InvalidValue."""
     try:
         yield
     except OSError:
@@ -364,8 +375,8 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Read the lines of a file; none of a file that cannot be a log, since it may be a video of
-    gigabytes. The end of a truncated compressed file is lost."""
+    """Read the lines of a file. Return none for a file that cannot be a log, since it may be a
+    video of several gigabytes. The end of a truncated compressed file is lost."""
     lines: list[bytes] = []
     try:
         with path.open("rb") as file:
@@ -421,8 +432,8 @@ _NAMES = {"position_variance_m2": "velocity_variance_m2ps2", "var_m2": "vel_var_
 
 
 def _with_named_variance(value: Any) -> Any:
-    """Return a value from an older log with the velocity variance under its own name instead of
-    under that of the position variance."""
+    """Return a value from an older log, in which the velocity variance was stored under the name of
+    the position variance, with the correct name."""
     if isinstance(value, list):
         return [_with_named_variance(part) for part in value]
     if isinstance(value, dict):
@@ -434,17 +445,17 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
 
 
-# --- turns, and what was sent in the loop's place ---
+# --- turns, and commands sent in the loop's place ---
 
 
 def parse_turn(record: dict[str, Any]) -> TickRecord:
-    """Return the turn in a record, bit-identical. Errors: InvalidValue."""
+    """Restore the turn in a record, bit for bit. Errors: InvalidValue."""
     return parse_exact(TickRecord, _whole_turn(record))
 
 
 def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record with the observation's telemetry added. A line only contains it once, among
-    the samples."""
+    """Return the record with the observation's telemetry filled in. A line contains it only once,
+    among the samples."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
         samples = taken.get("late") or taken.get("samples")
@@ -454,7 +465,7 @@ def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
-    """The `TickRecord` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
+    """Restore the `TickRecord` or `SentCommand` in a record, bit for bit. Errors: InvalidValue."""
     try:
         return from_exact_json(kind, _without_kind(record))
     except ValueError as error:

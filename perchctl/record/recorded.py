@@ -1,5 +1,5 @@
-"""Read the images of a flight from its recording. It is read from the beginning, because the
-recording of a killed flight has no index."""
+"""Read the images of a flight from its recording. The file is read from the beginning, because the
+recording of a flight that was killed has no index."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 
 
 class RecordedPicture(NamedTuple):
-    """One frame: its number and time of exposure on the loop's clock, as the source gave
-    them, and the grey image (height, width) that the pipeline saw."""
+    """One frame: its number, its exposure time on the loop's clock as reported by the source, and
+    the grey image (height, width) that the pipeline processed."""
 
     number: int
     t_s: float
@@ -43,8 +43,8 @@ def recorded_pictures(
     """Yield the images `(number, t_s, image)`, oldest first, of a recording, or of the recording
     next to a log. A truncated last image is left out.
 
-    If `numbers` is given, only these frames are decoded. Errors, with the first image: NotFound
-    without a recording; InvalidValue for any other file.
+    If `numbers` is given, only these frames are decoded. Errors, raised when the first image is
+    requested: NotFound if there is no recording; InvalidValue for any other file.
     """
     path = recording_path(path)
     for frame, message in recorded_frames(path):
@@ -58,9 +58,9 @@ def recorded_pictures(
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield each frame's record in a recording, and its image, None if it was not stored.
+    """Yield each frame's record in a recording, and its image (None if it was not stored).
 
-    Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
+    Errors: NotFound if there is no file, InvalidValue if it is not an MCAP file.
     """
     topics: dict[int, str] = {}
     image: Message | None = None

@@ -1,7 +1,8 @@
-"""Records a flight while it flies: images, transforms and ticks.
+"""Record images, transforms and ticks during a flight.
 
-The flight passes on its data and continues; a separate thread encodes and writes it. The recording
-is less important than the log: lost data is counted and reported, but never makes the vehicle land.
+The flight hands over its data and continues; a separate thread encodes and writes the data. The
+recording is less important than the log: lost data is counted and reported, but never makes the
+vehicle land.
 """
 
 from __future__ import annotations
@@ -56,20 +57,20 @@ the vehicle may have to land."""
 
 
 class Recorder:
-    """Writes one flight's recording. Only `open` raises.
+    """Writes the recording of one flight. Only `open` raises exceptions.
 
-    The loop calls `write_frame` and `write_tick`. If `live`, both only fill a queue, and a thread
-    writes each turn at its end, while the loop sleeps. In lockstep everything is written at once,
-    and nothing is dropped.
+    The loop calls `write_frame` and `write_tick`. If `live`, both only fill a queue; at the end of
+    each loop iteration (turn), a thread writes its data while the loop sleeps. In lockstep
+    everything is written at once, and nothing is dropped.
 
     Attributes:
-        problem: None, or one sentence about the first data that is missing in the recording.
+        problem: None, or one sentence about the first data that is missing from the recording.
     """
 
     def __init__(
         self, path: Path, stream: DiskFile, header: Mapping[str, Any], profile: Profile, live: bool
     ) -> None:
-        """Begin the file at the times of the log's header. Raises OSError."""
+        """Begin the file, with the start times in the log's header. Raises OSError."""
         self.path = path
         self.problem: str | None = None
         # Used by the loop's thread:
@@ -80,7 +81,7 @@ class Recorder:
         self._closed = False
         # Used by the writer thread:
         self._stream = stream
-        sink: Any = stream  # of IO[bytes] the writer needs no more
+        sink: Any = stream  # not all of IO[bytes], but enough for the writer
         self._mcap = Writer(sink, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._mcap.start(library=f"perchctl {perchctl.__version__}")
         self._channels: dict[str, int] = {}
@@ -99,7 +100,7 @@ class Recorder:
     def open(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, live: bool = False
     ) -> Recorder:
-        """Begin a new file beside the log. Errors: InvalidValue, before the flight."""
+        """Begin a new file next to the log. Errors: InvalidValue, before the flight."""
         try:
             return create_file(path, live, lambda stream: cls(path, stream, header, profile, live))
         except OSError as error:
@@ -109,21 +110,22 @@ class Recorder:
             ) from None
 
     def write_frame(self, frame: Frame) -> None:
-        """Record a frame of the source. Never raises."""
-        self._hand_over()  # before take-off, no tick does this
+        """Record a frame from the source. Never raises an exception."""
+        self._hand_over()  # before take-off there are no ticks, which do this otherwise
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
-        # A repeated frame contains its image, too.
+        # A repeated frame also contains its image.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
     def write_tick(self, record: Mapping[str, Any]) -> None:
-        """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
+        """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises an
+        exception."""
         self._turn.append(partial(self._write_tick, record))
         self._hand_over()
 
     def close(self) -> RecordingEnd:
-        """End the file, once, and return its summary. Waits at most `RECORDING_CLOSE_TIMEOUT_S` for
-        the disk. Never raises."""
+        """End the file and return its summary; further calls do nothing. Waits at most
+        `RECORDING_CLOSE_TIMEOUT_S` for the disk. Never raises an exception."""
         if not self._closed:
             self._hand_over()
             self._closed = True
@@ -169,7 +171,7 @@ class Recorder:
         if not frame.repeated:
             self._add(IMAGE, ns, image_message(self._ns(frame.t_s), frame), number)
             self._written_pictures += 1
-        # With all digits, because a replay needs exactly these times.
+        # Not rounded, because a replay needs exactly these times.
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def _write_tick(self, record: Mapping[str, Any]) -> None:
@@ -213,8 +215,8 @@ class Recorder:
         self._remember(f"the recording has ended ({why}): the flight and its log continue")
 
     def _ns(self, t_s: float) -> int:
-        """Convert a time on the loop's clock to nanoseconds since 1970, where a flight in lockstep
-        begins. Earlier times become 0, the first time of MCAP."""
+        """Convert a time on the loop's clock to nanoseconds since 1970; a flight in lockstep begins
+        at 0. Earlier times become 0, the earliest time in MCAP."""
         return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:

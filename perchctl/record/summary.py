@@ -1,4 +1,4 @@
-"""The summary of a flight: a few lines of text."""
+"""The summary of a flight, as values and as a few lines of text."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 class RecordingEnd(NamedTuple):
-    """Summary of a recording: the file's name, the numbers of stored and of missing images, and
-    the first reason for a loss."""
+    """Summary of a recording: the file's name, the numbers of stored and of lost images, and the
+    reason for the first loss."""
 
     recording: str
     pictures: int
@@ -47,21 +47,24 @@ NAME_COLUMNS = 11
 
 @dataclass(frozen=True)
 class FlightSummary:
-    """How one flight ended, and what it found out.
+    """How one flight ended, and what was measured in it.
 
     Attributes:
         outcome: ``perched``, ``landed``, ``aborted``, or ``unknown`` for a log
             that ends without its summary.
         cause: the reason for the outcome, such as ``target not found``.
         miss_m: true distance from gear to target centre; None if unknown.
-        contact: estimated error of the contact; None unless the vehicle hangs.
+        contact: estimated position error of the contact; None unless the vehicle hangs.
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
-        hover: time and position errors of a hover; None in a mission that perches.
-        lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
-        recording: its summary; None without a recording, and in a log that is read back.
+        hover: duration and position errors of a hover; None in a mission that perches.
+        lost_records, log_problem: number of lost log records, and why they were lost; 0 and None if
+            the log is complete.
+        recording: summary of the recording; None without a recording, and in a log that is read
+            back.
         simulated: True if the vehicle was simulated; then nothing here is advice for the profile of
             a real vehicle.
-        is_profile_suspect: True if the deciding row says that the profile may be wrong.
+        is_profile_suspect: True if, according to the transition that decided the outcome, the
+            profile may be wrong.
     """
 
     outcome: str
@@ -104,7 +107,7 @@ class FlightSummary:
         findings = _part_in(end, CameraFindings, _FINDINGS)
         if (
             simulated and findings is not None
-        ):  # logs written by 0.3.0 contain advice in this case, too
+        ):  # logs written by version 0.3.0 contain advice even in this case
             findings = replace(findings, advice=())
         return cls(
             outcome=str(end.get("outcome", "unknown")),
@@ -165,7 +168,7 @@ class FlightSummary:
         return f"{self.outcome.upper()}: {self.reason_text}".rstrip(": ")
 
     def text(self, log_path: Path | None = None) -> str:
-        """A few lines about the flight, without colour or a last line break."""
+        """A few lines about the flight, without colour or a final newline."""
         rows = self.rows()
         if log_path is not None:
             rows.append(("log", str(log_path)))
@@ -193,7 +196,7 @@ class FlightSummary:
         lines.append(("flight", f"{self.duration_s:.1f} s, {attempts}"))
         if self.battery_min_v is not None:
             lines.append(("battery", f"{self.battery_min_v:.2f} V at the lowest"))
-        if self.findings is not None:  # with 95 % intervals
+        if self.findings is not None:  # the measured values, with 95 % intervals
             lines.append(("latency", self.findings.latency_text))
             lines.append(("mounting", f"rotated by {self.findings.rotation_text} (x, y, z)"))
             lines += [("advice", sentence) for sentence in self.findings.advice]
@@ -217,7 +220,7 @@ def is_simulated(header: Mapping[str, Any]) -> bool:
     return str(header.get("uri", "")).startswith("sim://")
 
 
-# The parts of the summary, by the record's keys, with their own fields in order.
+# The keys of each part of the summary in the record, and the part's fields, in order.
 _CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {

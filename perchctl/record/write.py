@@ -1,8 +1,8 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
-Line 1 is the header. Each turn of the loop adds a `tick` record (rounded, for people and plots) and
-a `turn` record (exact and complete), with `event` and `sent` records between them. The last line is
-the `summary`. An error of the log never disturbs the flight.
+Line 1 is the header. Each iteration of the flight loop (turn) adds a `tick` record (rounded, for
+reading and plotting) and a `turn` record (exact and complete), with `event` and `sent` records
+between them. The last line is the `summary`. An error in writing the log never disturbs the flight.
 """
 
 from __future__ import annotations
@@ -46,19 +46,20 @@ Truth = tuple[tuple[float, float, float], float]
 
 
 class LogWatcher:
-    """Writes the log of one flight, and its recording if wanted.
+    """Writes the log of one flight and, optionally, its recording.
 
-    Only opening it raises; later failures are in `problem`, those of the recording in `remarks`.
+    Only opening it raises exceptions. Later failures are reported by `problem`, and those of the
+    recording by `remarks`.
 
     Attributes:
-        path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
+        path: the log file; `open` adds ``_2``, ``_3``... to the name rather than overwrite a file.
         problem: None, or one sentence about the first failure of the disk, or about the error for
             which the flight detached its log.
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight continues.
-        truth: returns the true state at a tick; set by a simulation.
-        simulated: the header is that of a simulated vehicle.
-        recorder: records the frames of the watched source; None without a recording.
+        truth: function that returns the true state at a tick; set by a simulation.
+        simulated: True if the header is that of a simulated vehicle.
+        recorder: records the camera's frames; None without a recording.
     """
 
     name = "the flight log"
@@ -85,13 +86,13 @@ class LogWatcher:
 
     @property
     def lost_records(self) -> int:
-        """How many records could not be written."""
+        """The number of records that could not be written."""
         return self._writer.refused_jobs + self._failed + self._unfinished + self._unmade
 
     @property
     def loss_reason(self) -> str | None:
-        """The reason why the log is incomplete, in one sentence; a disk failure has priority. None
-        if the log is complete."""
+        """The reason why the log is incomplete, in one sentence; None if it is complete. A disk
+        failure takes precedence over other reasons."""
         return self.problem or self.unencodable
 
     @classmethod
@@ -101,7 +102,7 @@ class LogWatcher:
         `live`: a background thread writes, and syncs about once a second; otherwise each record is
         written at once. Raises InvalidValue, before the flight.
         """
-        # A replay flies with the profile in the header, so its numbers are not rounded.
+        # A replay uses the profile in the header, so its numbers are not rounded.
         line = json_line(to_exact_json({k: v for k, v in header.items() if v is not None}))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -159,7 +160,7 @@ class LogWatcher:
         return log
 
     def frame(self, frame: Frame) -> None:
-        """Record a frame of the camera, if there is a recorder. Never raises."""
+        """Record a camera frame, if there is a recorder. Never raises an exception."""
         if self.recorder is not None:
             self.recorder.write_frame(frame)
 
@@ -199,11 +200,12 @@ class LogWatcher:
         self._put(partial(encode_line, {"kind": "tick", **record}), record["t_s"])
 
     def turn(self, turn: TickRecord) -> None:
-        """Append a whole turn, exactly (`turn_line`). Never raises."""
+        """Append the exact record of a turn (`turn_line`). Never raises an exception."""
         self._put(partial(turn_line, turn), turn.t_s)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append a command sent outside of loop turns, exactly; from any thread. Never raises."""
+        """Append the exact record of a command that was sent outside of loop turns. May be called
+        from any thread. Never raises an exception."""
         self._put(partial(sent_line, sent), sent.t_s)
 
     def event(self, event: Event) -> None:
@@ -216,14 +218,15 @@ class LogWatcher:
             self._remember_unencodable(error)
 
     def note_detached(self, reason: str) -> None:
-        """Note that the flight writes no more records because writing one raised an exception."""
+        """Record that the flight writes no more records, because writing one raised an
+        exception."""
         self._remember(reason)
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write the summary and close; without a report (the flight raised) only close. Return the
-        summary."""
+        """Write the summary and close. Without a report, that is, if the flight raised an
+        exception, only close. Return the summary."""
         if report is None:
             self.end()
             self._ended_recording()
@@ -254,7 +257,7 @@ class LogWatcher:
         )
 
     def abandon(self, reason: str) -> None:
-        """Close the log of a failed flight; delete it if the flight never began."""
+        """Close the log of a flight that failed; delete it if the flight never began."""
         self.end({"outcome": "failed", "reason": reason})
         self._ended_recording()
         if not self.has_begun:
@@ -302,7 +305,7 @@ class LogWatcher:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # The record for which the wait timed out is in the file by now.
+            # If the wait timed out earlier, the record has been written by now.
             problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
@@ -328,12 +331,12 @@ class LogWatcher:
 
 
 def sent_line(sent: SentCommand) -> bytes:
-    """A command sent outside of loop turns as one exact line of the log."""
+    """One exact line of the log for a command that was sent outside of loop turns."""
     return json_line({"kind": "sent", **to_exact_json(sent)})
 
 
 def turn_line(turn: TickRecord) -> bytes:
-    """A turn as one exact line of the log, by the fields of `perchctl.mission.TickRecord`."""
+    """One exact line of the log for a turn, with the fields of `perchctl.mission.TickRecord`."""
     record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.inputs.late_samples or turn.inputs.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
@@ -356,7 +359,8 @@ def path_beside(log: Path | str, suffix: str) -> Path:
 
 
 def recording_path(path: Path | str) -> Path:
-    """The path of a log's recording; a recording's own path is returned unchanged."""
+    """The path of the recording that belongs to a log; the path of a recording is returned
+    unchanged."""
     return path_beside(path, ".mcap")
 
 
