@@ -1,4 +1,5 @@
-"""The paper's merge weights: data from a session, the fit, and its uncertainty."""
+"""The paper's merge weights: collect data in a session, fit the weights, and test whether they
+help."""
 
 import lazy_loader
 

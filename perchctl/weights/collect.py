@@ -1,11 +1,12 @@
-"""Collect the data for a fit: a person places the camera, and checked rows are added to the
+"""Collect the data for a fit: the user places the camera, and checked rows are added to the
 session's file.
 
 A session is a CSV file (`perchctl.weights.data`) to which each position is appended in a single
 write. It can be stopped and continued at any time; a crash costs at most the last position.
 
-The actual pose of each position comes from a person or from motion capture. Like the pipeline's
-poses, it is the target relative to the gear's tip in the level frame, (x, y, z, yaw).
+The actual pose at each position is typed by the user or measured by motion capture. Like the
+pipeline's poses, it is the pose of the target relative to the gear's tip in the level frame, (x, y,
+z, yaw).
 """
 
 from __future__ import annotations
@@ -62,9 +63,10 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 
 @dataclass(frozen=True, eq=False)
 class MarkerReading:
-    """Both markers' poses (x, y, z, yaw; m and rad) in one frame, (4,) each, None if not found.
+    """The poses of both markers (x, y, z, yaw; m and rad) in one frame, (4,) each; None if a marker
+    was not found.
 
-    `center_px` (2,) is the mean of both markers' corners, None where a pose is missing.
+    `center_px` (2,) is the mean of both markers' corners; None if a pose is missing.
     """
 
     t_s: float
@@ -79,8 +81,8 @@ def read_markers(
     camera: CameraModel,
     attitude: VehicleState | None = None,
 ) -> Iterator[MarkerReading]:
-    """Yield the markers' poses in the frames of one position, relative to the gear in the level
-    frame, by the profile's pipeline with `merge.method` weights."""
+    """Yield the markers' poses in the frames at one position, relative to the gear in the level
+    frame, from the profile's pipeline with `merge.method: weights`."""
     merge = profile.merge.model_copy(update={"method": "weights"})
     setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
     state = PipelineState()
@@ -101,7 +103,7 @@ def _vector(pose: MarkerPose | None) -> Array | None:
 
 
 def position_fault(readings: list[MarkerReading]) -> str | None:
-    """Return why a position must be measured again, in one sentence; None if it is good."""
+    """Return, in one sentence, why a position must be measured again; None if it is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames arrived"
@@ -123,15 +125,15 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
-    """Return the CSV lines of the place with number `position`, each with the actual pose (4,)."""
+    """Return the CSV lines for the position with this number, each with the actual pose (4,)."""
     return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
 class SessionFile:
-    """The CSV file of a session. Raises InvalidValue for any other file.
+    """The CSV file of a session. The constructor raises InvalidValue for any other file.
 
     Attributes:
-        note: a sentence if an incomplete end was removed; otherwise empty.
+        note: a sentence if an incomplete last position was removed; otherwise empty.
         done: number of complete positions.
         next_position: number of the next position, above all numbers in the file.
     """
@@ -147,7 +149,7 @@ class SessionFile:
             self._write(HEADER + "\n", "w")
 
     def append(self, rows: str) -> None:
-        """Append the rows of a whole position, and flush them to the disk."""
+        """Append all rows of a position, and flush them to the disk."""
         self._write(rows, "a")
         self.done += 1
         self.next_position += 1
@@ -177,8 +179,8 @@ class SessionFile:
             raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
         rows = Counter(positions)
         if torn:
-            # A part of the position that was being written is lost, so the whole position must be
-            # measured again.
+            # The last position was only partly written, so the whole position must be measured
+            # again.
             if positions and rows[positions[-1]] < frames:
                 del lines[-rows.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
@@ -194,10 +196,10 @@ ActualPose = tuple[Array, VehicleState | None]
 
 
 class TypedPoses:
-    """Actual poses, measured and typed by a person, in centimetres and degrees."""
+    """Actual poses that the user measures and types in centimetres and degrees."""
 
     def actual_pose(self, ask: Ask) -> ActualPose:
-        """Ask the person for the pose. Raises InvalidValue if the answer is not four numbers."""
+        """Ask the user for the pose. Raises InvalidValue if the answer is not four numbers."""
         text = ask("actual pose of the target relative to the gear, x y z [cm] and yaw [deg]: ")
         try:
             x, y, z, yaw = (float(cell) for cell in text.replace(",", " ").split())
@@ -215,8 +217,9 @@ class MocapPoses:
     """Actual poses from motion capture, read as in flights.
 
     Args:
-        config: names the capture and the vehicle's rigid body, and gives that body's mounting.
-        target: rigid body of the target; its x axis is the heading.
+        config: the settings of the motion-capture system, of the vehicle's rigid body and of that
+            body's mounting.
+        target: name of the target's rigid body; its x axis is the heading.
         gear_body_m: the gear's tip in body axes, (3,).
     """
 
@@ -233,7 +236,7 @@ class MocapPoses:
         self._gear, self._now, self._wait = gear_body_m, now, wait
 
     def actual_pose(self, ask: Ask) -> ActualPose:
-        """The median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
+        """The median of `SAMPLES` measured poses. Raises ConnectionFailed, NotFound."""
         self._capture.poll(self._now())  # older frames are ignored
         frames: list[CaptureFrame] = []
         until_s = self._now() + WITHIN_S
@@ -257,14 +260,15 @@ class MocapPoses:
         return np.array([*e_m, wrap_rad(target_yaw - yaw)]), attitude
 
     def close(self) -> None:
-        """End the capture."""
+        """Close the connection to the motion-capture system."""
         self._capture.close()
 
 
 def _median(
     frames: list[CaptureFrame], body: str, mounted: PositioningConfig
 ) -> tuple[Array, tuple[float, float, float]]:
-    """The position (3,) m, and roll, pitch, yaw in rad of the body's axes in the world."""
+    """The median position (3,), m, and the median roll, pitch and yaw of the body's axes in the
+    world, rad."""
     placed = [VehiclePose.of(frame.bodies[body], mounted) for frame in frames]
     rpy = np.unwrap([rpy_from_rotation(each.R) for each in placed], axis=0)
     roll, pitch, yaw = (float(angle) for angle in np.median(rpy, axis=0))
@@ -276,9 +280,9 @@ def _median(
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Collects poses at positions to which a person moves the camera.
+    """Collects poses at positions to which the user moves the camera.
 
-    `truth` gives actual poses, `say` prints a sentence, `bar` shows progress; `now` and
+    `truth` returns actual poses, `say` prints a sentence, and `bar` shows progress; `now` and
     `wait` are the clock.
     """
 
@@ -294,10 +298,11 @@ class Experiment:
     wait: Callable[[float], None]
 
     def run(self, positions: int, frames: int) -> None:
-        """Collect positions of `frames` frames each until the session holds `positions`.
+        """Collect positions with `frames` frames each, until the session contains `positions`
+        positions.
 
-        Raises Interrupted when the person stops (complete positions are kept), and the errors of
-        the source and the truth.
+        Raises Interrupted if the user stops (complete positions are kept), and the errors of the
+        source and of `truth`.
         """
         while self.session.done < positions:
             number = self.session.next_position
@@ -344,7 +349,7 @@ class Experiment:
 
     def _frames(self, count: int) -> Iterator[Frame]:
         if self.source.live:
-            self.source.poll(self.now())  # was captured before Enter was pressed
+            self.source.poll(self.now())  # discard a frame from before Enter was pressed
         got = 0
         for _, frame in poll_frames(self.source, self.now, self.wait):
             if frame is None or frame.repeated:

@@ -1,11 +1,10 @@
-"""The data for a fit: a CSV with one row per frame. It is read and checked, and errors name the
-line.
+"""The data for a fit: read and check a CSV file with one row per frame. Errors name the line.
 
-Columns, in this order where perchctl writes them, by name where it reads them: ``position`` (a
-whole number: the place where the row was taken), ``t_s``, then x, y, z in metres and yaw in
-radians of ``large_``, ``small_`` and ``actual_``. Cells of a marker that was not seen are empty.
-Other columns are ignored. The three poses are in one frame: perchctl's own are the target relative
-to the gear's tip in the level frame.
+The columns are ``position`` (a whole number: the place where the row was taken), ``t_s``, then x,
+y, z in metres and yaw in radians with each of the prefixes ``large_``, ``small_`` and ``actual_``.
+perchctl writes them in this order, and reads them by name. Cells of a marker that was not seen are
+empty. Other columns are ignored. All three poses must be in the same frame; perchctl writes the
+target relative to the gear's tip in the level frame.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Poses of the target (x, y, z in m, yaw in rad), one row a frame, n rows.
+    """Poses of the target (x, y, z in m, yaw in rad), n rows, one per frame.
 
     Attributes:
-        name: the data file, for messages.
+        name: name of the data file, for messages.
         position: number of the place where the row was taken, (n,).
-        large, small: pose by each marker, (n, 4); NaN where the marker was not seen.
+        large, small: pose measured from each marker, (n, 4); NaN where the marker was not seen.
         actual: true pose, (n, 4).
     """
 
@@ -66,12 +65,12 @@ class Measurements:
 
 
 def wrap_angles(angle_rad: Any) -> Any:
-    """The angles, of any shape, wrapped to (-pi, pi]."""
+    """The angles (an array of any shape), wrapped to (-pi, pi]."""
     return -((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
-    """The CSV line of a frame at `position`; `poses`: large, small, actual, each (4,) or None."""
+    """The CSV line for a frame at `position`. `poses`: large, small, actual, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
         cells += [""] * 4 if pose is None else [f"{float(value):.8f}" for value in pose]
@@ -79,7 +78,8 @@ def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
 
 
 def read_data(path: Path) -> Measurements:
-    """Read a CSV file for the fit. Raises NotFound, InvalidValue with line or position."""
+    """Read a CSV file for the fit. Raises NotFound, and InvalidValue with the line or the
+    position."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
             lines, table = _read_table(path, csv.reader(text, skipinitialspace=True))
@@ -95,7 +95,8 @@ def read_data(path: Path) -> Measurements:
 
 
 def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
-    """Return rows' lines (n,) and needed columns (n, 14), NaN where a cell is empty."""
+    """Return the line numbers of the rows (n,) and the required columns (n, 14), NaN where a cell
+    is empty."""
     header = [name.strip() for name in next(reader, [])]
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing:
@@ -124,7 +125,7 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
 def _check_cells(
     path: Path, lines: NDArray[np.int64], heads: Array, poses: dict[str, Array]
 ) -> None:
-    """Raises InvalidValue for infinite numbers, missing cells, and poses that lack a part."""
+    """Raise InvalidValue for infinite numbers, missing cells, and incomplete poses."""
 
     def refuse(bad: Any, text: str) -> None:
         if bad.any():

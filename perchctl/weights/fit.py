@@ -1,14 +1,14 @@
-"""Fit the weights to the data for each axis, by the paper's LMS and by the closed-form least
-squares to which it converges, and test whether they help.
+"""Fit the weights to the data for each axis, by the paper's LMS (least mean squares) and by the
+closed-form least squares to which it converges, and test whether they help.
 
 With a = large - actual and b = small - actual, the merged error of equation 8 is ``w a + (1 - w)
 b``. The constant part of a and b is the markers' bias. No weight can correct it, so it is reported
 separately, and the weights are fitted to the rest. Differences of yaw are wrapped about their mean
 direction.
 
-Frames of one position share its errors, so the weights are tested by cross-validation over whole
-positions. The test errors include the bias, as they do in a flight. Intervals are Student's t over
-positions (for a root mean square by the delta method), 95 %.
+Frames at one position have errors in common, so the weights are tested by cross-validation over
+whole positions. The test errors include the bias, as in a flight. Intervals are 95 % intervals by
+Student's t over positions (for a root mean square, by the delta method).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class MarkerErrors:
 
 
 def marker_errors(data: Measurements) -> MarkerErrors:
-    """The pose errors of the rows with both markers."""
+    """The pose errors in the rows that contain both markers."""
     rows = np.flatnonzero(data.has_both_markers)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
     positions, starts = np.unique(data.position[rows], return_index=True)
@@ -102,7 +102,7 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return False at outliers by `OUTLIER_SIGMAS`, (n, 4); positions begin at rows `starts`."""
     use = np.ones(error.shape, dtype=bool)
     if len(starts) * LEAST_ROWS > len(error):
-        return use  # too few rows per position to estimate the usual error
+        return use  # too few rows per position to recognise outliers
     for start, end in itertools.pairwise([*starts, len(error)]):
         part = error[start:end]
         away = np.abs(part - np.median(part, axis=0))
@@ -119,8 +119,8 @@ def t_quantile(freedom: int) -> float:
 
 
 def closed_form_weights(sums: Array) -> Array:
-    """The weights (..., 4) with the least variance of the merged error; NaN where all
-    weights fit alike. `sums` is (6, ..., 4), as `MarkerErrors.sums`."""
+    """The weights (..., 4) that minimise the variance of the merged error; NaN where all weights
+    fit equally well. `sums` is (6, ..., 4), as in `MarkerErrors.sums`."""
     a, b, aa, bb, ab = sums[1:] / np.maximum(sums[0], 1.0)
     var_a, var_b, cov = aa - a * a, bb - b * b, ab - a * b
     below = var_a + var_b - 2.0 * cov
@@ -147,7 +147,8 @@ def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]
     """The final weights of LMS, (4,), not clipped, and the final weights with each position
     left out in turn, (g, 4).
 
-    LMS begins at the weight `start` and takes the rows, less the mean errors, in a shuffled order.
+    LMS begins at the weight `start` and processes the rows, minus the mean errors, in a shuffled
+    order.
     """
     power, pull = _recursion(errors)
     g = len(errors.positions)
@@ -167,9 +168,9 @@ def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]
 
 
 def _run(start: float, shrink: Array, shift: Array) -> Array:
-    """The last w (4,) of ``w <- shrink[k] w + shift[k]``, which begins at `start`.
+    """The final w (4,) of the recursion ``w <- shrink[k] w + shift[k]`` that begins at `start`.
 
-    `shrink`, `shift`: (n, 4). By one sum, because the recursion is linear.
+    `shrink`, `shift`: (n, 4). The recursion is linear, so it is computed as one sum.
     """
     product = np.cumprod(shrink[::-1], axis=0)  # product of the last 1, 2, ... n factors
     later = np.vstack([product[-2::-1], np.ones(4)])  # product of the factors after each row
@@ -177,7 +178,8 @@ def _run(start: float, shrink: Array, shift: Array) -> Array:
 
 
 def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
-    """Return p of mean 1 and q, (n, 4), of ``w <- w - mu (p w + q)``; an outlier's row is zero."""
+    """Return p, scaled to the mean 1, and q, (n, 4) each, for ``w <- w - mu (p w + q)``; the rows
+    of outliers are zero."""
     use = errors.is_inlier
     n = np.maximum(use.sum(axis=0), 1)
     a, b = np.where(use, errors.large, 0.0), np.where(use, errors.small, 0.0)
@@ -193,7 +195,8 @@ def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class FittedWeights:
-    """The large marker's weights by one method for x, y, z and yaw, (4,) each; g positions.
+    """The large marker's weights for x, y, z and yaw, fitted by one method to g positions; arrays
+    are (4,) unless stated.
 
     Attributes:
         raw_weights: weights as fitted.
@@ -209,7 +212,8 @@ class FittedWeights:
 
 
 def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
-    """The weights by each method of `FITTED`. Raises InvalidValue where all weights fit alike."""
+    """The weights fitted by each method in `FITTED`. Raises InvalidValue if on some axis all
+    weights fit equally well."""
     total = errors.sums.sum(axis=1)
     closed = closed_form_weights(total)
     if np.isnan(closed).any():
@@ -221,7 +225,7 @@ def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
     held_out = closed_form_weights(total[:, None] - errors.sums)
     folds = np.where(np.isfinite(held_out), held_out, closed)
     g = len(folds)
-    # LMS approaches the closed form, and so its weights have the same spread over positions.
+    # LMS approximates the closed form, so its weights have the same spread over positions.
     spread = np.sqrt((g - 1) / g * ((folds - folds.mean(axis=0)) ** 2).sum(axis=0))
     half = t_quantile(g - 1) * spread
     return {
@@ -235,16 +239,17 @@ def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Errors of sets of weights on held-out positions.
+    """The errors of several sets of weights on held-out positions.
 
-    `squares`: mean square errors (x, y, z, yaw) at g positions, (g, 4), by name of the set.
+    `squares`: mean square errors (x, y, z, yaw) at g positions, (g, 4), keyed by the name of the
+    set.
     """
 
     squares: dict[str, Array]
 
     @property
     def better_marker(self) -> NDArray[np.int64]:
-        """The better single marker by axis: index into `SINGLE`, (4,)."""
+        """The better single marker on each axis, as an index into `SINGLE`, (4,)."""
         means = [self.squares[name].mean(axis=0) for name in SINGLE]
         return np.asarray(np.argmin(means, axis=0))
 
@@ -254,7 +259,8 @@ class Evidence:
         return np.where(self.better_marker == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """RMS error (m, rad) of weights `name` and its 95 % interval's half width, (4,) each."""
+        """The RMS error (m, rad) of the weights `name`, and half the width of its 95 % interval,
+        (4,) each."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
@@ -272,8 +278,8 @@ class Evidence:
 
 
 def evaluate_weights(errors: MarkerErrors, weights: Mapping[str, Array]) -> Evidence:
-    """The errors of the fitted weights, the paper's, and each marker alone. `weights` by
-    method: (4,), or a row for each position, (g, 4)."""
+    """The errors of the fitted weights, of the paper's weights, and of each marker alone.
+    `weights`, keyed by method: (4,), or one row per position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}
     return Evidence(
@@ -285,7 +291,8 @@ def evaluate_weights(errors: MarkerErrors, weights: Mapping[str, Array]) -> Evid
 
 
 def _root(square: Array) -> tuple[Array, Array]:
-    """The root of the mean over positions (4,), and each position's influence (g, 4)."""
+    """The square root of the mean over positions (4,), and the influence of each position (g,
+    4)."""
     mean = square.mean(axis=0)
     rms = np.sqrt(mean)
     return rms, (square - mean) / (2.0 * np.maximum(rms, 1e-300))

@@ -1,5 +1,5 @@
-"""The result of a fit from a data file, as a value, a report for a terminal, a JSON record, and the
-weights file that a profile names (`merge.weights_file`)."""
+"""The result of fitting weights to a data file: as a value, as a report for a terminal, as a JSON
+record, and as the weights file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
 
@@ -61,17 +61,19 @@ class FitResult:
 
     @property
     def recommended_weights(self) -> Array:
-        """The fitted weights where proven, else 1 or 0: the better single marker alone, (4,)."""
+        """The fitted weights on axes where they are proven better; on the others 1 or 0, that is,
+        the better single marker alone, (4,)."""
         alone = np.where(self.evidence.better_marker == 0, 1.0, 0.0)
         return np.where(self.is_proven_better, self.fits[self.method].weights, alone)
 
 
 def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
-    """Read the data file `path`, fit the weights by each method, judge them by held-out positions.
+    """Read the data file `path`, fit the weights by each method, and judge them on held-out
+    positions.
 
     Args:
         method: the method to recommend, one of `FITTED`.
-        test: other data file to judge the weights by.
+        test: another data file on which to judge the weights.
 
     Errors: NotFound, InvalidValue.
     """
@@ -138,18 +140,18 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
 
 
 def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> None:
-    """Write a file of the recommended weights or, with `anyway`, of the fitted ones, and of the
-    fit's results.
+    """Write a file with the recommended weights (or, with `anyway`, the fitted ones) and the
+    results of the fit.
 
-    Errors: InvalidValue if the file cannot be written; an old file then stays.
+    Errors: InvalidValue if the file cannot be written; an existing file is then left unchanged.
     """
     flown = result.fits[result.method].weights if anyway else result.recommended_weights
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
 
-# --- The report, for a terminal of 80 columns, the verdict first ---
-# Lengths are in micrometres and angles in thousandths of a degree.
+# --- The report for a terminal of 80 columns, with the verdict first --- Lengths are in micrometres
+# and angles in thousandths of a degree.
 
 
 WEIGHTS_COLUMNS = 80

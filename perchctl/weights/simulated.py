@@ -1,7 +1,7 @@
 """The paper's experiment in the simulator: a stationary camera at seeded positions.
 
-Places lie between z3 and z2 under the target, where both markers are seen whole; heading
-and offset are drawn.
+The camera is placed between z3 and z2 below the target, where both markers are completely in view;
+heading and offset are drawn at random.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _SESSION_STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A camera place; `actual` (x, y, z, yaw): target relative to the gear in the level frame."""
+    """A place of the camera. `actual` (x, y, z, yaw): pose of the target relative to the gear in
+    the level frame."""
 
     T_world_cam: Array
     actual: Array
@@ -52,8 +53,8 @@ class SimulatedStand:
         self._corners = square_corners(profile.target.large.side_m)
 
     def fill_session(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
-        """Add the missing positions, each of `frames` frames; call `advance` on each frame. Raises
-        InvalidValue."""
+        """Add the missing positions, with `frames` frames each; call `advance` for each frame.
+        Raises InvalidValue."""
         while session.done < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
@@ -70,8 +71,8 @@ class SimulatedStand:
             session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
-        """The camera place of a position, counted from 1. Each position has its own section of the
-        range z3 to z2, so that even a few positions cover it. Raises InvalidValue."""
+        """The place of the camera for a position, counted from 1. Each position has its own section
+        of the range from z3 to z2, so that even a few positions cover it. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _SESSION_STREAM, position])
         share = (position - 1) % self._positions
