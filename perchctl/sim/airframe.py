@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ThrustCurve:
-    """One motor's thrust against its mean voltage, which is duty cycle times battery voltage.
+    """The thrust of one motor as a function of its mean voltage, which is duty cycle times battery
+    voltage.
 
     Attributes:
-        coefficients: of the cubic in that voltage, N, N/V, N/V^2, N/V^3.
+        coefficients: coefficients of the cubic polynomial in that voltage: N, N/V, N/V^2, N/V^3.
         most_n: thrust at the full command.
         least_n: a command below this gives no thrust.
     """
@@ -31,11 +32,12 @@ class Airframe:
 
     Attributes:
         device_type: the name that its firmware announces.
-        thrust: of one motor.
-        arms_itself: it needs no arming request (auto-arming).
-        idle_pwm: least duty cycle of each motor while it is armed, 0..65535; 0 if it arms itself.
-        spin_up_s: from the arming request until its motors turn steadily enough to fly; the
-            firmware disarms it after 2 s.
+        thrust: thrust curve of one motor.
+        arms_itself: True if it needs no arming request (auto-arming).
+        idle_pwm: smallest duty cycle of each motor while the vehicle is armed, 0..65535; 0 if it
+            arms itself.
+        spin_up_s: time from the arming request until its motors turn steadily enough to fly; after
+            2 s, the firmware disarms it.
         thrust_base: its height controller's guess of the hover thrust, 0..65535.
         rate_gains: its controller's gains of roll and pitch rate (P, I, D).
         parameters: firmware parameters that differ from a Crazyflie 2.1's at boot.

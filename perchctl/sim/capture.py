@@ -1,5 +1,5 @@
-"""A simulated motion-capture system: its properties and faults, the view that its cameras have of
-the simulated vehicle, the delay of its frames, and its server on loopback."""
+"""A simulated motion-capture system: its settings and faults, what its cameras see of the simulated
+vehicle, the delay of its frames, and its server on loopback."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class CaptureFault:
-    """A temporary fault of the motion capture. With the defaults, there is no fault.
+    """A temporary fault of the motion-capture system. With the defaults, there is no fault.
 
     Attributes:
         occluded: the vehicle's body is hidden from the cameras.
@@ -46,7 +46,7 @@ class CaptureFault:
             `swapped_with`, or the first other one if that is None.
         scale: factor on all positions; 1000 is millimetres.
         mirrored: the sign of y is inverted, as by a program with left-handed axes.
-        axes: rows (3, 3) of the rotation from the world's axes to the capture's.
+        axes: rows (3, 3) of the rotation from the world's axes to the system's.
         late_s: delay in addition to `CaptureSettings.delay_s`.
     """
 
@@ -72,7 +72,7 @@ class CaptureSettings:
         rate_hz: frame rate of the system's cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
-        heading_rad, origin_m: pose of the simulator's world in the capture's.
+        heading_rad, origin_m: pose of the simulator's world in the system's world.
         faults: (start s, end s, fault), on the simulation's clock.
     """
 
@@ -97,7 +97,7 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """Return the motion capture for the seed's flight; None if the profile uses no motion
+    """Return the motion-capture system for the seed's flight; None if the profile uses no motion
     capture."""
     config, sim = profile.positioning, profile.simulation
     if not config.source.is_mocap:
@@ -171,7 +171,8 @@ class SimCapture:
         self._under_way.append(CaptureFrame(self._arrival_s, bodies))
 
     def take(self) -> list[CaptureFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, each
+        once."""
         arrived = []
         while self._under_way and self._under_way[0].t_s <= self._t_s + 1e-9:
             arrived.append(self._under_way.popleft())
@@ -217,8 +218,8 @@ class SimCapture:
         turn, scale = np.eye(3), 1.0
         for fault in faults:
             turn, scale = np.array(fault.axes) @ turn, scale * fault.scale
-        # A capture defines a body's axes along its own, so the attitude of a level body is the
-        # identity.
+        # A motion-capture system defines a body's axes along its own, so a level body has the
+        # identity attitude.
         x, y, z = (scale * float(v) for v in turn @ place)
         if any(fault.mirrored for fault in faults):
             y = -y

@@ -50,7 +50,8 @@ _SETPOINTS = {
 
 
 def execute_packet(firmware: Firmware, packet: Packet) -> bytes | None:
-    """Let the firmware execute a packet; return the data of its answer, None for no answer.
+    """Make the firmware execute a packet; return the data of its answer, or None if there is no
+    answer.
 
     Raises struct.error for a packet that is too short for its command.
     """

@@ -38,14 +38,14 @@ _EPS_S = 1e-9
 
 
 class VehicleHost:
-    """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture.
+    """One vehicle, its CRTP endpoint, its video stream and its motion-capture server.
 
-    The endpoint is a socket on loopback: one CRTP packet a UDP datagram, as cflib's `udp://`
-    driver sends them. Answers go to the address that asked.
+    The endpoint is a socket on loopback, with one CRTP packet per UDP datagram, as sent by cflib's
+    `udp://` driver. Answers go to the address from which the request came.
 
     Args:
         link: further arguments of `CrtpServer`.
-        truth_file: JSON lines of the true state, 50 a simulated second.
+        truth_file: file for the true state, as 50 JSON lines per simulated second.
         parts: further arguments of `SimulatedVehicle`, for each vehicle.
     """
 
@@ -208,8 +208,8 @@ def serve_parent(
 # --- How time passes in the simulated vehicle's process, and when it ends ---
 # - real time: paced by the wall clock; catches up after a hiccup, never runs ahead. While a flight
 #   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
-# - stepped: only the parent's `advance` moves time; between two of them the link is
-#   answered, so that cflib connects without simulated time passing.
+# - stepped: only the parent's `advance` moves time; between two calls, packets on the link are
+#   answered, so that cflib can connect while simulated time stands still.
 
 
 MAX_LAG_S = 1.0
@@ -269,7 +269,7 @@ class HostRunner:
         return max(0.0, next_s - self._clock())
 
     def _must_wait(self) -> bool:
-        """True while the flight's loop has not kept up, for `LOOP_PATIENCE_S` at most."""
+        """True while the flight's loop lags behind, but for `LOOP_PATIENCE_S` at most."""
         limit_s, before_s = self._shared.limit_s, self._limit_s
         if self._host.elapsed_s < limit_s:
             self._waiting_since_s = None

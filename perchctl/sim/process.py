@@ -35,8 +35,8 @@ class SimProcess:
     """Handle of a running simulated vehicle; a context manager. It also has the methods that
     `perchctl.sim.host.VehicleHost.call_method` finds in the child.
 
-    From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
-    does not answer, `InvalidValue` when it refuses.
+    Its methods may be called from any thread. They raise `ConnectionFailed` if the child is gone,
+    `TimedOut` if it does not answer, and `InvalidValue` if it refuses a call.
 
     Attributes:
         uri: address for cflib.

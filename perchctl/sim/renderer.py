@@ -62,7 +62,7 @@ _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """One field, or a whole frame.
+    """The exposure of one field, or of a whole frame.
 
     Attributes:
         row_poses: for rows at equal distances from the first to the last, the camera poses
@@ -349,7 +349,7 @@ def round_pose(T_target_cam: Array) -> Array:
     return T
 
 
-# --- Motion within one exposure: how many poses it needs, and its blur as a kernel ---
+# --- Motion within one exposure: the number of poses needed, and the motion blur as a kernel ---
 
 
 SHARP_MOTION_PX = 0.25

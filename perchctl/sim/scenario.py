@@ -52,15 +52,15 @@ class Scenario:
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
         first_contact_force_n: pull at the first contact; None: `magnet_force_n`.
-        camera_freeze_at_s: time from which on the camera repeats its last image; None: never.
+        camera_freeze_at_s: time after which the camera only repeats its last image; None: never.
         parameters: firmware parameters that differ from the release's at boot.
         gyro_bias_radps, acc_bias_mps2: biases in body axes, of the gyroscope after and of the
             accelerometer before the firmware's calibration on the ground; only for a vehicle
             without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: height of the target's plane above the surface that the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        capture_holes_s: begin and length of the times in which a motion capture does not see
-            the vehicle.
+        capture_holes_s: start and duration of each period in which motion capture does not see the
+            vehicle.
         neighbours: other vehicles' targets; their downwash is in the draught.
         motor_strength: thrust of M1..M4 at the same duty, as shares of the data sheet's. In steady
             flight the strongest and the weakest of recorded vehicles differ by 17 % of the mean

@@ -13,8 +13,8 @@ Assumptions of the model, each with its source:
 - Airspeed pitches the vehicle away from its direction of flight, nose up in forward flight, by
   `Scenario.airspeed_moment_nmspm`.
 - Near the floor the rotors lift more, by `Scenario.ground_effect`.
-- A draught is a wind whose speed steady part and smooth gusts reach together, at two
-  standard deviations of the gusts (`Wind`).
+- A draught has a steady part and smooth gusts, which reach its nominal speed together when the
+  gusts are at two standard deviations (`Wind`).
 - The downwash of other vehicles in a fleet is `downwash_mps` (`perchctl.sim.downwash`).
 - Near the ceiling, suction pulls the rotors towards it: `Scenario.ceiling_suction` of their thrust
   at the ceiling itself; with 0.1 as measured by benches with rotors of this size (Hsiao and
@@ -301,11 +301,10 @@ def build_model(scenario: Scenario) -> Any:
     )
 
 
-# --- The magnet: what pulls the gear's tip towards the ceiling, and whether it holds ---
-# It acts within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at
-# contact, and falls to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker
-# than the later ones (`Scenario.first_contact_force_n`); it is over when the tip has
-# engaged and come off again.
+# --- The magnet: how it pulls the gear's tip towards the ceiling, and when it holds --- It acts
+# within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at contact, and falls
+# to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker than the later ones
+# (`Scenario.first_contact_force_n`); it is over when the tip has engaged and come off again.
 
 
 MAGNET_RADIUS_M = 0.025
@@ -362,8 +361,8 @@ _WIND_STREAM = 1
 
 
 class Wind:
-    """A steady wind with gusts, each axis a sum of sines. The wind has the speed
-    `Scenario.draught_mps` where the gusts are at two standard deviations."""
+    """A steady wind with gusts, which are a sum of sines on each axis. The wind has the speed
+    `Scenario.draught_mps` when the gusts are at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:
         x, y, z = scenario.draught_mps
