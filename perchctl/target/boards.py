@@ -52,8 +52,8 @@ class Board:
         square_m: side of the squares whose corners meet.
         marker_m, dictionary: the markers' side and dictionary; None on a chessboard.
         scale: measured over nominal size of the print, along width and height.
-        legacy: of a charuco board with an even number of rows: the top left square is white, as in
-            OpenCV before 4.6; other boards have one layout, and False here.
+        legacy: True for a charuco board with an even number of rows whose top left square is white,
+            as in OpenCV before 4.6. All other boards have only one layout, and False here.
     """
 
     kind: BoardKind
@@ -67,7 +67,7 @@ class Board:
 
     @property
     def has_two_layouts(self) -> bool:
-        """True if the board looks different in OpenCV before and since 4.6 (`legacy`)."""
+        """True if the board's layout changed in OpenCV 4.6 (`legacy`)."""
         return self.kind == "charuco" and self.rows % 2 == 0
 
     @property
@@ -119,7 +119,7 @@ class Board:
     def parse(cls, text: str) -> Board:
         """Return the board for a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
 
-        Raises InvalidValue, which names the wrong part.
+        Raises InvalidValue, naming the part that is wrong.
         """
         whole, _, measured = text.strip().partition(_MEASURED)
         found = _CHESSBOARD.fullmatch(whole) or _CHARUCO.fullmatch(whole)

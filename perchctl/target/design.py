@@ -1,8 +1,8 @@
 """Predict how a target works with a camera: the range in which each marker is detected.
 
-z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the whole
-large one (paper, section III-B: 115, 25, 12 cm). They depend on the smallest side that can be read
-through the blur, and on the image's edge.
+z1 and z2 are the farthest ranges at which the large and the small marker are detected, and z3 the
+nearest range at which the whole large marker is in view (paper, section III-B: 115, 25, 12 cm).
+They depend on the smallest side that can be read despite the blur, and on the field of view.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _px(side_px: float | None) -> str:
 
 
 def focal_px(camera: CameraModel) -> float:
-    """The mean focal length in px."""
+    """The mean of the two focal lengths, px."""
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 

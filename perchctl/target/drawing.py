@@ -80,8 +80,9 @@ class TargetDrawing:
         return np.asarray(w @ w.T)
 
     def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
-        """The whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its
-        area; row 0 is at the top of the print, the centre in the middle of the image."""
+        """The whole sheet, black 0 on white 255, (n, n); each pixel is the exact mean over its
+        area. Row 0 is at the top of the print, and the target's centre is in the middle of the
+        image."""
         size = max(1, int(np.ceil(self.sheet_side_m * px_per_m - 1e-9)))
         return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 
@@ -252,8 +253,9 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
 def print_scale(
     name: str, option: str, measured_m: float, spec_m: float, source: str
 ) -> tuple[float, list[str]]:
-    """A print's measured over its nominal length, and notes for the user, in which `name`
-    and `option` name the length, and `source` its nominal value's origin.
+    """The ratio of a print's measured length to its nominal length, and notes for the user. In the
+    notes, `name` and `option` name the length, and `source` says where the nominal value comes
+    from.
 
     Raises InvalidValue for a scale that no printer produces, for example because the length is in
     the wrong unit.

@@ -67,9 +67,10 @@ _MAD_TO_SIGMA = 1.4826
 def size_ratio(
     large_px: Array, small_px: Array, camera: CameraModel, target: TargetConfig
 ) -> tuple[float, float] | None:
-    """The ratio of the small marker's to the large marker's size over the profile's (1.01: printed
-    1 % too large), from one frame's corners, (4, 2) px each; and the ratio's possible systematic
-    error by the corners. None where the corners span no plane."""
+    """Return the ratio of the small marker's size to the large marker's, divided by the same ratio
+    in the profile (1.01: printed 1 % too large), from the corners in one frame, (4, 2) px each; and
+    the possible systematic error of the result due to the corners. None if the corners do not span
+    a plane."""
     rays = undistort_to_normalised(np.concatenate([large_px, small_px]), camera)
     seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
     sides = [

@@ -22,7 +22,7 @@ from perchctl.vision import MARKERS
 
 
 class ArucoReader:
-    """Reads a target's markers by cv2.aruco with default parameters, searching their ids only."""
+    """Reads a target's markers with cv2.aruco's default parameters, looking for their ids only."""
 
     def __init__(self, target: TargetConfig) -> None:
         dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]

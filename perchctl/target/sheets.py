@@ -64,7 +64,7 @@ def target_pdf(
 
     Args:
         page: ``a4``, ``letter``, ``a3`` or a size such as ``220x240mm``.
-        magnet_m: diameter of the magnet, whose place is on the back.
+        magnet_m: diameter of the magnet, whose outline is drawn on the back.
         origin: where the sizes come from, for the caption.
 
     Raises InvalidValue if the target cannot be read, or if the page is too small; the message then
@@ -72,7 +72,7 @@ def target_pdf(
     """
     check_target(target, magnet_m)
     size = parse_page(page)
-    # Only the letters of Helvetica.
+    # Replace characters that Helvetica lacks.
     origin = origin.encode("latin-1", errors="replace").decode("latin-1")
     texts = _caption(target, origin, date)
     place = _layout_on(target, size, texts)
@@ -88,8 +88,8 @@ def target_pdf(
 
 
 def board_pdf(board: Board, page: str) -> bytes:
-    """A board in the middle of the page, upright or across as it fits, with its rulers, as a
-    PDF; `page` as in `target_pdf`. Raises InvalidValue where it does not fit."""
+    """A board in the middle of the page, in portrait or landscape as it fits, with rulers, as a
+    PDF; `page` as in `target_pdf`. Raises InvalidValue if the board does not fit."""
     width, height = (1e3 * side for side in board.size_m)
     side = UNPRINTABLE + _RULER_DEPTH
     needed = (max(width, 2 * _RULER_REACH) + 2 * side, max(height, 2 * _RULER_REACH) + 2 * side)

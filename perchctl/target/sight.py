@@ -1,4 +1,4 @@
-"""The part of the ceiling in a camera's image: from the ground, and as the gear comes near.
+"""Compute which part of the ceiling a camera sees, from the ground and when the gear is close.
 
 The vehicle stands or flies level. Directions are the vehicle's: forward and left.
 """
@@ -27,7 +27,8 @@ _EDGE_POINTS = 200
 
 
 class FieldOfView:
-    """The image's edge, as the tangent of its angle from the camera's axis in each direction."""
+    """The edges of the image, as the tangent of the angle from the camera's axis in each
+    direction."""
 
     def __init__(self, camera: CameraModel, margin_px: float = ARUCO_MARGIN_PX) -> None:
         low = margin_px - 0.5
@@ -51,8 +52,8 @@ class FieldOfView:
         return bool((np.hypot(x, y) <= reach * z).all())
 
     def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
-        """The distance d from which on ``R (x, y, d) + offset`` is in the image for all
-        points (x, y) of `outline_m` (n, 2); None without such a distance."""
+        """The distance d beyond which ``R (x, y, d) + offset`` is in the image for all points (x,
+        y) of `outline_m` (n, 2); None if there is no such distance."""
 
         def seen(d: float) -> bool:
             return self.contains(outline_points_3d(outline_m, d) @ R.T + offset_m)
