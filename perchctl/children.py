@@ -1,4 +1,4 @@
-"""Child processes of the flying process, and the connection to each.
+"""Start child processes and communicate with them.
 
 A pair of sockets carries pickled messages: only the child inherits the other end, so neither side
 unpickles data from other programs.
@@ -38,8 +38,8 @@ class SharedTime(ctypes.Structure):
 
 
 class Channel(Connection):
-    """One end of a connection between two processes, which carries pickled messages; `recv` raises
-    EOFError when the other end is gone."""
+    """One end of a connection between two processes that carries pickled messages; `recv` raises
+    EOFError if the other end is gone."""
 
     def receive(self, timeout_s: float | None = None) -> Any:
         """Return the next message. Raises TimeoutError if none arrives within `timeout_s`, and
@@ -104,8 +104,8 @@ def wait_or_kill(child: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 
 def last_line(output: IO[bytes]) -> str:
-    """Return a child's last line of output for a message, with a colon in front; empty if there was
-    no output."""
+    """Return a child's last line of output, preceded by a colon, to append to a message; empty if
+    there was no output."""
     if output.closed:
         return ""
     output.seek(0)

@@ -1,7 +1,7 @@
-"""Every failure that perchctl reports, as one exception hierarchy.
+"""All failures that perchctl reports, as one exception hierarchy.
 
-Each class carries the exit code of the process; `EXIT_CODES` is the table that `fly --help` and the
-README print. Each message says in one sentence what was found, what is allowed and what to do.
+Each class has the exit code of the process; `EXIT_CODES` is the table that is shown in `fly --help`
+and the README. Each message says in one sentence what was found, what is allowed and what to do.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ MOST_DECIMALS = 9
 
 
 def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]:
-    """Return `found` and `limit` as texts for a message: with `decimals`, or as many decimals as
-    the limit has; with more if both texts would be the same."""
+    """Return `found` and `limit` as text for a message, with `decimals` decimals or as many as the
+    limit has. If both texts would be the same, more decimals are used."""
     own = -int(Decimal(f"{limit:g}").as_tuple().exponent)
     for count in range(min(max(decimals, own), MOST_DECIMALS), MOST_DECIMALS + 1):
         texts = f"{found:.{count}f}", f"{limit:.{count}f}"
@@ -60,7 +60,8 @@ def _install(extra: str) -> str:
 
 
 def no_simulator(missing: str | None = "mujoco") -> UsageError:
-    """The error if the extra ``sim``, which contains `missing`, is not installed."""
+    """The error to raise if the extra ``sim``, which provides the module `missing`, is not
+    installed."""
     return UsageError(f"the simulator is not installed ({missing} is missing); {_install('sim')}")
 
 
@@ -78,7 +79,7 @@ def broken_motion_capture(why: str) -> UsageError:
 
 
 def unfit_cflib(part: str, version: str) -> UsageError:
-    """The error for a cflib that lacks `part`, which perchctl reads or replaces."""
+    """The error for a cflib version that lacks `part`, which perchctl reads or replaces."""
     return UsageError(
         f"cflib {version} has no {part}, which perchctl needs; install a supported "
         f"version with: {sys.executable} -m pip install 'cflib>=0.1.34,<0.2'"
@@ -153,11 +154,12 @@ def require_type(name: str, value: object, *kinds: type) -> None:
 
 
 class Note(UserWarning):
-    """One sentence for people; the command line prints each once."""
+    """A warning of one sentence for the user; the command line prints each one once."""
 
 
 class ProfileNote(Note):
-    """Says that a profile was read, but one of its keys has been renamed or is not used."""
+    """Warns that a key in a profile has been renamed or is not used; the profile was read
+    anyway."""
 
 
 _ALL: list[type[PerchError]] = [PerchError, *PerchError.__subclasses__()]

@@ -1,5 +1,5 @@
-"""Your own code, named in a profile as ``my_module:MyCamera``: find it, create the object and check
-it."""
+"""Load your own code, named in a profile as ``my_module:MyCamera``: find the class, create an
+object and check it."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ def is_extension(text: str) -> bool:
 
 
 def load_extension(text: str, key: str) -> Any:
-    """Return the class, function or value named ``my_module:name`` by a profile's `key`. Modules
-    are searched for among the installed ones, then in the current folder.
+    """Return the class, function or value that the profile's `key` names as ``my_module:name``.
+    Modules are searched for among the installed ones, then in the current folder.
 
     Raises:
-        NotFound: no such module, or no such name in it. InvalidValue: its import raised.
+        NotFound: there is no such module, or no such name in it. InvalidValue: importing it raised
+            an exception.
     """
     module_name, _, name = text.partition(":")
     _search_here()
@@ -70,8 +71,9 @@ def make_extension(
     """Return a new object of the class named ``my_module:MyCamera``.
 
     Raises:
-        NotFound: as `load_extension`. InvalidValue: as `load_extension`; the class raised; or the
-        object lacks something that `protocol` has.
+        NotFound: as in `load_extension`.
+        InvalidValue: as in `load_extension`; or the class raised an exception; or the object lacks
+        something that `protocol` has.
     """
     kind = load_extension(text, key)
     try:

@@ -28,7 +28,7 @@ _BEGINNINGS = (
     (b"\x89MCAP0", "a recording"),
     (b'{"kind":"header","format":"perchctl-flight-log"', "a flight log"),
 )
-_KEYS = (  # of a YAML file, at the beginning of a line
+_KEYS = (  # keys at the beginning of a line, by which a YAML file is recognised
     (r"image_width|camera_matrix|distortion_model|cam0", "a camera calibration"),
     (r"vehicles", "a fleet file"),
     (r"extends|vehicle|planner|safety|positioning", "a profile"),
@@ -38,7 +38,8 @@ _UNKNOWN = "another kind of file"
 
 
 def file_kind(path: Path) -> str:
-    """Return what a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
+    """Return what kind of file this seems to be, such as ``a picture``; ``another kind of file`` if
+    unknown.
 
     For messages about a file of the wrong kind; never raises.
     """
@@ -58,8 +59,8 @@ def file_kind(path: Path) -> str:
 
 
 def kind_note(path: Path, *expected: str) -> str:
-    """Return what a file is, for the end of a message: `` (it is a flight log)``; an empty text if
-    that is unknown, or one of the `expected` kinds. Never raises."""
+    """Return what kind of file this is, to append to a message: `` (it is a flight log)``; empty if
+    the kind is unknown or one of the `expected` kinds. Never raises an exception."""
     kind = file_kind(path)
     return "" if kind in (*expected, _UNKNOWN) else f" (it is {kind})"
 
@@ -72,9 +73,9 @@ def check_output(
     *,
     makes_folder: bool = False,
 ) -> None:
-    """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or if
-    `check_writable` does. `content` is the name of such a file in the message, for example "a
-    plot"."""
+    """Raise InvalidValue if the name ends in none of the `suffixes` (in upper or lower case), or if
+    the file cannot be written (`check_writable`). `content` is what the message calls such a file,
+    for example "a plot"."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(
             f"the name of {content} must end in {' or '.join(suffixes)}, found {path}"
@@ -121,7 +122,7 @@ def same_file(path: Path, other: Path) -> bool:
 def write_error(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """Return the operating system's refusal as an error with one sentence, which ends with
+    """Convert an error of the operating system to one with a single sentence that ends with
     `more`."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
@@ -174,13 +175,13 @@ def file_mode(path: Path) -> int:
 
 
 def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
-    """Write all files, or none: the first is renamed when the last is written.
+    """Write all files or none: no file is renamed to its final name before the last one is written.
 
     Args:
         mode: permissions of new files, by default the system's; a replaced file keeps its own.
 
     Raises:
-        InvalidValue: a path is a folder; or a full disk, or missing rights.
+        InvalidValue: a path is a folder, the disk is full, or permissions are missing.
     """
     for path in files:
         check_writable(path, force=True)

@@ -1,6 +1,6 @@
-"""Frames and rotations: the conventions used in every other module.
+"""Frames and rotations: the conventions that all other modules use.
 
-Conventions (`docs/conventions.md` has them all):
+The conventions (all of them are in `docs/conventions.md`):
 
 - ``T_a_b`` is a 4x4 homogeneous matrix that maps coordinates in b into a, so
   inner letters cancel: ``T_world_body @ T_body_cam @ T_cam_target``.
@@ -32,8 +32,8 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def is_finite(values: Array) -> bool:
-    """True if all values are finite and small enough that the sum of their squares is finite,
-    too."""
+    """True if all values are finite and small enough that the sum of their squares is finite as
+    well."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))
 
@@ -166,7 +166,7 @@ def circular_mean(weights: Array, angles_rad: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A position (3,), m, in the estimate's world, and a heading, rad."""
+    """A position (3,), m, and a heading, rad, in the world of the state estimate."""
 
     position_m: Array
     yaw_rad: float

@@ -19,7 +19,8 @@ def data_folder(kind: str) -> Path:
 
 
 def data_file(kind: str, name: str) -> Path | None:
-    """Path of a user's or shipped file by name, with or without .yaml; None if missing."""
+    """The path of a user's or shipped file with this name, with or without .yaml; None if there is
+    none."""
     for folder in (user_folder("config") / kind, data_folder(kind)):
         for candidate in (folder / name, folder / f"{name}.yaml"):
             if candidate.is_file():

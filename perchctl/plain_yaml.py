@@ -1,4 +1,4 @@
-"""Read YAML as plain values. Duplicate keys are refused (PyYAML would silently keep the last
+"""Read YAML as plain values. Duplicate keys are an error (PyYAML would silently use the last
 one)."""
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 GRID = "#D8D8D8"
 DPI = 110
-_METADATA: dict[str, dict[str, None]] = {  # without metadata that changes from run to run
+_METADATA: dict[str, dict[str, None]] = {  # leave out metadata that changes from run to run
     ".png": {"Software": None},
     ".pdf": {"CreationDate": None},
     ".svg": {"Date": None},
@@ -46,7 +46,8 @@ def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
     """The figure in one of `FORMATS`, the same bytes for the same figure."""
     content = BytesIO()
     with rc_context({"svg.hashsalt": "perchctl"}):
-        # The layout solver's last bits differ from call to call.
+        # Fix the layout first, because the last bits of the solver's result differ from call to
+        # call.
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         for ax in figure.axes:

@@ -28,7 +28,7 @@ from perchctl.record import LogWatcher
 
 @dataclass(frozen=True)
 class Flight:
-    """A finished flight in real time: how it ended, its log for `read_log` and, if a simulated
+    """A finished flight in real time: how it ended, its log (for `read_log`) and, if a simulated
     vehicle perched, the distance of the gear from the target's centre, m."""
 
     report: FlightReport
@@ -55,24 +55,25 @@ def fly(
     Python warnings (`perchctl.errors.Note`).
 
     Args:
-        profile: a profile, its name or its file.
+        profile: a profile, its name, or its file.
         uri, source: vehicle and camera, instead of the profile's. A script that flies ``sim://``
-            needs ``if __name__ == "__main__":``, for the simulator's process.
+            needs ``if __name__ == "__main__":``, because it starts the simulator's process.
         on_tick: called 50 times a second with a `Tick`: telemetry, target, planner's state and
-            command; it must return within milliseconds. If it raises, it is not called again, the
-            flight continues, and a warning is issued.
+            command; it must return within milliseconds. If it raises an exception, it is not called
+            again, the flight continues, and a warning is issued.
         on_event: called with each new phase and each note. An error in it is treated in the same
             way.
-        should_stop: called in each tick; once it returns True or raises, the vehicle lands.
+        should_stop: called in each tick; once it returns True or raises an exception, the vehicle
+            lands.
         rows: your own transitions, in addition to those of the profile. A replay does not use them.
-        seed: of the simulated scenario.
-        log_dir: folder of the log, instead of the profile's.
-        record: keep the images beside the log; by default only of real vehicles.
+        seed: seed of the simulated scenario.
+        log_dir: folder for the log, instead of the profile's.
+        record: store the images next to the log; by default only for real vehicles.
 
     Raises:
         InvalidValue, NotFound, UsageError, ConnectionFailed, TimedOut, SafetyAbort, Interrupted:
-        it refused to take off. KeyboardInterrupt and SystemExit of your functions, once the vehicle
-        has landed.
+        the flight was refused before take-off. KeyboardInterrupt and SystemExit raised by your
+        functions, once the vehicle has landed.
     """
     profile = load_profile(profile)
     uri = profile.link.uri if uri is None else uri
@@ -138,8 +139,8 @@ class _OnEvent(Watcher):
 
 class _Stopper:
     """Calls `should_stop` and commands the landing. Runs in the loop's own thread, because the
-    watchdog's thread must not hang in user code. If the function raises, it is not called again,
-    because it may have meant yes."""
+    watchdog's thread must not hang in user code. If the function raises an exception, the vehicle
+    lands, because the answer may have been yes; the function is not called again."""
 
     def __init__(self, should_stop: Callable[[], bool], switch: OperatorSwitch) -> None:
         self._should_stop, self._switch = should_stop, switch

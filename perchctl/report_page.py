@@ -19,7 +19,7 @@ def render_template(package: str, name: str, **values: Any) -> Markup:
     """Render a template from the package's folder `templates`.
 
     A template of a whole page extends ``report.html``, which brings the style sheet and `POLICY`.
-    Texts in `values` are escaped. Raises jinja2.UndefinedError for a value that is missing.
+    Text in `values` is escaped. Raises jinja2.UndefinedError if a value is missing.
     """
     template = _environment(package).get_template(name)
     return Markup(template.render(values, policy=POLICY, version=perchctl.__version__))
@@ -38,5 +38,5 @@ def _environment(package: str) -> jinja2.Environment:
 
 
 def data_url(kind: str, content: bytes) -> str:
-    """Return content of a MIME type as a ``data:`` URL, for a page that holds its own images."""
+    """Return content of a MIME type as a ``data:`` URL, for a page that contains its own images."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -65,17 +65,18 @@ class Sighting:
 
     Attributes:
         index: number of the image in its source, from 0.
-        t_s: time of exposure, s; of a live source by `time.monotonic`.
+        t_s: exposure time, s; for a live source, by `time.monotonic`.
         name: the image's file name, or None.
-        markers: the detected ones of ``large`` and ``small``: `corners_px` (4, 2), top left, top
-            right, bottom right, bottom left on the paper; `sigma_px`, their standard deviation.
-        T_cam_target: pose of the target in the camera frame, (4, 4), m, by this image alone; None
+        markers: the detected markers, keyed by ``large`` and ``small``, with `corners_px` (4, 2)
+            (top left, top right, bottom right, bottom left on the paper) and their standard
+            deviation `sigma_px`.
+        T_cam_target: pose of the target in the camera frame, (4, 4), m, from this image alone; None
             without an accepted pose.
-        covariance: of that pose, (6, 6), in ROS's order: shifts along the camera's x, y, z (m),
-            then small rotations about the camera's x, y, z (rad); None without a pose.
-        T_level_target: pose in the level frame, from the vehicle's centre, (4, 4), m, by
+        covariance: covariance of that pose, (6, 6), in ROS's order: shifts along the camera's x, y,
+            z (m), then small rotations about the camera's x, y, z (rad); None without a pose.
+        T_level_target: pose in the level frame, from the vehicle's centre, (4, 4), m, computed with
             `camera.mount`; None without a pose or an attitude.
-        note: what is wrong with the image or the target; else empty.
+        note: what is wrong with the image or the target; otherwise empty.
     """
 
     index: int
@@ -99,19 +100,21 @@ def track(
     """Yield a `Sighting` for each image of a source, or for each field of an interlaced one.
 
     Args:
-        source: a text that `perchctl track` takes, such as ``camera:0``, ``video:flight.mp4`` or
-            ``images:pictures``; an open `FrameSource`; or an iterable of `Frame` or of arrays,
-            uint8, (height, width) in grey or (height, width, 3) in BGR.
-        profile: the target's sizes, and how it is measured; a profile, its name or its file.
-        calibration: the camera's, or its file; that of the profile by default.
-        attitude: the vehicle's attitude, or a function that returns it for a frame's `t_s`; for
-            `T_level_target`.
-        rate_hz: of arrays that are a stream. Without it, and from ``images:``, each image is
-            searched by itself, thoroughly.
+        source: a source text as for `perchctl track`, such as ``camera:0``, ``video:flight.mp4`` or
+            ``images:pictures``; an open `FrameSource`; or an iterable of `Frame` or of uint8
+            arrays, (height, width) in grey or (height, width, 3) in BGR.
+        profile: a profile, its name, or its file; contains the target's sizes, and how it is
+            measured.
+        calibration: the camera's calibration, or its file; by default that of the profile.
+        attitude: the vehicle's attitude, or a function that returns it for a frame's `t_s`; needed
+            for `T_level_target`.
+        rate_hz: frame rate, if the arrays are a stream. Without it, and for ``images:``, each image
+            is searched thoroughly and independently.
 
     Raises:
-        NotFound: no such source, profile or calibration. InvalidValue: None instead of an image, a
-        wrong type, shape, size or number. ConnectionFailed: a live source fell silent.
+        NotFound: there is no such source, profile or calibration. InvalidValue: an image is None,
+            or a type, shape, size or number is wrong. ConnectionFailed: a live source has stopped
+            delivering frames.
     """
     profile = load_profile(profile)
     if calibration is None:
@@ -164,7 +167,7 @@ def _sightings(
             live, frames = source.live, _polled(source, camera)
         else:
             live, frames = False, _numbered(source, rate_hz)
-        # `open_camera` has turned the images already, if it has the profile's section.
+        # If `open_camera` was given the profile's section, it already flips the images.
         turns = profile.camera.mirrored and not isinstance(source, WrappedSource)
         tracker = Tracker(profile, camera, live=live, stills=stills, attitude=attitude)
         for frame, name in frames:
@@ -174,7 +177,8 @@ def _sightings(
 
 
 def _polled(source: FrameSource, camera: CameraModel) -> Iterator[Named]:
-    """Yield all frames of a recording, the newest of a live source. Raises ConnectionFailed."""
+    """Yield all frames of a recording, or the newest frames of a live source. Raises
+    ConnectionFailed."""
     paths = getattr(getattr(source, "inner", source), "paths", ())
     heard_s = time.monotonic()
     while True:
@@ -205,8 +209,8 @@ def _numbered(images: Iterable[Any], rate_hz: float) -> Iterator[Named]:
 class Tracker:
     """Runs the profile's pipeline on one source's frames, without a vehicle.
 
-    `live`: the source is a camera. `stills`: each image is searched thoroughly, and by itself.
-    Without `attitude` poses are relative to the camera instead of the gear.
+    `live`: the source is a camera. `stills`: each image is searched thoroughly and independently.
+    Without `attitude`, poses are relative to the camera instead of the gear.
     """
 
     def __init__(
@@ -245,7 +249,8 @@ class Tracker:
         notes: list[str],
         name: str | None = None,
     ) -> Sighting:
-        """Return the sighting for what `process` has just yielded; `name` is its file's."""
+        """Return the sighting for the result that `process` has just yielded; `name` is the image's
+        file name."""
         seen = Sighting(picture.index, picture.t_s, name, {}, note="; ".join(notes))
         if output is None or not output.detections.markers:
             return seen
@@ -270,7 +275,7 @@ class Tracker:
 def _add_pose(
     seen: Sighting, state: PipelineState, attitude: VehicleState | None, pipeline: Pipeline
 ) -> Sighting:
-    """The sighting with its pose, if the pipeline accepted one of this image."""
+    """The sighting with its pose, if the pipeline accepted a pose from this image."""
     if state.last_pose is None or state.last_pose.pose.t_s != seen.t_s:
         return seen
     pose, T_body_cam = state.last_pose.pose, pipeline.pose_setup.T_body_cam

@@ -1,4 +1,5 @@
-"""Answers Ctrl-C during loading with one sentence and an exit code, without a traceback.
+"""Handle Ctrl-C while libraries are loading: exit with one sentence and an exit code, without a
+traceback.
 
 A KeyboardInterrupt would occur in the middle of a library's import, which prints it as ignored or
 turns it into another error. Nothing is open yet, so the process simply exits. This module imports
@@ -37,13 +38,13 @@ def exit_at_ctrl_c() -> None:
 
 
 def restore_ctrl_c() -> None:
-    """Make Ctrl-C a KeyboardInterrupt again from now on."""
+    """Make Ctrl-C raise a KeyboardInterrupt again from now on."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def refuse_windows() -> int:
-    """Say that Windows is not supported; returns the exit code."""
+    """Print that Windows is not supported; return the exit code."""
     sys.stderr.write(f"perchctl: {NO_WINDOWS}\n")
     if "--json" in sys.argv[1:]:
         sys.stdout.write(f"{failure_record(NO_WINDOWS, 1)}\n")

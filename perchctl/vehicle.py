@@ -35,12 +35,12 @@ DISARM_IT = (
 class Telemetry:
     """The vehicle's newest state, SI and right-handed (see `perchctl.geometry`).
 
-    `t_s` is on the loop's clock; `thrust` is the commanded 0..65535; `acc_x_g`, `acc_y_g` and
-    `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
-    `behind_s`: by how much position and velocity, which come by a packet of their own, are older
-    than `t_s`; `battery_behind_s` and `variance_behind_s` say the same of battery and variances,
-    and are infinite before their first packet. `start`: how often the vehicle has restarted since
-    it was first heard.
+    `t_s` is on the loop's clock; `thrust` is the commanded thrust, 0..65535; `acc_x_g`, `acc_y_g`
+    and `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
+    `behind_s` is how much older than `t_s` position and velocity are, which arrive in a separate
+    packet; `battery_behind_s` and `variance_behind_s` are the same for battery and variances, and
+    infinite before their first packet. `start` is how often the vehicle has restarted since its
+    first packet arrived.
 
     The variances are those reported by the vehicle's estimator; None if it reports none. With a
     deck that only measures the speed over ground, as a Flow deck does, nothing measures the
@@ -79,8 +79,9 @@ class Telemetry:
         return bool(self.supervisor & supervisor_bit)
 
 
-# --- What a vehicle may be doing, by its newest telemetry: what is old is unknown, and what is
-# unknown counts as flying. By it a link is left, and a rescue and the watchdog land.
+# --- The vehicle's state according to its newest telemetry. Old telemetry counts as unknown, and an
+# unknown vehicle counts as flying. Closing the link, the rescue and the watchdog depend on this
+# state.
 
 
 FRESH_S = 0.3
@@ -101,8 +102,8 @@ def has_fresh_position(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
-    """True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
-    the motors by 2 s (docs/firmware.md, "When setpoints stop")."""
+    """True if a zero setpoint could drop the vehicle, or lock it. The flying bit stays set for 2 s
+    after the motors stop (docs/firmware.md, "When setpoints stop")."""
     return newest is None or not is_fresh(newest, now_s) or newest.has_bit(FLYING)
 
 
@@ -127,7 +128,8 @@ def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
 
 @dataclass(frozen=True)
 class ExternalPosition:
-    """The vehicle's position as measured from outside, for its estimator; not a command.
+    """The vehicle's position as measured by an external system, for the vehicle's estimator; not a
+    command.
 
     `position_m` is in the world of the state estimate. `quaternion` (w, x, y, z) rotates body axes
     to world axes; None if only the position is known.
@@ -177,12 +179,13 @@ class RawThrust:
 
 @dataclass(frozen=True)
 class StopMotors:
-    """Stop setpoint followed by the notify that keeps the supervisor from locking."""
+    """A stop setpoint, followed by the notify message that prevents the supervisor from locking."""
 
 
 @dataclass(frozen=True)
 class Land:
-    """High-level landing to `height_m` in the world: sent once, then flown by the vehicle alone."""
+    """High-level landing to `height_m` in the world: sent once, then carried out by the
+    firmware."""
 
     height_m: float
     duration_s: float
@@ -198,8 +201,8 @@ class EmergencyStop:
 class Arm:
     """Arm a vehicle that does not arm itself, or disarm it; on the ground only.
 
-    While armed its propellers turn (docs/firmware.md, "Idle propellers"); disarming in the air
-    cuts the motors.
+    While it is armed, its propellers turn (docs/firmware.md, "Idle propellers"). Disarming it in
+    the air cuts the motors.
     """
 
     armed: bool
@@ -209,5 +212,5 @@ Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencySto
 
 
 def is_battery_reading(volts: float) -> bool:
-    """True if a battery cell can have that voltage; False for NaN."""
+    """True if this is a possible voltage of a battery cell; False for NaN."""
     return NO_BATTERY_READING_V <= volts <= MOST_CELL_V
