@@ -88,7 +88,7 @@ def check_writable(path: Path, force: bool, *, makes_folder: bool = True) -> Non
 
     Args:
         force: an existing file may be replaced.
-        makes_folder: the folder of the file may be made; False for a path typed by a person, in
+        makes_folder: the folder of the file may be created; False for a path typed by the user, in
             which a missing folder is usually a typing error.
 
     Raises:

@@ -239,7 +239,7 @@ def _values(text: str) -> dict[str, Any]:
             raise InvalidValue(str(error)) from None
     if not documents or not all(isinstance(each, dict) for each in documents):
         raise InvalidValue(f"holds no keys: a calibration is a {READ_FORMS}")
-    # In the output of a topic, each message is a document with a time of its own.
+    # In the output of a topic, each message is a document whose header contains its own time.
     first, *others = ({str(k): v for k, v in d.items() if k != "header"} for d in documents)
     try:
         differ = any(other != first for other in others)

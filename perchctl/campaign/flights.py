@@ -85,7 +85,7 @@ def fly_seed(
 ) -> FlightResult:
     """Fly one seed of the profile's scenario. Any executor can send this function to a worker.
 
-    `record` writes the images beside the log. A refused flight is a result, too, without a log.
+    `record`: store the images next to the log. A refused flight also gives a result, without a log.
     Errors: NotFound, InvalidValue (calibration, log).
     """
 

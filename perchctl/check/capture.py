@@ -263,8 +263,8 @@ class FrameAlignment:
     """Rotations A and B with R_capture = A R_vehicle B.
 
     Attributes:
-        R_world: A, from the vehicle's world to the capture's.
-        R_body: B, from the capture's body axes to the vehicle's.
+        R_world: A, from the vehicle's world to the motion-capture system's.
+        R_body: B, from the system's body axes to the vehicle's.
         residual_share: mean share of a rotation that A and B leave unexplained.
     """
 
@@ -274,7 +274,7 @@ class FrameAlignment:
 
     @property
     def vertical(self) -> Array:
-        """Upward unit vector in the capture's world, (3,)."""
+        """Upward unit vector in the motion-capture system's world, (3,)."""
         return np.asarray(self.R_world.as_matrix()[:, 2])
 
 

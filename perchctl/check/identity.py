@@ -147,7 +147,7 @@ def _vehicle_finding(
     )
 
 
-# --- The motion capture's body ---
+# --- The rigid body in motion capture ---
 
 
 def _body_finding(

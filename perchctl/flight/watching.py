@@ -168,7 +168,8 @@ def takes_frames(watcher: Watcher) -> TypeGuard[FrameWatcher]:
 
 
 def takes_turns(watcher: Watcher) -> TypeGuard[TurnWatcher]:
-    """True for a `TurnWatcher`. `isinstance` would read its `problem`, too, which may raise."""
+    """True for a `TurnWatcher`. Not by `isinstance`, which would read `problem` and could raise an
+    exception."""
     return all(callable(getattr(watcher, name, None)) for name in ("turn", "sent"))
 
 

@@ -66,7 +66,7 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close the link after waiting, with a timeout, until the vehicle no longer flies. A
-        vehicle on the ground that does not arm itself is disarmed, whatever ended the session."""
+        vehicle on the ground that does not arm itself is disarmed, however the session ended."""
 
 
 class VehicleLink(Protocol):

@@ -59,7 +59,7 @@ class _Waiting:
 
 
 class Sender:
-    """Pass commands to a library, from its creation to `stop`.
+    """Passes commands to a library, from the creation of this object until `stop`.
 
     `hand_over` passes one piece to the library; it returns False if there is no room, and the piece
     is then offered again. `guard` returns the command to send in the loop's place, usually None.
@@ -68,7 +68,7 @@ class Sender:
     `pieces` splits a command. `tend` maintains the link, and must not block: the guard's thread
     calls it after the guard, with `stuck_s`, and with True if the library has held one piece, or
     raised errors, for longer than `LIBRARY_HANG_S`. `spare` is called by the first thread when no
-    command waits; it may pass on a packet of its own and then returns True.
+    command waits; it may pass on another packet, and then returns True.
 
     `errors` counts the failed attempts to send.
     """
@@ -94,13 +94,13 @@ class Sender:
         self._queue: deque[_Waiting] = deque()
         self._ready = threading.Condition()
         self._stopped = threading.Event()  # separate, so that a command does not wake the guard
-        # since when the next piece has been waiting for the library
+        # when the next piece began to wait for the library
         self._waiting_since_s: float | None = None
-        self._called_s: float | None = None  # start of the current call of the library
+        self._called_s: float | None = None  # when the current call into the library began
         self._held_since_s: float | None = (
             None  # the call that had already lasted too long at the last check
         )
-        self._raised = False  # the library raised an error at the last attempt
+        self._raised = False  # True if the library raised an error at the last attempt
         self._last: tuple[float, Command] | None = None
         self._running = True
         self.errors, self._error = 0, ""
@@ -113,7 +113,7 @@ class Sender:
         self._keeper.start()
 
     def put(self, command: Command, by: str | None = None) -> None:
-        """Queue a command; `by` names the sender in the loop's place, None for the loop."""
+        """Queue a command. `by` is the name of the sender if it is not the loop."""
         with self._ready:
             if isinstance(command, EmergencyStop):
                 self._queue.clear()  # earlier commands are obsolete
@@ -136,7 +136,7 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Return the seconds for which no waiting command was accepted; 0 if none waits."""
+        """Return for how long, s, no waiting command has been accepted; 0 if none waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
@@ -240,7 +240,7 @@ class Sender:
         return None
 
     def _send(self, waiting: _Waiting) -> float:
-        """Pass on the next piece if there is room. Return the seconds to pause."""
+        """Pass on the next piece if there is room. Return how long to pause, s."""
         at_s = self._clock()
         if waiting.rest is None:
             try:

@@ -35,8 +35,8 @@ class Key:
 
 
 def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
-    """Yield every key below a section of a profile that has a value of its own, with that value, in
-    the order of the schema."""
+    """Yield every key below a section of a profile, except sections, with its value, in the order
+    of the schema."""
     properties = _properties(type(section))
     for name in type(section).model_fields:
         value = getattr(section, name)

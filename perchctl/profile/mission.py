@@ -10,7 +10,8 @@ from perchctl.profile.base import Section, key
 
 
 class SearchConfig(Section):
-    """Phase 2: the vehicle waits `wait_s`, climbs `step_m`, tries again, up to `max_height_m`."""
+    """Phase 2: the vehicle waits for `wait_s`, climbs by `step_m` and tries again, up to
+    `max_height_m`."""
 
     attempts: int = key(
         6, "number of times the vehicle waits for the target before it lands", ge=1, le=100
@@ -57,9 +58,9 @@ class AlignConfig(Section):
 class AscendConfig(Section):
     """Phase 5: the vehicle climbs to `standoff_m` under the target and settles there.
 
-    The vehicle goes back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
-    `standoff_m` is between gear and target; the small marker must be in view there.
-    The gear is settled within `settle_xy_m` of the axis, not more than `settle_z_m` below
+    The vehicle returns to ALIGN if it leaves the cone `cone_base_m + cone_slope * distance`.
+    `standoff_m` is the distance between gear and target; the small marker must be in view there.
+    The gear counts as settled within `settle_xy_m` of the axis and not more than `settle_z_m` below
     the stand-off.
     """
 
@@ -161,7 +162,8 @@ class CompleteConfig(Section):
     slip_mps: ClassVar[float] = 0.12  # sink rate that counts as a slip
     # duration of a slip before it is answered; a free fall is answered at once
     slip_dwell_s: ClassVar[float] = 0.03
-    # specific force below which the vehicle falls freely, or slips whatever the estimate says
+    # specific force below which the vehicle falls freely, or slips even if the estimate contradicts
+    # it
     slip_acc_g: ClassVar[float] = 0.5
     watch_s: float = key(
         1.5,
@@ -227,7 +229,7 @@ class PlannerConfig(Section):
     approach_xy_m: tuple[float, float] | None = key(
         None, "point to fly to after take-off, in the world frame of the state estimate"
     )
-    approach_timeout_s: ClassVar[float] = 15.0  # for take-off and the way to the target together
+    approach_timeout_s: ClassVar[float] = 15.0  # for take-off and the flight to the target together
     search: SearchConfig = SearchConfig()
     estimate: EstimateConfig = EstimateConfig()
     align: AlignConfig = AlignConfig()
@@ -264,7 +266,7 @@ class CorridorConfig(Section):
     target_top_m: float = key(..., "maximum height above the ground under the target", gt=0, le=20)
 
     def contains(self, x_m: float, y_m: float, height_m: float) -> bool:
-        """True for a place inside; False for a place that is unknown (NaN)."""
+        """True for a position inside the corridor; False for an unknown position (NaN)."""
         return Corridor(**dict(self)).contains(x_m, y_m, height_m)
 
 

@@ -1,4 +1,4 @@
-"""The profile's section on where the state estimate gets its position from."""
+"""The profile's section on the source of the state estimate's position."""
 
 from __future__ import annotations
 
@@ -148,9 +148,8 @@ class PositioningConfig(Section):
         return f"motion capture at {self.system}:{self.host}".rstrip(":")
 
     def with_method(self, by: str) -> dict[str, Any]:
-        """Return the values with another `by`. Keys of the previous method are dropped. A capture's
-        keys are kept if the new method is a deck, because a profile may name a capture beside
-        it."""
+        """Return the values with another `by`. Keys of the previous method are dropped. Keys for
+        motion capture are kept if the new method is a deck, because a profile may contain both."""
         if by == self.by:
             return self.model_dump()
         kept = self.model_dump() if (self.by, by) == ("deck", "mocap") else {"decks": self.decks}
@@ -167,8 +166,8 @@ class PositioningConfig(Section):
 
     @model_validator(mode="after")
     def _is_meant(self) -> PositioningConfig:
-        """Refuse a capture's keys if decks measure the position, since the flight would not use
-        them. (The profile in a log has every key, including `by`.)"""
+        """Reject keys for motion capture if decks measure the position, since the flight would not
+        use them. (The profile in a log contains every key, including `by`.)"""
         given = self.model_fields_set - {"decks"}
         if self.by == "deck" and (self.host if "by" in given else given):
             raise ValueError(

@@ -77,8 +77,8 @@ class SimulationConfig(Section):
     acc_bias_g: float = key(
         0.0, "maximum accelerometer bias on each horizontal axis, if there is no deck", ge=0, le=0.2
     )
-    draught_mps: Range = key((0.0, 0.3), "wind speed, with gusts")
-    magnet_force_n: ClassVar[float] = 1.2  # share of the weight that the magnet holds
+    draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
+    magnet_force_n: ClassVar[float] = 1.2  # what the magnet holds, as a multiple of the weight
     first_contact_fails: float = key(
         0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )

@@ -51,7 +51,7 @@ def have_same_pattern(dictionary: str, marker_id: int, other: str, other_id: int
 
 
 def check_marker_id(dictionary: str, marker_id: int) -> None:
-    """Raises ValueError when the id is outside its dictionary."""
+    """Raise ValueError if the id is not in the dictionary."""
     count = dictionary_size(dictionary)
     if marker_id >= count:
         raise ValueError(f"id {marker_id} is not in {dictionary}, which has ids 0 to {count - 1}")
@@ -81,7 +81,8 @@ class Mounting(Section):
     @field_validator("rpy_deg")
     @classmethod
     def _in_degrees(cls, rpy_deg: Vector3) -> Vector3:
-        """Refuse angles that are all multiples of 45 deg written in radians."""
+        """Reject angles that are probably in radians, because all would then be multiples of 45
+        deg."""
         turned = [(angle, _eighths(abs(angle))) for angle in rpy_deg if angle]
         if turned and all(eighths for _, eighths in turned):
             angle, eighths = turned[0]
@@ -128,15 +129,15 @@ class CameraConfig(Section):
         "example_640x480.yaml",
         "calibration file: a file next to the profile or in `calib/`, or a full path",
     )
-    cam: ClassVar[None] = None  # of one camera in a Kalibr file with several
+    cam: ClassVar[None] = None  # which camera of a Kalibr file with several cameras
     latency_s: Annotated[float, Field(ge=0, le=MOST_CAMERA_LATENCY_S)] | Literal["measured"] = key(
         USUAL_LATENCY_S, "time from exposure to arrival; with `measured`, each flight measures it"
     )
     mount: Mounting = Mounting()
     start_timeout_s: float = key(8.0, "time limit for the first good image", gt=0, le=60)
     mirrored: bool = key(False, "flip each image before use")
-    mask: str | None = key(None, "mask file, which is white where the vehicle covers the view")
-    fields: ClassVar[str] = "auto"  # of interlaced images: which field comes first is measured
+    mask: str | None = key(None, "mask file, white where the vehicle covers the view")
+    fields: ClassVar[str] = "auto"  # interlaced images: measure which field comes first
     readout_s: float | None = key(
         0.0, "rolling shutter: time from the first to the last row; none if unknown", ge=0, le=0.05
     )
@@ -277,10 +278,10 @@ class DetectorConfig(Section):
         "find corners from edge lines (even blurred or cut ones), or with OpenCV's subpixel method",
     )
     own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
-    blurred: ClassVar[bool] = True  # only with lines: searched for where blur may hide the target
+    blurred: ClassVar[bool] = True  # with `lines` only: also search where blur may hide the target
     # number of images without the target in a stream before that search
     blurred_every: ClassVar[int] = 4
-    # only with lines: measured where the image's edge cuts both markers
+    # with `lines` only: also measure if the image's edge cuts both markers
     cut: ClassVar[bool] = True
     correction_bits_large: ClassVar[int] = 0  # number of wrong cells that are corrected
     correction_bits_small: ClassVar[int] = 1
@@ -290,7 +291,7 @@ class PoseConfig(Section):
     """The profile's `pose`: how a pose is solved from corners."""
 
     solver: ClassVar[str] = "sqpnp"  # OpenCV's method for the first guess
-    refine: ClassVar[bool] = True  # refined by least squares on the corners
+    refine: ClassVar[bool] = True  # refine the pose by least squares on the corners
     max_reprojection_px: float = key(
         3.0, "RMS reprojection error above which a pose is rejected", gt=0
     )
@@ -308,8 +309,8 @@ class KalmanConfig(Section):
     camera's attitude and heading, in the world `drift_mps2` of the state estimate. A constant
     error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens the estimate's spread.
 
-    `drift_mps`: a target stands still, so while it is not measured it moves in the world
-    of the state estimate by that estimate's drift only, at most so fast.
+    `drift_mps`: largest drift of the state estimate. The target stands still, so while it is not
+    measured, it moves in the world of the state estimate only by this drift.
     """
 
     k1: float = key(0.04, "measurement noise with `noise: fixed`; the paper's R = k1 I", gt=0)

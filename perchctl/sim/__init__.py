@@ -1,4 +1,4 @@
-"""The simulated vehicle, its room and its camera, stepped by simulated time."""
+"""The simulated vehicle, its room and its camera, which advance in simulated time."""
 
 import lazy_loader
 

@@ -1,4 +1,5 @@
-"""The simulated camera: when frames are exposed, which are lost, and when the others arrive."""
+"""The simulated camera: it determines when frames are exposed, which are lost, and when the others
+arrive."""
 
 from __future__ import annotations
 
@@ -71,7 +72,7 @@ class SimCamera:
         self._newest: DeliveredFrame | None = None  # an image that the receiver repeats
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
-        """Take all exposures that end at or before `t_s`.
+        """Make all exposures that end at or before `t_s`.
 
         `pose_at`, the body's pose, is called with times within the exposures that ended since the
         last call.

@@ -13,9 +13,9 @@
   duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).
 - Motors of a kind differ (`Scenario.motor_strength`), and what each gives fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
-- The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
-  to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
-  0.63 V from no thrust to full.
+- The cell (`Cell`) supplies 4.4 A at full thrust. Current and voltage sag are proportional to
+  thrust: the voltages that the page lists with the duty cycles lie on a line within 0.06 V, with a
+  sag of 0.63 V at full thrust.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Cell:
         self.rest_v = self.battery_v = rest_v
 
     def set_rest_v(self, rest_v: float) -> None:
-        """Set the resting voltage without a change of the charge."""
+        """Set the resting voltage without changing the charge."""
         self._offset_v += rest_v - self.rest_v
         self.rest_v = rest_v
 

@@ -41,7 +41,7 @@ class SimProcess:
     Attributes:
         uri: address for cflib.
         stream_url: address of the video; "" without a camera.
-        capture: the motion capture's kind and address for `motioncapture`, or None.
+        capture: the motion-capture system's kind and address for `motioncapture`, or None.
         shared_time: how far simulated time has advanced, and how far it may advance.
         pid: process number of the child.
     """
@@ -100,7 +100,7 @@ class SimProcess:
 
     def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
         with self._lock:
-            with contextlib.suppress(OSError):  # then there is no answer either
+            with contextlib.suppress(OSError):  # the child is gone and does not answer
                 self._channel.send((name, arguments, named))
             good, result = self._receive()
         if not good:

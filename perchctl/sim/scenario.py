@@ -24,7 +24,8 @@ class Neighbour:
     Attributes:
         xy_m: its centre in the axes of the vehicle's own target.
         yaw_rad: its heading minus that of the vehicle's own target.
-        large_id, small_id: its markers' ids, in the own dictionaries; None: the own target's ids.
+        large_id, small_id: its markers' ids, in the dictionaries of the vehicle's own target; None:
+            the same ids.
     """
 
     xy_m: tuple[float, float]
@@ -289,7 +290,8 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _vehicle(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Return the differences between vehicles of one kind, each from a random stream of its own."""
+    """Return the differences between vehicles of one kind, each drawn from its own random
+    stream."""
     motors, mass, authority, thrust, vibration, air = (
         np.random.default_rng([seed, _VEHICLE_STREAM, part]) for part in range(6)
     )
@@ -356,8 +358,8 @@ class RadioBursts:
     together. The times passed to `is_lost` must not decrease. The same seed gives the same bursts.
 
     Args:
-        share: lost share of the time, above 0 and below 1.
-        mean_s: a burst's mean length.
+        share: share of the time in which packets are lost, above 0 and below 1.
+        mean_s: mean length of a burst, s.
     """
 
     def __init__(self, seed: int, share: float, mean_s: float) -> None:

@@ -175,8 +175,8 @@ class SheetView(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacedSheet:
-    """A sheet, and the homography (3, 3) `to_sheet` from the plane of the vehicle's own target to
-    the sheet's; None: the same plane."""
+    """A sheet on the ceiling. `to_sheet` is the homography (3, 3) from the plane of the vehicle's
+    own target to that of the sheet; None: the same plane."""
 
     sheet: Sheet
     to_sheet: Array | None = None

@@ -1,5 +1,5 @@
-"""The state estimate of a vehicle without a positioning deck: its IMU, and positions or poses
-from outside.
+"""The state estimate of a vehicle without a positioning deck, from its IMU and from external
+positions or poses.
 
 The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second, the
 gyroscope updates the attitude and the accelerometer updates the velocity. In flight, the velocity

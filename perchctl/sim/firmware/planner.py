@@ -1,4 +1,4 @@
-"""The high-level commander: 7th-order polynomials in x, y, z and yaw, run by the clock."""
+"""The high-level commander, which flies 7th-order polynomials in x, y, z and yaw."""
 
 from __future__ import annotations
 
@@ -72,7 +72,8 @@ class HighLevelPlanner:
         return self.state != TRAJECTORY_IDLE
 
     def finished(self, t_s: float) -> bool:
-        """True if the plan is over, by clock, not height (docs/firmware.md, "Setpoint modes")."""
+        """True if the plan's time is over, whatever the height (docs/firmware.md, "Setpoint
+        modes")."""
         return self.state == TRAJECTORY_IDLE or t_s - self._begin_s >= self._duration_s
 
     def stop(self, t_s: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""The supervisor: whether the motors may spin, decided 25 times a second.
+"""The supervisor, which decides 25 times a second if the motors may spin.
 
 States, conditions and times are those of docs/firmware.md, "Supervisor", "When setpoints
 stop" and "Contact, tumble, crash".
