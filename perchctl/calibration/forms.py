@@ -135,8 +135,8 @@ _NOTE_WORDS = frozenset(
         *("file", "path", "comment", "comments", "note", "notes", "description"),
     )
 )
-"""Words about boards, images, errors and dates: a key that consists only of these is a note,
-too."""
+"""Words about boards, images, errors and dates: a key that consists only of these is also a
+note."""
 _UNITS = frozenset(("px", "mm", "cm", "m", "deg"))
 
 _LENSES = {

@@ -102,8 +102,8 @@ class JpegSplitter:
 
 
 SENSOR_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-"""OpenCV's flags for a grey image on the sensor's grid. The orientation that a camera notes for
-viewers says how the camera was held; applying it would give each image another lens."""
+"""OpenCV's flags for a grey image on the sensor's grid. A camera stores how it was held as an
+orientation for viewers; if it were applied, the calibration would no longer fit the image."""
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:

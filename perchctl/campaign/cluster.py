@@ -75,8 +75,8 @@ def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
 
 
 _differences: dict[str, str] = {}
-"""Return the differences between this worker and the requirements of its campaigns, by campaign;
-empty without any."""
+"""The differences between this worker and the requirements of each campaign, keyed by campaign;
+empty if there are none."""
 
 
 def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:

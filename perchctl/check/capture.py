@@ -52,8 +52,8 @@ from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
 CAPTURE_S = 3.0
-"""Time for which the capture is observed, s. Shorter: a body that drifts at 0.05 m/s is not
-detected."""
+"""Time for which the motion-capture system is observed, s. Shorter: a body that drifts at 0.05 m/s
+is not detected."""
 CAPTURE_POLL_S = 0.005
 NOISE_FAIL = 4.0
 """Noise above which the row fails, in units of the `positioning.position_sigma_m` that the vehicle
@@ -212,16 +212,16 @@ LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
 axis."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 BODY_STILL_RAD = math.radians(4.0)
-"""Rotation up to which the capture's body counts as still, rad. Larger: a body that moves counts as
+"""Rotation up to which the rigid body counts as still, rad. Larger: a moving body counts as
 still."""
 BODY_STILL_M = 0.03
-"""Displacement up to which the capture's body counts as still, m."""
+"""Displacement up to which the rigid body counts as still, m."""
 MANY_SHARE = 0.9
 """Share of the rotations that deviate from one axis by less than `LEAST_STEP_RAD`, above which all
 count as rotations about this axis."""
 WORLD_TILT_DEG = 25.0
-"""Angle between the capture's z and the vertical above which its world is wrong, deg. Larger: a
-tilted world passes."""
+"""Angle between the motion-capture system's z axis and the vertical above which its world is wrong,
+deg. Larger: a tilted world passes."""
 BODY_WARN_DEG = 5.0
 """Angle between the axes of rigid body and vehicle above which the row warns, deg."""
 BODY_FAIL_DEG = 15.0
@@ -233,8 +233,8 @@ sufficient."""
 HAND_REACH_M = 5.0
 """Largest possible lift by hand, m. If a body moved further, its positions are in another unit."""
 STRANGER = 0.4
-"""Mean share of a rotation that A and B leave unexplained, above which the capture sees another
-body."""
+"""Mean share of a rotation that A and B leave unexplained above which the motion-capture system
+tracks another body."""
 
 
 @dataclass(frozen=True, eq=False)

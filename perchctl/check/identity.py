@@ -47,7 +47,7 @@ covered."""
 _DARK = ("dark", "uniform")
 
 Ask = Callable[[str], bool]
-"""Asks a person a question; True for yes."""
+"""Asks the user a question; returns True for yes."""
 
 
 @dataclass(frozen=True, kw_only=True)

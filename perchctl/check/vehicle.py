@@ -42,7 +42,7 @@ flight."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "fly sends the positions, and waits for the estimate to agree"
-"""With positions from a motion capture or the target."""
+"""Finding for a vehicle that gets its positions from motion capture or from the target."""
 ARMED_BY_FLY = "fly arms it after you confirm"
 UNREPORTED = "link.unreported says that this vehicle reports none"
 

@@ -124,7 +124,7 @@ MEASURES: dict[str, tuple[str, float]] = {
     "ceiling": ("m", 1.0),
     "safety.fence_radius_m": ("m", 1.0),
 }
-"""The unit in which people answer, and its value in the unit of the key."""
+"""The unit in which users answer, and its value in the unit of the key."""
 EDGES_AND_CEILING = ("front", "left", "ceiling")
 """Questions that are not keys of the profile."""
 BACK = "back"

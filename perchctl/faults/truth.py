@@ -245,13 +245,13 @@ NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
 """If a loss ends this soon after its limit, it is acceptable that the vehicle kept waiting, s."""
 REACTION_S = 1.0
-"""Longest time from the profile's limit to the descent, s: one turn's delay, and the time for the
-thrust to decrease."""
+"""Longest time from the profile's limit to the descent, s: the delay of one loop iteration, and the
+time for the thrust to decrease."""
 WATCHED_S, SUNK_M = 2.0, 0.15
 """Time after that, s, and the height that the vehicle must have lost by then, m, at less than a
 third of the landing speed."""
 COMING_DOWN_MPS = 0.1
-"""Or the sink rate at which it counts as coming down, m/s."""
+"""Sink rate at which the vehicle also counts as coming down, m/s."""
 HANDED_OVER_M = 0.3
 """Height at which a landing is handed over to the firmware and slows down, m."""
 

@@ -48,9 +48,9 @@ libraries takes half a minute, and nothing is armed before all vehicles are read
 operator waits for a process that hangs while it starts. Shorter: a busy computer cannot start a
 fleet."""
 LOOP_HUNG_S = 60.0
-"""Time without a turn of its flight loop after which a process is ended, s. It is longer than a
-landing by the watchdog takes, including closing the link and the log. Longer: the fleet waits for
-nothing."""
+"""Time without an iteration (turn) of its flight loop after which a process is killed, s. It is
+longer than a landing by the watchdog takes, including closing the link and the log. Longer: the
+fleet waits for nothing."""
 
 
 class Child(Protocol):

@@ -31,7 +31,7 @@ from perchctl.flight import FlyOptions
 
 RECORD_NAME = "fleet.json"
 LOOK_FIRST = "look where the vehicle is before you reach for it"
-"""Advice for a vehicle of which nobody knows how it ended."""
+"""Advice for a vehicle if it is unknown how its flight ended."""
 _WORST_FIRST: tuple[type[PerchError], ...] = (
     EmergencyStopped,
     SafetyAbort,

@@ -56,8 +56,7 @@ after a single lost packet."""
 LEAST_RATE_HZ = 10
 """Lowest rate of sent positions, Hz, which `positioning.rate_hz` allows."""
 MEASURED_RATE = "2M"
-"""Data rate to which all figures above apply; nobody has measured what a dongle carries at 1M and
-250K."""
+"""Data rate to which all figures above apply; the capacity at 1M and 250K has not been measured."""
 
 
 @dataclass(frozen=True)

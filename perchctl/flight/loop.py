@@ -54,14 +54,14 @@ from perchctl.vehicle import Idle, Telemetry
 from perchctl.vision import Pipeline
 
 TURN_HANG_S = 0.25
-"""Duration of a turn above which its data about the vehicle is out of date because something hung,
-s."""
+"""Duration of a turn above which something has hung, so that the turn's data about the vehicle is
+out of date, s."""
 PERMISSION = "permission to take off"
 """What a vehicle still waits for, as shown to the operator, when its own checks have passed but
 other vehicles fly in the same room."""
 PERMISSION_PERIOD_S = 0.1
-"""Period of the turns during that wait, s. Longer: take-off follows the permission later. Shorter:
-vehicles on the floor take computing time from those in the air."""
+"""Period of the turns while waiting for permission, s. Longer: take-off begins later after the
+permission. Shorter: vehicles on the floor take computing time from those in the air."""
 
 
 class PositionStatus(Protocol):

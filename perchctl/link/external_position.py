@@ -39,8 +39,8 @@ AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
 """Timeout for agreement after one reset, and how long the agreement must last, s. There are at most
 `RESETS` resets."""
 RESET_AGREE_M = 0.05
-"""Largest distance between estimate and capture after a reset, m: ten times the capture's assumed
-error."""
+"""Largest distance between estimated and measured position after a reset, m: ten times the assumed
+error of motion capture."""
 RESET_AGREE_RAD = math.radians(5.0)
 """Largest difference of the heading after a reset, rad: tolerable for half a metre of climb."""
 RESET_STILL_M = 0.05

@@ -129,8 +129,8 @@ FORMS = {
     "hub": rf"127\.0\.0\.1:[1-9]\d{{0,4}}/{_CHANNEL}/{_RATE}/{_ADDRESS}"
     r"\?key=[0-9a-f]{16}",
 }
-"""Regular expressions of the URIs, by scheme. `hub` is a radio's vehicle behind a `RadioHub`, which
-gives out these URIs; nobody types one."""
+"""Regular expressions of the URIs, by scheme. `hub` is a radio vehicle behind a `RadioHub`, which
+makes these URIs; users never type one."""
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
     "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"

@@ -262,7 +262,7 @@ class PositionFeed:
 
 STALE_FRAME_S = 0.05
 """Time after its arrival at which a frame is too old, s. A vehicle that climbs at 0.5 m/s moves by
-25 mm in this time, five times the assumed error of the capture."""
+25 mm in this time, five times the assumed error of motion capture."""
 UNIT_WITHIN = 0.01
 """Tolerance of a quaternion's length; single precision is accurate to 1e-6."""
 NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)

@@ -51,7 +51,7 @@ LEARN_FAR_M = 1.0
 """Distance above which it is learned with `LEARN_FAR_S`, m: more slowly, because a pixel is a
 larger distance."""
 LEARN_NEAR_S = 0.3
-"""Time constant near the target, s. Smaller: the noise of single sightings is learned, too."""
+"""Time constant near the target, s. Smaller: the result follows the noise of single sightings."""
 LEARN_FAR_S = 1.0
 """Time constant far from the target, s. Larger: a change of the difference is learned later."""
 NOWHERE = Place(np.zeros(3), 0.0)

@@ -33,7 +33,8 @@ from perchctl.profile.vision import (
 )
 
 MOTOR_PARAMETERS = ("motorPowerSet.", "health.start")
-"""Prefixes of the firmware parameters that turn motors on the ground, even while disarmed."""
+"""Prefixes of the firmware parameters that spin motors on the ground, even while the vehicle is
+disarmed."""
 
 
 class LinkConfig(Section):

@@ -84,9 +84,9 @@ class SimulationConfig(Section):
     )
     no_target: bool = key(False, "simulate a bare ceiling")
     capture_delay_s: ClassVar[float] = 0.01
-    """Time from a motion capture's exposure to arrival."""
+    """Time from a motion-capture exposure to the arrival of the frame, s."""
     capture_noise_m: ClassVar[float] = 0.001
-    """Standard deviation of a motion capture's position."""
+    """Standard deviation of a motion-capture position, m."""
     neighbours: tuple[tuple[float, float, float], ...] = key(
         (),
         "other targets: x and y (m) in the axes of the vehicle's target, and heading (deg)",

@@ -313,7 +313,8 @@ class FlightLog:
 
 
 TIMES = ("t_s", "frame_t_s")
-"""Times on the loop's clock in the log; in a table, they count from the flight's first turn."""
+"""Fields that are times on the loop's clock in the log; in a table, they are measured from the
+first iteration of the flight loop."""
 
 
 # --- the file ---

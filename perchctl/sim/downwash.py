@@ -49,7 +49,7 @@ FACTOR_RADIUS_M = 0.05
 push next to the axis, although the recordings need no factor at 0.1 m."""
 LEAST_MPS = 0.01
 """Speed below which a jet is ignored, m/s, so that vehicles far apart fly exactly as if alone. It
-is the speed 2 m below and 1 m beside the source. Larger: the drag force at this speed is
+is the speed 2 m below the source and 1 m from its axis. Larger: the drag force at this speed is
 missing."""
 
 

@@ -31,7 +31,7 @@ OUTLIER_SIGMAS = 6.0
 """Number of robust standard deviations from the median of its position beyond which a marker's
 error excludes the row on that axis."""
 LEAST_ROWS = 8
-"""Average number of rows per position below which nothing counts as an outlier."""
+"""Average number of rows per position below which no row is treated as an outlier."""
 _MAD_TO_SIGMA = 1.4826
 
 PAPER_WEIGHTS = (0.275, 0.306, 0.728, 0.469)

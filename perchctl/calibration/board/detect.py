@@ -182,7 +182,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
 
 
 _Corners = tuple[NDArray[np.intp], Array, bool]
-"""Indices (n,) and positions (n, 2), px, of a board's corners, and whether it has the legacy
+"""Indices (n,) and positions (n, 2), px, of a board's corners, and True if it has the legacy
 layout."""
 
 
