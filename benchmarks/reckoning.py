@@ -117,7 +117,9 @@ class Filter:
     def add_velocity(self, b: Belief, dt_s: float) -> None:
         for i, axis in enumerate(self.axes):
             pushed = (
-                b.is_positioned_by_target and not b.is_estimated_velocity_being_corrected and i < 2
+                b.is_target_position_source
+                and not b.is_estimated_velocity_being_corrected
+                and i < 2
             )
             if not pushed:
                 v = b.telemetry.velocity_mps[i]
@@ -180,7 +182,7 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         if before is None or imu.last_telemetry_gap_ended_at_s > before.t_s:
             filter_.begin(b.telemetry.velocity_mps)
         if before is not None and 0.0 < dt_s < 0.3:
-            filter_.predict(np.subtract(imu.velocity_mps, before.velocity_mps), dt_s)
+            filter_.predict(np.subtract(imu.velocity_gained_mps, before.velocity_gained_mps), dt_s)
         before = imu if before is None or dt_s > 0.0 else before
         filter_.remember(b.telemetry.t_s, b.telemetry.yaw_rad)
         if (
@@ -235,11 +237,12 @@ def _blind(
         if dt_s <= 0.0:
             continue
         struck = (
-            now.imu.last_telemetry_gap_ended_at_s > imu.t_s or now.imu.last_impact_at_s > imu.t_s
+            now.imu.last_telemetry_gap_ended_at_s > imu.t_s
+            or now.imu.last_impact_or_bounce_at_s > imu.t_s
         )
         if struck or now.height_m < FLOOR_M or not left:
             return
-        gained = np.subtract(now.imu.velocity_mps, imu.velocity_mps)
+        gained = np.subtract(now.imu.velocity_gained_mps, imu.velocity_gained_mps)
         old = advance_dead_reckoning(old, now.imu, now.telemetry, is_estimate_trusted=False)
         for axis, dv in zip(new, gained, strict=True):
             axis.predict(float(dv), dt_s)

@@ -286,7 +286,7 @@ def test_a_row_of_your_own_waits_for_a_switch(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(own_row, "WAIT_S", 30.0)
     monkeypatch.setattr(own_row, "SWITCH", Switch())
-    stop = ordered({Phase.ASCEND: OperatorRequest.STOP})
+    stop = ordered({Phase.ASCEND: OperatorRequest.CUT_MOTORS})
     fly_lockstep(load_profile(SHORT), rows=own_row.ROWS, log="waits.jsonl", **stop)
     events = [(each["phase"], each["reason"]) for each in read_log("waits.jsonl").events]
     assert events.count(("ALIGN", "the switch is off")) == 1

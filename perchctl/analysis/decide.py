@@ -92,7 +92,7 @@ def replay_decisions(
             name = type(error).__name__
             differs = None
             if turn.role != "failed" or ("Turn", "error") not in comparison.unknown:
-                differs = comparison.difference("error", turn.error, name)
+                differs = comparison.difference("error", turn.planner_exception_name, name)
             yield ReplayedDecision(tick, turn, differs, name)
             return  # later turns cannot be replayed
         yield ReplayedDecision(tick, turn, _difference(turn, new, command, comparison))
@@ -104,7 +104,7 @@ def _difference(
     turn: TickRecord, state: PlannerState, command: Command, comparison: Comparison
 ) -> FieldDifference | None:
     if turn.role == "failed":
-        return comparison.difference("error", turn.error, None)
+        return comparison.difference("error", turn.planner_exception_name, None)
     if turn.command is None:
         return None
     replayed = {

@@ -16,7 +16,7 @@ from perchctl.display.terminal import (
     frame_table,
     phase_style,
 )
-from perchctl.mission import Event, EventKind, ExternalPositions, Phase, PlannerState, Tick
+from perchctl.mission import Event, EventKind, ExternalPositionStatus, Phase, PlannerState, Tick
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -86,10 +86,10 @@ def _whole(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
 
 
-def _outside_text(outside: ExternalPositions) -> str:
+def _outside_text(outside: ExternalPositionStatus) -> str:
     if outside.problem is not None:
         return outside.problem
-    return f"position {outside.rate_hz:.0f} Hz   {age_text(outside.age_s)}"
+    return f"position {outside.rate_hz:.0f} Hz   {age_text(outside.newest_position_age_s)}"
 
 
 def event_text(event: Event) -> str:

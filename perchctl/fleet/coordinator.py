@@ -187,7 +187,9 @@ class Coordinator:
         the others."""
         now_s, word = self._clock(), self._switch.read()
         order = Order(
-            word=OperatorRequest.STOP if word is OperatorRequest.STOP else OperatorRequest.LAND
+            word=OperatorRequest.CUT_MOTORS
+            if word is OperatorRequest.CUT_MOTORS
+            else OperatorRequest.LAND
         )
         for name in self._children:
             with contextlib.suppress(Exception):

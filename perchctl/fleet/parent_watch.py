@@ -53,7 +53,7 @@ class ParentSwitch(OperatorSwitch):
         self._newest = order
         if order.word is not OperatorRequest.NONE:
             self.land()
-        if order.word is OperatorRequest.STOP:
+        if order.word is OperatorRequest.CUT_MOTORS:
             self.cut()
         # Set after the command, so that no reader sees the permission without the command.
         permitted = order.may_take_off and order.word is OperatorRequest.NONE

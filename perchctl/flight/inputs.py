@@ -16,7 +16,7 @@ import numpy as np
 
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_problem
 from perchctl.mission import (
-    ExternalPositions,
+    ExternalPositionStatus,
     FrameRecord,
     Observation,
     PlannerState,
@@ -463,7 +463,7 @@ class TurnReporter:
                 inputs=inputs.taken,
                 unfiltered_pose_by_marker=inputs.poses,
                 observation=obs,
-                error=type(error).__name__,
+                planner_exception_name=type(error).__name__,
             )
             self._report(turn)
 
@@ -500,8 +500,10 @@ class TurnReporter:
         return self._count - 1
 
 
-def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
+def external_positions(status: FeedStatus | None) -> ExternalPositionStatus | None:
     """Convert a feed's status to its form in the log; None stays None."""
     if status is None:
         return None
-    return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)
+    return ExternalPositionStatus(
+        status.age_s, status.problem, status.sent, status.rate_hz, status.pose
+    )

@@ -367,7 +367,7 @@ def _observe(
         operator_request=parts.operator(),
         climb_withheld_reason=parts.climb_withheld(),
         flight_log_problem=flight_log_problem,
-        position_age_s=0.0 if feed is None else feed.age_s,
-        position_problem=None if feed is None else feed.problem,
+        external_position_age_s=0.0 if feed is None else feed.age_s,
+        external_position_problem=None if feed is None else feed.problem,
         rejected_sighting_to_estimate_m=0.0 if feed is None else feed.beside_m,
     )

@@ -107,7 +107,7 @@ class OperatorSwitch:
         with self._lock:
             self._decide(self.clock())
             if self._stopped_s < math.inf:
-                return OperatorRequest.STOP
+                return OperatorRequest.CUT_MOTORS
             pressed = bool(self._presses_s) or self.landing_requested
             return OperatorRequest.LAND if pressed else OperatorRequest.NONE
 

@@ -144,7 +144,7 @@ class Watchdog:
         if self._motors_off:
             return None
         silent_s = now_s - last.obs.t_s
-        if operator is OperatorRequest.STOP and (self._closing or silent_s > STOP_AFTER_S):
+        if operator is OperatorRequest.CUT_MOTORS and (self._closing or silent_s > STOP_AFTER_S):
             self._cut_ordered = True
             return self._cut(now_s, newest)
         if self._closing:
@@ -169,7 +169,7 @@ class Watchdog:
         """Obey the operator's command if the loop's first iteration hangs or fails, so that the
         loop does not read it. That iteration may already have sent its own command. A stop
         therefore cuts the motors, and a landing disarms the vehicle only on the ground."""
-        if operator is OperatorRequest.STOP:
+        if operator is OperatorRequest.CUT_MOTORS:
             self._cut_ordered = True
             return self._cut(now_s, newest)
         return self._on_ground(now_s, newest)
@@ -196,14 +196,14 @@ class Watchdog:
         self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
         if self._profile.positioning.source.is_target:  # without the loop, it gets no positions
-            age_s = last.obs.position_age_s + now_s - last.obs.t_s
+            age_s = last.obs.external_position_age_s + now_s - last.obs.t_s
         return Observation(
             t_s=now_s,
             telemetry=history.newest or last.obs.telemetry,
             has_estimated_position_jumped=history.jumped,
             heading_jump_rad=history.turned_rad,
             tick_start_delay_s=now_s - last.obs.t_s,
-            position_age_s=age_s,
+            external_position_age_s=age_s,
             imu=history.imu,
             visual_inertial_motion=last.obs.visual_inertial_motion,
             camera_imu_mismatch=last.obs.camera_imu_mismatch,
@@ -285,7 +285,7 @@ def rescue(
     by_target = profile.positioning.source.is_target
     start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
-        if operator() is OperatorRequest.STOP:
+        if operator() is OperatorRequest.CUT_MOTORS:
             send(EmergencyStop())  # the link's guard repeats it
             return RestReport(RestState.END_UNCONFIRMED)
         with suppress(Exception):
@@ -301,7 +301,7 @@ def rescue(
                 link_problem=problem,
                 has_estimated_position_jumped=history.jumped,
                 heading_jump_rad=history.turned_rad,
-                position_age_s=math.inf if by_target else position_age_s(now_s),
+                external_position_age_s=math.inf if by_target else position_age_s(now_s),
                 imu=history.imu,
                 visual_inertial_motion=motion,
             )

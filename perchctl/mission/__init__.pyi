@@ -1,4 +1,4 @@
-from .belief.belief import ContactOffset as ContactOffset
+from .belief.belief import GearToTargetDistance as GearToTargetDistance
 from .belief.motion import ImuMotion as ImuMotion
 from .context import Context as Context
 from .descent import step_landing as step_landing
@@ -13,7 +13,7 @@ from .phase import VehicleDiagnosis as VehicleDiagnosis
 from .planner import step_mission as step_mission
 from .records import Event as Event
 from .records import EventKind as EventKind
-from .records import ExternalPositions as ExternalPositions
+from .records import ExternalPositionStatus as ExternalPositionStatus
 from .records import FrameRecord as FrameRecord
 from .records import SentCommand as SentCommand
 from .records import Tick as Tick

@@ -32,11 +32,11 @@ from perchctl.mission.belief.contact import (
     is_pressing,
 )
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.reckoning import MAGNET_REACH_M
+from perchctl.mission.belief.reckoning import MAGNET_REACH_BELOW_TARGET_M
 from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
 from perchctl.mission.belief.update import (
     KEEPALIVE_RAW_THRUST,
-    reset_conditions,
+    reset_phase_dependent_conditions,
     start_dead_reckoning,
     update_after_command,
 )
@@ -84,7 +84,7 @@ MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
 """Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
 MAX_LANDED_HEIGHT_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
-MAX_CLIMB_RATE_OF_MOTIONLESS_VEHICLE_MPS = 0.1
+MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
 still climbs or sinks."""
 ON_FLOOR_DWELL_S = 0.5
@@ -98,17 +98,17 @@ MIN_LANDING_COMMANDS = 3
 """Number of landing commands before the telemetry can confirm that the vehicle lands."""
 MAX_LANDING_COMMANDS = 6
 """Largest number of landing commands."""
-ONBOARD_LANDING_MEAN_SPEED_MPS = 0.35
-"""Mean speed of the quintic landing trajectory, m/s."""
+ONBOARD_LANDING_PEAK_SPEED_MPS = 0.35
+"""Peak speed of the quintic landing trajectory, m/s."""
 ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the quintic's duration, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M = 1.0
+MAX_ASSUMED_HEIGHT_DRIFT_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
 """Specific force below which the vehicle falls, g: no floor supports it."""
-MAX_DROP_ONTO_FLOOR_SPEED_MPS = 1.0
+MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
 MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
 """Height above which stopped motors mean a cut in the air and not a landing, m."""
@@ -147,7 +147,7 @@ def begin_landing(state: PlannerState) -> PlannerState:
         entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
         severity=max(state.severity, Severity.LAND),
         condition_start_times_s={},
-        belief=reset_conditions(b),
+        belief=reset_phase_dependent_conditions(b),
         must_end_press=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
@@ -163,7 +163,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     if (
         heard
         and tel.has_bit(HL_ACTIVE)
-        and not b.is_positioned_by_target
+        and not b.is_target_position_source
         and not b.is_position_diverged
     ):
         state = replace(
@@ -175,7 +175,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
         # The motors were stopped or never ran; no command may start them again.
         state = replace(state, motor_stop_commanded_at_s=b.obs.t_s)
     vehicle_world_z_at_last_contact_m = old.vehicle_world_z_at_last_contact_m
-    pressed_unseen = state.must_end_press and b.is_positioned_by_target
+    pressed_unseen = state.must_end_press and b.is_target_position_source
     if vehicle_world_z_at_last_contact_m is None and (
         previous_state.phase is Phase.PERCH or pressed_unseen
     ):
@@ -186,7 +186,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     state = move_setpoint_to_vehicle(Context(state))
     within = (
         vehicle_world_z_at_last_contact_m is not None
-        or b.dead_reckoning.gear_below_target_m < MAGNET_REACH_M
+        or b.dead_reckoning.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
     )
     lost = b.has_only_imu_for_descent
     b = replace(
@@ -241,10 +241,10 @@ def descend(c: Context) -> Action:
         return _descend_by_thrust(c)
     landing, in_reach, doubtful = (
         c.planner.landing,
-        b.is_in_magnet_reach,
+        b.is_possibly_in_magnet_reach,
         b.is_flight_data_unreliable,
     )
-    if b.is_positioned_by_target or not (in_reach or doubtful):
+    if b.is_target_position_source or not (in_reach or doubtful):
         state, away = end_press(c)
         if away is not None:
             return state, away
@@ -255,8 +255,12 @@ def descend(c: Context) -> Action:
             b.is_imu_fresh or not doubtful
         )
         return _transfer_weight_to_magnet(c) if gives_up else _descend_by_setpoints(c)
-    if b.is_positioned_by_target:
-        return _descend_by_thrust(c) if c.state.descent.thrust or low else _descend_by_setpoints(c)
+    if b.is_target_position_source:
+        return (
+            _descend_by_thrust(c)
+            if c.state.descent.last_commanded_raw_thrust or low
+            else _descend_by_setpoints(c)
+        )
     overdue = c.time_in_phase_s > landing.setpoint_time_s
     return _command_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
 
@@ -272,7 +276,7 @@ def has_landing_command_reached_end(c: Context) -> bool:
             return True
     return (
         0.0
-        < c.state.descent.thrust
+        < c.state.descent.last_commanded_raw_thrust
         <= MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust + 1.0
     )
 
@@ -285,7 +289,7 @@ def _is_falling_free(c: Context) -> bool:
     if not b.is_imu_fresh:
         return False
     if not state.is_before_release_and_motor_stop:
-        return b.is_in_magnet_reach and has_slipped(b)
+        return b.is_possibly_in_magnet_reach and has_slipped(b)
     if state.stop_or_land_command_count:
         return False
     caught = state.catch_setpoint_above_vehicle_m is None
@@ -301,13 +305,15 @@ def _is_standing_on_floor(c: Context) -> bool:
     b = c.belief
     if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
         return True
-    placed = b.is_positioned_by_target and b.is_position_valid and b.dead_reckoning_since_s is None
-    low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_in_magnet_reach
+    placed = (
+        b.is_target_position_source and b.is_position_valid and b.dead_reckoning_since_s is None
+    )
+    low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_possibly_in_magnet_reach
     return (
         placed
-        and c.state.descent.thrust > 0.0
+        and c.state.descent.last_commanded_raw_thrust > 0.0
         and low
-        and abs(b.climb_mps) < MAX_CLIMB_RATE_OF_MOTIONLESS_VEHICLE_MPS
+        and abs(b.climb_mps) < MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS
     )
 
 
@@ -333,7 +339,7 @@ def _restart_landing_with_catch(c: Context) -> Action:
         setpoint=None,
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
-        descent=replace(c.state.descent, thrust=0.0),
+        descent=replace(c.state.descent, last_commanded_raw_thrust=0.0),
         entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
     )
     c = Context(state)
@@ -382,24 +388,26 @@ def _descend_by_thrust(c: Context) -> Action:
 
 
 def make_onboard_landing_command(
-    planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, z_m: float
+    planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, vehicle_world_z_m: float
 ) -> Land:
-    """Return the command for the firmware's own landing from height `z_m`, a quintic from rest to
-    rest.
+    """Return the command for the firmware's own landing from height `vehicle_world_z_m`, a quintic
+    from rest to rest.
 
     The motors stop at the end of the trajectory. Its goal is therefore below the ground by more
     than the estimated height may have drifted during `time_in_flight_s`, and never above the
     vehicle.
     """
     drifted_m = min(
-        MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M,
+        MAX_ASSUMED_HEIGHT_DRIFT_M,
         planner.landing.drift_mps * max(0.0, time_in_flight_s),
     )
-    goal_z_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
+    goal_z_m = min(ground_z_m, vehicle_world_z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(
         goal_z_m,
         ONBOARD_LANDING_DURATION_MARGIN_S
-        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - goal_z_m) / ONBOARD_LANDING_MEAN_SPEED_MPS,
+        + QUINTIC_PEAK_TO_MEAN_SPEED
+        * (vehicle_world_z_m - goal_z_m)
+        / ONBOARD_LANDING_PEAK_SPEED_MPS,
     )
 
 
@@ -418,7 +426,7 @@ def _command_onboard_landing(c: Context) -> Action:
         b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
     )
     carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_IN_FALL_G or (
-        ends and tel.velocity_mps[2] > -MAX_DROP_ONTO_FLOOR_SPEED_MPS
+        ends and tel.velocity_mps[2] > -MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS
     )
     if (
         b.is_imu_fresh

@@ -23,7 +23,7 @@ from perchctl.vehicle import FULL_THRUST
 
 MAX_BATTERY_READING_GAP_S = 5.0
 """Time without a reading after which the charge is unknown, s."""
-STANDOFF_SETTLING_S = 3.0
+STANDOFF_SETTLING_DURATION_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
 TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
@@ -45,7 +45,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     energy = c.belief.battery_fit
     consumed_charge_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
     thrust_fraction = (
-        c.belief.hover_thrust or FULL_THRUST * energy.mean_thrust_fraction
+        c.belief.hover_thrust or FULL_THRUST * energy.mean_airborne_thrust_fraction
     ) / FULL_THRUST
     counted_s = predict_hover_time_s(
         energy, c.profile, thrust_fraction, identify_power_train(c.telemetry)
@@ -56,11 +56,13 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     enough_s, predicted = seconds, predict_durations(c)
     if enough_s is None:
         enough_s = (
-            _missing_battery_reading_timeout_s(c)
+            _time_left_without_battery_reading_s(c)
             if counted_s is None
-            else min(counted_s, _missing_battery_reading_timeout_s(c))
+            else min(counted_s, _time_left_without_battery_reading_s(c))
         )
-    spare_s = enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.attempt_s
+    spare_s = (
+        enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.remaining_attempt_s
+    )
     left = c.planner.attempts - c.state.failed_attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
@@ -69,14 +71,14 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
 
 
 def predict_hover_time_s(
-    state: BatteryFit, profile: Profile, thrust_fraction: float, power_train: PowerTrain
+    battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
-    """Return the hover time, s, at `thrust_fraction` (share of full thrust) until the row
+    """Return the hover time, s, at `hover_thrust_fraction` (share of full thrust) until the row
     `battery-low` applies; None if unknown."""
     if (
-        state.rest_v is None
-        or state.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
-        or not thrust_fraction > 0.0
+        battery_fit.rest_v is None
+        or battery_fit.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
+        or not hover_thrust_fraction > 0.0
     ):
         return None
     safety, perch = profile.safety, profile.planner.perch
@@ -86,15 +88,15 @@ def predict_hover_time_s(
     )
     lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V)
-    press_load = max(thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, true_to_counted_discharge_ratio = fit_sag_model(state)
-    end_v = hover_v + sag_v * thrust_fraction
+    press_load = max(hover_thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
+    sag_v, true_to_counted_discharge_ratio = fit_sag_model(battery_fit)
+    end_v = hover_v + sag_v * hover_thrust_fraction
     if profile.planner.hover is None:
         end_v = max(end_v, press_v + sag_v * press_load)
-    share = charge_fraction_from_rest_v(state.rest_v) - charge_fraction_from_rest_v(end_v)
+    share = charge_fraction_from_rest_v(battery_fit.rest_v) - charge_fraction_from_rest_v(end_v)
     return max(0.0, share) / (
         true_to_counted_discharge_ratio
-        * thrust_fraction
+        * hover_thrust_fraction
         * full_thrust_discharge_fraction_per_s(profile.vehicle.battery_mah, power_train)
     )
 
@@ -103,7 +105,7 @@ def predict_hover_time_s(
 class MissionDurations:
     """Predicted times that parts of a mission take, s."""
 
-    attempt_s: float  # the rest of this attempt
+    remaining_attempt_s: float  # the rest of this attempt
     retry_s: float  # each further attempt
     landing_s: float
 
@@ -116,7 +118,7 @@ def predict_durations(c: Context) -> MissionDurations:
         0.0 if hover is None else hover.below_m
     )
     climb_height_m = max(0.0, top_z_m - c.telemetry.position_m[2])
-    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s
+    touch_s = STANDOFF_SETTLING_DURATION_S + planner.ascend.settle_dwell_s
     if hover is None:
         touch_s += TOUCH_DURATION_S
         touch_s += (
@@ -132,13 +134,13 @@ def predict_durations(c: Context) -> MissionDurations:
     retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
     descent_s = max(0.0, c.belief.height_m + climb_height_m) / planner.landing.speed_mps
     return MissionDurations(
-        attempt_s=aligned_s + _climb_duration_s(c.profile, climb_height_m) + touch_s,
+        remaining_attempt_s=aligned_s + _climb_duration_s(c.profile, climb_height_m) + touch_s,
         retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
         landing_s=descent_s + LANDING_DURATION_BEYOND_DESCENT_S,
     )
 
 
-def is_charge_too_low_to_continue(c: Context) -> bool:
+def is_charge_too_low_for_any_attempt(c: Context) -> bool:
     """True if the charge is too low for an attempt at a known target."""
     gated = c.safety.energy_gate and c.belief.target.world_position_m is not None
     return gated and not c.state.battery.affordable_attempts
@@ -152,13 +154,13 @@ def battery_shortfall_text(c: Context) -> str:
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
     return (
-        f"{has}; an attempt takes {predicted.attempt_s:.0f} s, "
+        f"{has}; an attempt takes {predicted.remaining_attempt_s:.0f} s, "
         f"the landing {predicted.landing_s:.0f} s, "
         f"and the reserve is {c.safety.energy_reserve_s:g} s"
     )
 
 
-def _missing_battery_reading_timeout_s(c: Context) -> float:
+def _time_left_without_battery_reading_s(c: Context) -> float:
     """Return the time without a battery reading, s, after which the row `battery-unknown` lands the
     vehicle."""
     return c.safety.battery_stale_s - max(

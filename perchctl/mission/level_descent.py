@@ -9,7 +9,8 @@ setpoint. Then
 is a proportional rate controller. The gain k falls with the age of v, otherwise the vehicle would
 oscillate. With old telemetry and the target in view, v is the climb rate from pictures. A vehicle
 that does not sink gets less and less thrust until it sinks, the magnet lets go, or the floor is
-detected. Laterally, the vehicle leans against the wind and brakes (`_compute_braking_attitude`).
+detected. Laterally, the vehicle leans against the wind and brakes
+(`_compute_braking_roll_pitch_rad`).
 """
 
 from __future__ import annotations
@@ -36,13 +37,15 @@ NEAR_FLOOR_SINK_RATE_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
 MAX_NEAR_FLOOR_HEIGHT_M = 0.6
 """Height below which the vehicle sinks at `NEAR_FLOOR_SINK_RATE_SETPOINT_MPS`, m."""
-MAX_SINK_RATE_GAIN_S_PER_M = 0.5
-"""Largest gain, in shares of the hover thrust per m/s. Larger: the vehicle oscillates."""
-MIN_SINK_RATE_GAIN_S_PER_M = 0.2
-"""Smallest gain, with old telemetry, in shares of the hover thrust per m/s."""
+MAX_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M = 0.5
+"""Largest gain k from the error of the sink rate to the thrust, in shares of the hover thrust per
+m/s. Larger: the vehicle oscillates."""
+MIN_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M = 0.2
+"""Smallest gain k, with old telemetry, in shares of the hover thrust per m/s."""
 SINK_RATE_GAIN_TIMES_AGE_S2_PER_M = 0.06
-"""Product of gain and age of the vertical speed, between the smallest and the largest gain."""
-THRUST_TO_HOVER_RATIO_WITHOUT_CLIMB_RATE = 0.98
+"""Product of the gain k and the age of the vertical speed, between the smallest and the largest
+gain."""
+THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
 SINK_RATE_SETPOINT_BY_CAMERA_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
@@ -53,7 +56,7 @@ detections is half of it."""
 CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
 """Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
 like a motion. Smaller: it drifts further."""
-MOTION_SETTLING_AT_CONSTANT_SETPOINT_S = 0.6
+SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which no speed remains, s."""
 THRUST_RAMP_DOWN_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
@@ -105,7 +108,7 @@ TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration after which the vehicle has landed or hangs, s."""
 TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
 """The same margin without a measured vertical speed, s."""
-MAX_SETPOINT_DESCENT_S = 1.5
+MAX_DESCENT_BY_SETPOINTS_DURATION_S = 1.5
 """Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
 its own estimate, s."""
 MIN_MEAN_DESCENT_SINK_RATE_MPS = 0.35
@@ -114,7 +117,7 @@ MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M = 0.1
 """Distance of the vehicle below its contact from which the magnet has let go, m. Larger: a vehicle
 that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to
 have come off."""
-MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M = 0.2
+MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, at which the magnet
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
@@ -122,11 +125,11 @@ MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA = 0.75
 """Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
 in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
 Smaller: the motors run on the floor for longer."""
-MAX_THRUST_RAMP_STEP_S = 0.1
+MAX_THRUST_RAMP_INTEGRATION_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
 
-def _fresh_visual_motion(c: Context) -> VisualMotion | None:
+def _visual_motion_if_telemetry_old(c: Context) -> VisualMotion | None:
     """Return the motion from pictures if the telemetry is old and the pictures are newer; else
     None."""
     b, seen = c.belief, c.belief.visual_motion
@@ -134,7 +137,7 @@ def _fresh_visual_motion(c: Context) -> VisualMotion | None:
     return seen if old and seen.is_velocity_known and seen.t_s > b.telemetry.t_s else None
 
 
-def _is_target_redetected(c: Context) -> bool:
+def _is_target_redetected_without_velocity(c: Context) -> bool:
     """True if the telemetry is old and the target is detected again, but not yet for long enough to
     determine the motion."""
     b, seen = c.belief, c.belief.visual_motion
@@ -144,30 +147,37 @@ def _is_target_redetected(c: Context) -> bool:
 
 def _climb_measured_at_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
-    seen = _fresh_visual_motion(c)
+    seen = _visual_motion_if_telemetry_old(c)
     return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
 
 
-def _is_climb_unknown(c: Context) -> bool:
+def _is_climb_rate_unknown(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
     return _climb_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
 
 
-def _tick_duration_s(c: Context) -> float:
-    """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_STEP_S`."""
-    return max(0.0, min(MAX_THRUST_RAMP_STEP_S, c.t_s - c.state.t_s))
+def _limited_tick_duration_s(c: Context) -> float:
+    """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_INTEGRATION_STEP_S`."""
+    return max(0.0, min(MAX_THRUST_RAMP_INTEGRATION_STEP_S, c.t_s - c.state.t_s))
 
 
 def _climb_measurement_age_s(c: Context) -> float:
     """Return the age of the vertical speed, s: at least one tick."""
-    return max(1e-3, _tick_duration_s(c), c.t_s - _climb_measured_at_s(c))
+    return max(1e-3, _limited_tick_duration_s(c), c.t_s - _climb_measured_at_s(c))
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
     """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
-    setpoints are then better, for at most `MAX_SETPOINT_DESCENT_S`."""
-    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover_thrust_estimate.is_imprecise
-    return _is_climb_unknown(c) and begins_rough and c.time_in_phase_s < MAX_SETPOINT_DESCENT_S
+    setpoints are then better, for at most `MAX_DESCENT_BY_SETPOINTS_DURATION_S`."""
+    begins_rough = (
+        c.state.descent.last_commanded_raw_thrust == 0.0
+        and c.belief.hover_thrust_estimate.is_imprecise
+    )
+    return (
+        _is_climb_rate_unknown(c)
+        and begins_rough
+        and c.time_in_phase_s < MAX_DESCENT_BY_SETPOINTS_DURATION_S
+    )
 
 
 def descend_level(c: Context) -> Action:
@@ -175,7 +185,7 @@ def descend_level(c: Context) -> Action:
     tilt brakes the lateral speed and balances the wind."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
-        _tick_duration_s(c),
+        _limited_tick_duration_s(c),
         _climb_measurement_age_s(c),
         _climb_measured_at_s(c),
     )
@@ -185,7 +195,7 @@ def descend_level(c: Context) -> Action:
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_PER_S,
     )
-    if _fresh_visual_motion(c) is not None:  # a vehicle on the floor ignores commands
+    if _visual_motion_if_telemetry_old(c) is not None:  # a vehicle on the floor ignores commands
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
             THRUST_RAMP_DOWN_BY_CAMERA_PER_S,
@@ -193,9 +203,9 @@ def descend_level(c: Context) -> Action:
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoning_since_s is None else b.dead_reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
-    thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
+    thrust = _compute_sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S:
-        thrust *= THRUST_TO_HOVER_RATIO_WITHOUT_CLIMB_RATE
+        thrust *= THRUST_FACTOR_WITHOUT_CLIMB_RATE
     floor_detected_at_s = _find_floor_detection_time_s(
         c, hover_thrust, height_m, is_sinking=is_sinking
     )
@@ -212,10 +222,10 @@ def descend_level(c: Context) -> Action:
     overdue = _is_touchdown_overdue(c) and not (
         b.is_imu_fresh and tel.acc_z_g < MAX_SPECIFIC_FORCE_IF_AIRBORNE_G
     )
-    before = descent.thrust or hover_thrust
+    before = descent.last_commanded_raw_thrust or hover_thrust
     if touched_s < TOUCHDOWN_THRUST_DURATION_S:
         thrust = TOUCHDOWN_TO_HOVER_THRUST_RATIO * hover_thrust
-    elif _is_target_redetected(c):
+    elif _is_target_redetected_without_velocity(c):
         thrust = before
     elif floor_detected_at_s is not None or carried or not is_sinking or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
@@ -233,7 +243,7 @@ def descend_level(c: Context) -> Action:
         state,
         descent=replace(
             descent,
-            thrust=thrust,
+            last_commanded_raw_thrust=thrust,
             floor_detected_at_s=floor_detected_at_s,
             climb_change_not_yet_measured_mps=climb_change_not_yet_measured_mps,
             climb_measured_at_s=measured_s,
@@ -243,7 +253,7 @@ def descend_level(c: Context) -> Action:
         catch_setpoint_above_vehicle_m=None,
     )
     roll_rad, pitch_rad = (
-        (0.0, 0.0) if floor_detected_at_s is not None else _compute_braking_attitude(c)
+        (0.0, 0.0) if floor_detected_at_s is not None else _compute_braking_roll_pitch_rad(c)
     )
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
@@ -251,10 +261,10 @@ def descend_level(c: Context) -> Action:
 def _last_measured_climb_mps(c: Context) -> float:
     """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
     the vehicle in place since the last telemetry."""
-    seen = _fresh_visual_motion(c)
+    seen = _visual_motion_if_telemetry_old(c)
     if seen is not None:
-        return seen.vehicle_velocity_mps[2]
-    held = c.telemetry.t_s < c.state.entry.t_s - MOTION_SETTLING_AT_CONSTANT_SETPOINT_S
+        return seen.vehicle_velocity_level_mps[2]
+    held = c.telemetry.t_s < c.state.entry.t_s - SETTLING_DURATION_AT_CONSTANT_SETPOINT_S
     return 0.0 if held else c.belief.climb_mps
 
 
@@ -267,34 +277,43 @@ def _find_floor_detection_time_s(
     motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed shows a
     descent.
     """
-    descent, b, seen = c.state.descent, c.belief, _fresh_visual_motion(c)
+    descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:
         return descent.floor_detected_at_s
     struck = (
-        c.t_s - b.imu.last_impact_at_s < TOUCHDOWN_THRUST_DURATION_S
+        c.t_s - b.imu.last_impact_or_bounce_at_s < TOUCHDOWN_THRUST_DURATION_S
         and b.dead_reckoning.climb_before_impact_mps < 0.0
     )
-    weak = 0.0 < descent.thrust < MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA * hover_thrust
+    weak = (
+        0.0
+        < descent.last_commanded_raw_thrust
+        < MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA * hover_thrust
+    )
     stands = (
         seen is not None
-        and seen.gear_to_target_vector_m[2] > MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M
+        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M
         and weak
         and not is_sinking
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
 
-def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
+def _compute_sink_rate_thrust(
+    c: Context, hover_thrust: float, climb_mps: float, height_m: float
+) -> float:
     """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
     is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
     low = height_m <= MAX_NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_RATE_SETPOINT_MPS if low else SINK_RATE_SETPOINT_MPS
-    if _fresh_visual_motion(c) is not None:
+    if _visual_motion_if_telemetry_old(c) is not None:
         sink_mps = SINK_RATE_SETPOINT_BY_CAMERA_MPS
     gain = SINK_RATE_GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
-    gain = max(MIN_SINK_RATE_GAIN_S_PER_M, min(MAX_SINK_RATE_GAIN_S_PER_M, gain))
+    gain = max(
+        MIN_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M,
+        min(MAX_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M, gain),
+    )
     tilt = max(MIN_TILT_COSINE_TO_COMPENSATE_THRUST, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
@@ -302,7 +321,7 @@ def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_
 def _forget_contact_after_fall(c: Context) -> PlannerState:
     """Return the state without its recorded contact if a position or pictures show the vehicle
     clearly below it, or the accelerometer a fall; otherwise unchanged."""
-    state, b, seen = c.state, c.belief, _fresh_visual_motion(c)
+    state, b, seen = c.state, c.belief, _visual_motion_if_telemetry_old(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
         return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M)
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
@@ -311,9 +330,9 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
     )
     seen_below = (
         seen is not None
-        and seen.gear_to_target_vector_m[2] > MIN_CAMERA_DISTANCE_BELOW_TARGET_WHEN_RELEASED_M
+        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M
     )
-    if fell or (b.is_in_magnet_reach and seen_below):
+    if fell or (b.is_possibly_in_magnet_reach and seen_below):
         belief = replace(
             b,
             vehicle_world_z_at_last_contact_m=None,
@@ -338,11 +357,11 @@ def _is_touchdown_overdue(c: Context) -> bool:
         TOUCHDOWN_OVERDUE_MARGIN_S if measured else TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
     )
     if not measured and b.hover_thrust_estimate.is_imprecise:
-        spare_s += MAX_SETPOINT_DESCENT_S
+        spare_s += MAX_DESCENT_BY_SETPOINTS_DURATION_S
     return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_DESCENT_SINK_RATE_MPS
 
 
-def _compute_braking_attitude(c: Context) -> tuple[float, float]:
+def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     """Return roll and pitch that balance the wind and brake the lateral speed; level without a
     heading.
 
@@ -358,7 +377,7 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     brakes it.
     """
     b = c.belief
-    if b.is_heading_lost or b.is_in_magnet_reach:
+    if b.is_heading_lost or b.is_possibly_in_magnet_reach:
         return 0.0, 0.0
     dead_reckoning, yaw_rad = b.dead_reckoning, c.telemetry.yaw_rad
     x_mps, y_mps, _ = dead_reckoning.velocity_mps
@@ -377,13 +396,13 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _world_to_heading_xy(part * x_mps, part * y_mps, yaw_rad)
-    seen, gain = _fresh_visual_motion(c), BRAKE_GAIN_RAD_PER_MPS
+    seen, gain = _visual_motion_if_telemetry_old(c), BRAKE_GAIN_RAD_PER_MPS
     if seen is not None and b.does_camera_motion_match_vehicle:
         ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
         if c.t_s - seen.t_s <= MAX_CAMERA_VELOCITY_AGE_S:
-            ahead_mps, left_mps, _ = seen.vehicle_velocity_mps
+            ahead_mps, left_mps, _ = seen.vehicle_velocity_level_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
-        dead_reckoning.acceleration_bias_mps2,
+        dead_reckoning.acceleration_bias_world_mps2,
         dead_reckoning.mean_specific_force_world_xy_mps2,
     )
     known = (
@@ -399,8 +418,12 @@ def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     )
     roll_rad, pitch_rad = c.obs.imu.roll_pitch_error_rad
     return (
-        _brake_tilt_rad(-left_mps, gain) - _wind_compensation_tilt_rad(left_mps2) + roll_rad,
-        _brake_tilt_rad(ahead_mps, gain) + _wind_compensation_tilt_rad(ahead_mps2) + pitch_rad,
+        _compute_braking_tilt_rad(-left_mps, gain)
+        - _wind_compensation_tilt_rad(left_mps2)
+        + roll_rad,
+        _compute_braking_tilt_rad(ahead_mps, gain)
+        + _wind_compensation_tilt_rad(ahead_mps2)
+        + pitch_rad,
     )
 
 
@@ -419,7 +442,7 @@ def _wind_compensation_tilt_rad(acceleration_against_wind_mps2: float) -> float:
     )
 
 
-def _brake_tilt_rad(lateral_speed_mps: float, brake_gain_rad_per_mps: float) -> float:
+def _compute_braking_tilt_rad(lateral_velocity_mps: float, brake_gain_rad_per_mps: float) -> float:
     return max(
-        -MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -brake_gain_rad_per_mps * lateral_speed_mps)
+        -MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -brake_gain_rad_per_mps * lateral_velocity_mps)
     )

@@ -25,8 +25,8 @@ class VisualInertialMotion:
     """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are world x and y."""
 
     t_s: float
-    lateral_velocity_mps: tuple[float, float]
-    acceleration_bias_mps2: tuple[float, float]  # bias of accelerometer and attitude
+    velocity_world_xy_mps: tuple[float, float]
+    acceleration_bias_world_xy_mps2: tuple[float, float]  # bias of accelerometer and attitude
     climb_mps: float | None  # climb rate; None if the latency it assumes may no longer apply
 
 
@@ -57,8 +57,9 @@ class Observation:
     camera_latency_sigma_s: float = 0.0
     #: why the last target in view belongs to another vehicle
     target_refusal_reason: str | None = None
-    position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
-    position_problem: str | None = None  #: why no external position is sent; None while they are
+    external_position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
+    #: why no external position is sent; None while they are
+    external_position_problem: str | None = None
     #: distance from the estimate to the newest sighting; 0 if it was accepted
     rejected_sighting_to_estimate_m: float = 0.0
     imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`

@@ -30,10 +30,10 @@ def observe(
     known = state.belief.last_telemetry is not None
     belief = update_belief(state.belief, obs, state.command_history(maneuver), profile)
     state = replace(state, belief=belief)
-    return _apply_frame_shift(state) if obs.has_estimated_position_jumped and known else state
+    return _apply_world_frame_shift(state) if obs.has_estimated_position_jumped and known else state
 
 
-def _apply_frame_shift(state: PlannerState) -> PlannerState:
+def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
     trajectory in the old frame, so the vehicle is caught and the landing is commanded again."""
     b, obstacle_blocked_at_z_m = state.belief, state.obstacle_blocked_at_z_m

@@ -151,8 +151,8 @@ class VehicleDiagnosis(Flag):
 
 
 class OperatorRequest(IntEnum):
-    """The operator's command, which never decreases: `LAND`, then `STOP`, which cuts the motors."""
+    """The operator's command, which never decreases: `LAND`, then `CUT_MOTORS`."""
 
     NONE = 0
     LAND = 1
-    STOP = 2
+    CUT_MOTORS = 2

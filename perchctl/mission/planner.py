@@ -15,7 +15,7 @@ from __future__ import annotations
 from perchctl.mission.belief.contact import is_pressing
 from perchctl.mission.belief.evidence import update_condition_start_times
 from perchctl.mission.belief.quality import hold_reason
-from perchctl.mission.belief.update import reset_conditions
+from perchctl.mission.belief.update import reset_phase_dependent_conditions
 from perchctl.mission.context import Context
 from perchctl.mission.descent import record_command
 from perchctl.mission.endurance import compute_battery_outlook
@@ -105,7 +105,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
     presses_against_target = state.phase is Phase.PERCH or is_pressing(c.belief)
     new = replace(
         state,
-        belief=reset_conditions(c.belief),
+        belief=reset_phase_dependent_conditions(c.belief),
         phase=row.to,
         entry=PhaseEntry(
             t_s=c.t_s,
@@ -114,7 +114,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             row_name=row.name,
             reason=row.reason_text(c),
             diagnosis=row.diagnosis,
-            stop_command=row.stop,
+            stop_command=row.stop_command,
         ),
         severity=state.severity.escalate(row.severity),
         outcome=row.outcome_after(state.outcome),

@@ -107,10 +107,10 @@ class SentCommand:
 
 
 @dataclass(frozen=True)
-class ExternalPositions:
+class ExternalPositionStatus:
     """The external positions sent to the vehicle: number, rate, and the newest one with its age."""
 
-    age_s: float  # age of the newest position
+    newest_position_age_s: float  # age of the newest position
     problem: str | None  # why none is sent now
     sent_count: int
     rate_hz: float
@@ -152,7 +152,7 @@ class UnfilteredPose:
     `e_yaw_rad`."""
 
     t_s: float
-    gear_to_target_m: Array
+    gear_to_target_level_m: Array
     vehicle_to_target_yaw_rad: float
 
 
@@ -185,10 +185,10 @@ class TickRecord:
     row_name: str = ""
     is_holding_position: bool = False
     failed_attempts: int = 0
-    external_positions: ExternalPositions | None = None
+    external_positions: ExternalPositionStatus | None = None
     outcome: Outcome | None = None
     reason: str | None = None  # None in logs before version 4, which also lack the outcome
-    error: str | None = None  # name of the planner's exception
+    planner_exception_name: str | None = None  # name of the planner's exception
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -248,7 +248,7 @@ class Tick:
         return self.observation.camera_latency_above_profile_s
 
     @property
-    def external_positions(self) -> ExternalPositions | None:
+    def external_positions(self) -> ExternalPositionStatus | None:
         """The external positions; None with decks."""
         return self.record.external_positions
 

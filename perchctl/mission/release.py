@@ -47,7 +47,7 @@ STOP_COMMAND_COUNT = 5
 """Number of stop commands: a single lost notify message would lock a hanging vehicle."""
 STOP_COMMAND_PERIOD_S = 0.1
 """Time between stop commands, s."""
-LATE_STOP_COMMAND_PERIOD_S = 0.5
+STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 """Time after which one more stop command is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
@@ -99,7 +99,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     return state, limit_setpoint(c, setpoint)
 
 
-def lower_thrust(c: Context) -> Action:
+def reduce_press_before_release(c: Context) -> Action:
     """Perform the first stage of the release, which transfers the weight from the rotors to the
     magnet.
 
@@ -197,7 +197,9 @@ def stop_motors(c: Context) -> Action:
     still_to_send = (
         state.stop_or_land_command_count < STOP_COMMAND_COUNT and waited_s >= STOP_COMMAND_PERIOD_S
     )
-    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= LATE_STOP_COMMAND_PERIOD_S):
+    if still_to_send or (
+        c.telemetry.thrust >= 1 and waited_s >= STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S
+    ):
         return replace(
             state,
             last_stop_or_land_command_at_s=now_s,
@@ -206,10 +208,10 @@ def stop_motors(c: Context) -> Action:
     return state, Idle()
 
 
-def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, thrust: float) -> float:
+def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, reported_thrust: float) -> float:
     """Return the distance, m, at which a setpoint above a falling vehicle catches it, given its
-    present `thrust`."""
-    turning = thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
+    present `reported_thrust`."""
+    turning = reported_thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
     return (
         CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M
         if turning
@@ -227,7 +229,11 @@ def catch_falling_vehicle(c: Context) -> Action | None:
     if begun or (
         b.climb_mps < MIN_CLIMB_RATE_TO_END_CATCH_MPS and c.time_in_phase_s < MAX_CATCH_DURATION_S
     ):
-        x, y = _braking_setpoint_m(c) if b.has_uncorrected_gust else state.entry.position_m[:2]
+        x, y = (
+            _braking_setpoint_world_xy_m(c)
+            if b.has_uncorrected_gust
+            else state.entry.position_m[:2]
+        )
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_setpoint_above_vehicle_m, state.entry.yaw_rad
         )
@@ -235,7 +241,7 @@ def catch_falling_vehicle(c: Context) -> Action | None:
     return None
 
 
-def _braking_setpoint_m(c: Context) -> tuple[float, float]:
+def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
     """Return x and y of a setpoint that brakes a lateral velocity that the state estimate has not
     measured."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
@@ -261,5 +267,8 @@ def forget_contact_when_below(
     ):
         return state
     return replace(
-        state, belief=replace(b, vehicle_world_z_at_last_contact_m=None, last_contact_offset=None)
+        state,
+        belief=replace(
+            b, vehicle_world_z_at_last_contact_m=None, gear_to_target_at_last_contact=None
+        ),
     )

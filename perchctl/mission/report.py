@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.mission.belief.belief import ContactOffset
-from perchctl.mission.belief.contact import MOTORS_STOPPED, current_gear_offset
+from perchctl.mission.belief.belief import GearToTargetDistance
+from perchctl.mission.belief.contact import MOTORS_OFF_AS_COMMANDED, current_gear_to_target
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
@@ -171,7 +171,7 @@ class FlightReport:
     is_locked_by_supervisor: bool
     history: tuple[Event, ...] = ()  # events of the phases, from the start of the flight
     findings: CameraFindings | None = None  # latency and mounting, if the flight was long enough
-    last_contact_offset: ContactOffset | None = None  # offset of a vehicle that hangs
+    gear_to_target_at_last_contact: GearToTargetDistance | None = None  # None unless it hangs
     touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
     hover: HoverReport | None = None  # the newest hover of a mission that hovers
     # one sentence for each watcher detached after an exception
@@ -197,9 +197,9 @@ class FlightReport:
     ) -> FlightReport:
         """Return the report of a completed mission from its last tick."""
         b = state.belief.with_observation(obs, profile)
-        hangs, contact = state.phase is Phase.PERCHED, b.last_contact_offset
+        hangs, contact = state.phase is Phase.PERCHED, b.gear_to_target_at_last_contact
         if hangs and contact is None:  # the magnet caught the vehicle during the descent
-            contact = current_gear_offset(b)
+            contact = current_gear_to_target(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,
@@ -221,7 +221,7 @@ class FlightReport:
             else CameraFindings.from_camera_errors(
                 camera_errors, profile.camera, simulated=simulated
             ),
-            last_contact_offset=contact if placed else None,
+            gear_to_target_at_last_contact=contact if placed else None,
             touchdown=find_touchdown(Context(replace(state, belief=b))),
             hover=HoverReport.from_state(state, profile),
         )
@@ -248,7 +248,7 @@ def report_rest(
     """Return the rest state; None until telemetry has shown the motors off for
     `min_motors_off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
-    if c.true_for_s(MOTORS_STOPPED) < min_motors_off_s:
+    if c.true_for_s(MOTORS_OFF_AS_COMMANDED) < min_motors_off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
@@ -268,7 +268,7 @@ def find_touchdown(c: Context) -> Touchdown | None:
         or min(tel.t_s, imu.motors_off_since_s) - impact.t_s > MAX_TOUCHDOWN_TO_MOTOR_STOP_S
     ):
         return None
-    higher = impact.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M
+    higher = impact.world_z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M
     if b.is_position_valid and b.dead_reckoning_since_s is None and higher:
         return None
     reckoned = b.dead_reckoning_since_s is not None or b.is_position_diverged
@@ -277,7 +277,7 @@ def find_touchdown(c: Context) -> Touchdown | None:
         if reckoned
         else impact.estimated_climb_before_impact_mps
     )
-    return Touchdown(max(0.0, speed_mps), impact.peak_g)
+    return Touchdown(max(0.0, speed_mps), impact.peak_acc_z_g)
 
 
 def _end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:

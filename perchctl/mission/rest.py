@@ -41,7 +41,7 @@ def find_rest_state(c: Context) -> RestState:
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
         return RestState.HELD
-    if b.is_positioned_by_target or not b.is_position_valid:
+    if b.is_target_position_source or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _find_rest_state_from_falls(c)
@@ -67,11 +67,11 @@ def _is_held_by_other_object(c: Context) -> bool:
         return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
         contact_height_tolerance_m(b) < b.target.gear_to_target_z_m <= MIN_TARGET_FAR_ABOVE_GEAR_M
-        and b.last_contact_offset is None
+        and b.gear_to_target_at_last_contact is None
     )
     by_position = (
         b.is_position_valid
-        and not b.is_positioned_by_target
+        and not b.is_target_position_source
         and b.first_estimate_jump_at_s is None
         and b.height_m > MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
     )
@@ -105,7 +105,7 @@ def is_still_hanging(c: Context) -> bool:
     """True if a position shows the vehicle at its contact, or the accelerometer shows no fall."""
     b, tel = c.belief, c.telemetry
     if (
-        not b.is_positioned_by_target
+        not b.is_target_position_source
         and b.is_position_valid
         and b.vehicle_world_z_at_last_contact_m is not None
     ):

@@ -17,7 +17,7 @@ from perchctl.mission.belief.contact import (
     THRUST_SATURATED_WITHOUT_CLIMB,
     Support,
     contact_height_tolerance_m,
-    gear_offset_at_last_touch_or_now,
+    gear_to_target_at_last_touch_or_now,
     max_press_thrust,
 )
 from perchctl.mission.belief.motion import MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
@@ -50,7 +50,7 @@ from perchctl.mission.transition import (
     back_off_row,
     land_row,
     motor_cut_row,
-    supervisor_row,
+    supervisor_abort_row,
 )
 from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
@@ -63,15 +63,15 @@ MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
 it over."""
 MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
-MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M = 0.22
+MAX_DISTANCE_FROM_SETPOINT_AT_LOW_HEIGHT_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
 `MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
-MAX_SETPOINT_DEVIATION_IN_LANDING_M = 0.4
+MAX_DISTANCE_FROM_SETPOINT_IN_LANDING_M = 0.4
 """The same distance during a landing, m."""
-MAX_SETPOINT_DEVIATION_M = 0.8
+MAX_DISTANCE_FROM_SETPOINT_M = 0.8
 """The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
 reaches the walls."""
-SETPOINT_DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
+DISTANCE_FROM_SETPOINT_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the limit on the lateral distance from the setpoint with the target as the position
 source, in m per second of the camera latency's standard deviation: pictures that are 0.1 s later
 than assumed cause up to 0.2 m. Larger: a rotated camera leads the vehicle further away."""
@@ -114,7 +114,7 @@ def is_position_control_diverging(c: Context) -> bool:
         return False
     if c.true_for_s(
         ESTIMATE_CONTRADICTS_IMU
-    ) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S or _is_oscillating(c):
+    ) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S or _is_oscillating_vertically(c):
         return True
     if setpoint is None:
         return False
@@ -123,14 +123,17 @@ def is_position_control_diverging(c: Context) -> bool:
             b.vehicle_world_z_at_last_contact_m is not None
             or c.state.motor_stop_commanded_at_s is not None
         )
-        return not touched and _setpoint_deviation_m(c) > MAX_SETPOINT_DEVIATION_IN_LANDING_M
+        return (
+            not touched
+            and _lateral_distance_from_setpoint_m(c) > MAX_DISTANCE_FROM_SETPOINT_IN_LANDING_M
+        )
     spare_m = (
-        SETPOINT_DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
-        if b.is_positioned_by_target
+        DISTANCE_FROM_SETPOINT_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        if b.is_target_position_source
         else 0.0
     )
     if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
-        return _setpoint_deviation_m(c) > MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M + spare_m
+        return _lateral_distance_from_setpoint_m(c) > MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M + spare_m
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
@@ -141,12 +144,14 @@ def is_position_control_diverging(c: Context) -> bool:
         b.imu.t_s - b.imu.last_lateral_push_at_s <= MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
     )  # by moving air
     stays = b.height_m < MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M or (only_climbs and not is_pushed)
-    return _setpoint_deviation_m(c) > (
-        MAX_SETPOINT_DEVIATION_AT_LOW_HEIGHT_M + spare_m if stays else MAX_SETPOINT_DEVIATION_M
+    return _lateral_distance_from_setpoint_m(c) > (
+        MAX_DISTANCE_FROM_SETPOINT_AT_LOW_HEIGHT_M + spare_m
+        if stays
+        else MAX_DISTANCE_FROM_SETPOINT_M
     )
 
 
-def _is_oscillating(c: Context) -> bool:
+def _is_oscillating_vertically(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
     most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS
@@ -157,7 +162,7 @@ def _is_oscillating(c: Context) -> bool:
     )
 
 
-def _setpoint_deviation_m(c: Context) -> float:
+def _lateral_distance_from_setpoint_m(c: Context) -> float:
     (x_m, y_m, _), setpoint = c.telemetry.position_m, c.state.setpoint
     return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
 
@@ -166,7 +171,7 @@ def divergence_reason(c: Context) -> str:
     """Return a text that says which evidence shows that the positions are wrong, and the possible
     causes."""
     b = c.belief
-    if _is_oscillating(c):
+    if _is_oscillating_vertically(c):
         return (
             f"vertical oscillation, {'climbing' if b.climb_mps > 0 else 'sinking'} at "
             f"{abs(b.climb_mps):.1f} m/s: motion-capture positions may be delayed"
@@ -175,12 +180,12 @@ def divergence_reason(c: Context) -> str:
         "the motion capture may have swapped axes, delayed positions or a rotated rigid body; run "
         "perchctl check --lift"
     )
-    if b.is_positioned_by_target:
+    if b.is_target_position_source:
         cause = (
             "the camera's rotation in camera.mount may be wrong; measure it with "
             "`perchctl calibrate mount`"
         )
-    found = f"the vehicle drifted {_setpoint_deviation_m(c):.2f} m from its setpoint"
+    found = f"the vehicle drifted {_lateral_distance_from_setpoint_m(c):.2f} m from its setpoint"
     if c.true_for_s(ESTIMATE_CONTRADICTS_IMU) >= ESTIMATE_CONTRADICTS_IMU_DWELL_S:
         found = "the estimated velocity contradicts the accelerometer"
     return f"{found} at a height of {b.height_m:.2f} m: {cause}"
@@ -191,16 +196,16 @@ def is_position_lost(c: Context) -> bool:
     useless: after an impact or gust that no sighting has corrected, because of its variance, or
     because sightings contradict it."""
     b = c.belief
-    if b.position_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
+    if b.position_correction_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
         return True
     if (
-        b.position_age_s > MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S
+        b.position_correction_age_s > MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S
         and c.obs.rejected_sighting_to_estimate_m
         > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M
     ):
         return True
     unsure = b.worst_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
-    return b.is_positioned_by_target and b.is_position_stale and unsure
+    return b.is_target_position_source and b.is_position_stale and unsure
 
 
 def is_outside_fence(c: Context) -> bool:
@@ -335,7 +340,7 @@ def has_time_for_all_attempts_run_out(c: Context) -> bool:
 SAFETY_ROWS: tuple[Transition, ...] = (
     motor_cut_row(
         "operator-stop",
-        lambda c: c.obs.operator_request >= OperatorRequest.STOP,
+        lambda c: c.obs.operator_request >= OperatorRequest.CUT_MOTORS,
         "the operator cut the motors",
         Outcome.EMERGENCY,
     ),
@@ -347,11 +352,11 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=_outcome_after_supervisor_lock,
     ),
-    supervisor_row(
+    supervisor_abort_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
     ),
-    supervisor_row("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
-    supervisor_row(
+    supervisor_abort_row("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
+    supervisor_abort_row(
         "crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"
     ),
     motor_cut_row(
@@ -505,7 +510,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S,
         lambda c: (
             f"the vehicle hangs at the target's height, "
-            f"{gear_offset_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
+            f"{gear_to_target_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
         ),
         diagnosis=VehicleDiagnosis.HANGING_AT_LAST_TOUCH,
     ),

@@ -91,13 +91,13 @@ def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float
     return float(target[0] - gear[0]), float(target[1] - gear[1])
 
 
-def make_setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
-    """Return the setpoint that brings the gear below the target: the body at height `z_m`, with the
-    target's heading."""
+def make_setpoint_under_target(c: Context, vehicle_world_z_m: float) -> PositionSetpoint:
+    """Return the setpoint that brings the gear below the target: the body at height
+    `vehicle_world_z_m`, with the target's heading."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
     x, y = body_world_xy_under_target(c, yaw)
-    return PositionSetpoint(x, y, z_m, yaw)
+    return PositionSetpoint(x, y, vehicle_world_z_m, yaw)
 
 
 def step_towards(
@@ -107,18 +107,18 @@ def step_towards(
     *,
     max_up_mps: float = 0.0,
     max_down_mps: float = 0.4,
-    is_slow_until_mounting_confirmed: bool = False,
+    limits_speed_until_mounting_confirmed: bool = False,
     changes_heading: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint of the next tick: `old`, moved towards `goal` with a speed of at most
-    `max_up_mps` upwards and `max_down_mps` downwards. `is_slow_until_mounting_confirmed` limits the
-    lateral speed while the camera's mounting is unconfirmed. If `changes_heading` is False, the
-    heading stays."""
+    `max_up_mps` upwards and `max_down_mps` downwards. `limits_speed_until_mounting_confirmed`
+    limits the lateral speed while the camera's mounting is unconfirmed. If `changes_heading` is
+    False, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
         yaw_radps = 0.0
-    if is_slow_until_mounting_confirmed and c.belief.mounting.is_target_motion_undetermined:
+    if limits_speed_until_mounting_confirmed and c.belief.mounting.is_target_motion_undetermined:
         xy_mps = (
             min(xy_mps, MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS)
             if c.belief.target.is_fresh
@@ -144,14 +144,18 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
     )
 
 
-def fly_under_target(c: Context, z_m: float, *, max_up_mps: float = 0.0) -> Action:
-    """Move under the target at height `z_m`, and learn the integral that keeps the gear there."""
-    goal = make_setpoint_under_target(c, z_m)
+def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float = 0.0) -> Action:
+    """Move under the target at height `vehicle_world_z_m`, and learn the integral that keeps the
+    gear there."""
+    goal = make_setpoint_under_target(c, vehicle_world_z_m)
     lateral_integral_m = update_lateral_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = Context(replace(c.state, lateral_integral_m=lateral_integral_m))
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(
-        c, step_towards(c, old, goal, max_up_mps=max_up_mps, is_slow_until_mounting_confirmed=True)
+        c,
+        step_towards(
+            c, old, goal, max_up_mps=max_up_mps, limits_speed_until_mounting_confirmed=True
+        ),
     )
 
 
@@ -265,25 +269,25 @@ def _lateral_error_and_velocity(
     (x, y) in world axes. They come from pictures and lean while recent pictures show the target,
     otherwise from the state estimate. During take-off and landing, which do not follow the target,
     they always come from the state estimate."""
-    offset, tel, maneuver = c.belief.lateral_offset, c.telemetry, c.belief.command_history.maneuver
+    lateral, tel, maneuver = c.belief.lateral_state, c.telemetry, c.belief.command_history.maneuver
     follows_target = maneuver.is_camera_guided or maneuver.presses_against_target
-    if offset is None or not follows_target or c.belief.target.world_position_m is None:
+    if lateral is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
     # The reference may still be on its way to the target. The offset is that of the gear as the
     # vehicle heads now, and the reference's heading may differ.
     x_m, y_m = body_world_xy_under_target(c, tel.yaw_rad)
     return (
-        reference.x_m - x_m + offset.offset_m[0],
-        reference.y_m - y_m + offset.offset_m[1],
-    ), offset.velocity_mps
+        reference.x_m - x_m + lateral.gear_to_target_world_xy_m[0],
+        reference.y_m - y_m + lateral.gear_to_target_world_xy_m[1],
+    ), lateral.vehicle_velocity_world_xy_mps
 
 
 def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the held setpoint one tick later. If the target is the position source and out of
     view, the setpoint sinks slowly to bring the target back into view."""
     b = c.belief
-    if not (b.is_positioned_by_target and b.is_position_stale) or b.takeoff_position_m is None:
+    if not (b.is_target_position_source and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HELD_SETPOINT_HEIGHT_M)
     z_m = setpoint.z_m - HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS * max(

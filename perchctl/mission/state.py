@@ -30,7 +30,7 @@ class BatteryOutlook:
 class LevelDescentState:
     """State of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
-    thrust: float = 0.0  # last commanded thrust
+    last_commanded_raw_thrust: float = 0.0
     climb_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
     # climb rate that recent commands cause and no sample shows yet
     climb_change_not_yet_measured_mps: float = 0.0
@@ -50,7 +50,7 @@ class HoverErrors:
     hover_began_at_s: float = 0.0  # start of the hover
     newest_frame_at_s: float = 0.0  # time of the newest of these frames
     frame_count: int = 0
-    squared_error_sums: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    squared_error_sums_xyz_yaw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Sums of the squares of x, y, z and yaw."""
 
     def with_error(
@@ -61,7 +61,9 @@ class HoverErrors:
     ) -> HoverErrors:
         """Return the errors with those of one more frame at `t_s`."""
         errors = (*gear_to_hover_position_m, vehicle_to_target_yaw_rad)
-        x2, y2, z2, yaw2 = (s + e * e for s, e in zip(self.squared_error_sums, errors, strict=True))
+        x2, y2, z2, yaw2 = (
+            s + e * e for s, e in zip(self.squared_error_sums_xyz_yaw, errors, strict=True)
+        )
         return HoverErrors(self.hover_began_at_s, t_s, self.frame_count + 1, (x2, y2, z2, yaw2))
 
     @property
@@ -74,7 +76,9 @@ class HoverErrors:
         """Root mean squares of the errors in x, y, z, m, and heading, rad; NaN without a frame."""
         if not self.frame_count:
             return math.nan, math.nan, math.nan, math.nan
-        x, y, z, yaw = (math.sqrt(each / self.frame_count) for each in self.squared_error_sums)
+        x, y, z, yaw = (
+            math.sqrt(each / self.frame_count) for each in self.squared_error_sums_xyz_yaw
+        )
         return x, y, z, yaw
 
 

@@ -82,7 +82,7 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
 # --- Your own rows ---
 
 
-ALLOWED_TRANSITIONS = frozenset(
+TRANSITIONS_ALLOWED_FOR_OWN_ROWS = frozenset(
     (phase, row.to, row.severity)
     for row in TABLE
     for phase in row.phases & PRE_CONTACT_PHASES - {row.to}
@@ -100,9 +100,9 @@ def add_rows(
     exits of the phases.
 
     A row of your own may wait in ALIGN, or lead to an earlier phase, to RECOVER or to LANDING
-    (`ALLOWED_TRANSITIONS`); in COMPLETE and LANDING, none applies. Raises InvalidValue for a row
-    that is not allowed, is not a valid `Transition`, or has a name that is taken. If a function of
-    a row raises in flight, InvalidValue names the row, and the vehicle lands.
+    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`); in COMPLETE and LANDING, none applies. Raises InvalidValue
+    for a row that is not allowed, is not a valid `Transition`, or has a name that is taken. If a
+    function of a row raises in flight, InvalidValue names the row, and the vehicle lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):
@@ -111,15 +111,17 @@ def add_rows(
             raise InvalidValue(f"row {row.name!r}: another row has that name; rename it")
         names.add(row.name)
         for phase in row.phases:
-            if (phase, row.to, row.severity) not in ALLOWED_TRANSITIONS:
+            if (phase, row.to, row.severity) not in TRANSITIONS_ALLOWED_FOR_OWN_ROWS:
                 may = sorted(
-                    f"{to.name} ({how.name})" for at, to, how in ALLOWED_TRANSITIONS if at is phase
+                    f"{to.name} ({how.name})"
+                    for at, to, how in TRANSITIONS_ALLOWED_FOR_OWN_ROWS
+                    if at is phase
                 )
                 raise InvalidValue(
                     f"row {row.name!r} leads from {phase.name} to {row.to.name} "
                     f"({row.severity.name}); allowed from {phase.name}: {', '.join(may) or 'none'}"
                 )
-        if row.stop is not None or row.outcome is not None or row.diagnosis:
+        if row.stop_command is not None or row.outcome is not None or row.diagnosis:
             raise InvalidValue(f"row {row.name!r} must not set stop, outcome or diagnosis")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = (
@@ -164,20 +166,20 @@ def _wrap_row_function(
     return call
 
 
-def load_table(name: str | None) -> tuple[Transition, ...]:
+def load_table(extension_name: str | None) -> tuple[Transition, ...]:
     """Return the table of one flight: the built-in one, with your own rows if the profile's
     `planner.rows` names them.
 
-    `name` is ``module:attribute`` of the rows, or of a function that returns them; None for the
-    built-in table. Raises NotFound if there is no such attribute, and InvalidValue as `add_rows`
-    does.
+    `extension_name` is ``module:attribute`` of the rows, or of a function that returns them; None
+    for the built-in table. Raises NotFound if there is no such attribute, and InvalidValue as
+    `add_rows` does.
     """
-    if name is None:
+    if extension_name is None:
         return TABLE
-    own = load_extension(name, "planner.rows")
+    own = load_extension(extension_name, "planner.rows")
     try:
         # The profile in a log may name any object.
         own = own() if isfunction(own) else own
     except Exception as error:
-        raise InvalidValue(f"planner.rows: {name} raised {error_at(error)}") from error
+        raise InvalidValue(f"planner.rows: {extension_name} raised {error_at(error)}") from error
     return add_rows(own)

@@ -20,8 +20,8 @@ class Transition:
 
     `when` is called with a `Context`. `reason`, a text or a function of the context, is shown to
     the user. `outcome`, a value or a function of the previous outcome, is the reason why the flight
-    ends. `stop` is the command that a transition into ABORTED sends at once. `diagnosis` is what
-    the row asserts about the vehicle.
+    ends. `stop_command` is the command that a transition into ABORTED sends at once. `diagnosis` is
+    what the row asserts about the vehicle.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Transition:
     reason: Reason
     severity: Severity = Severity.CONTINUE
     outcome: NewOutcome | None = None
-    stop: EmergencyStop | StopMotors | None = None
+    stop_command: EmergencyStop | StopMotors | None = None
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 
     def keeps_mission_in(self, phase: Phase) -> bool:
@@ -57,7 +57,7 @@ def motor_cut_row(
     return _abort_row(name, when, reason, outcome, EmergencyStop())
 
 
-def supervisor_row(name: str, supervisor_bit: int, reason: str) -> Transition:
+def supervisor_abort_row(name: str, supervisor_bit: int, reason: str) -> Transition:
     """Return a row that stops the motors and aborts once the supervisor has set
     `supervisor_bit`."""
 
@@ -68,7 +68,11 @@ def supervisor_row(name: str, supervisor_bit: int, reason: str) -> Transition:
 
 
 def _abort_row(
-    name: str, when: Predicate, reason: str, outcome: Outcome, stop: EmergencyStop | StopMotors
+    name: str,
+    when: Predicate,
+    reason: str,
+    outcome: Outcome,
+    stop_command: EmergencyStop | StopMotors,
 ) -> Transition:
     return Transition(
         name,
@@ -78,7 +82,7 @@ def _abort_row(
         reason,
         Severity.STOP,
         outcome,
-        stop=stop,
+        stop_command=stop_command,
     )
 
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from perchctl.mission import Event, ExternalPositions, Tick
+from perchctl.mission import Event, ExternalPositionStatus, Tick
 from perchctl.vehicle import (
     Arm,
     Command,
@@ -180,11 +180,13 @@ def _battery_values(battery: Any) -> dict[str, Any]:
     }
 
 
-def _external_values(external: ExternalPositions | None) -> dict[str, Any]:
+def _external_values(external: ExternalPositionStatus | None) -> dict[str, Any]:
     if external is None:
         return {}
     return {
-        "pos_age_s": external.age_s if math.isfinite(external.age_s) else None,
+        "pos_age_s": external.newest_position_age_s
+        if math.isfinite(external.newest_position_age_s)
+        else None,
         "pos_note": external.problem,
         **_xyz("pos_", external.newest_position and external.newest_position.position_m),
     }

@@ -13,6 +13,7 @@ from functools import cache
 
 CLASS_KEYS: dict[str, str] = {
     "CameraImuMismatch": "Mismatch",
+    "ExternalPositionStatus": "ExternalPositions",
     "TickInputs": "TurnInputs",
     "TickRecord": "Turn",
 }
@@ -22,7 +23,8 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "camera_latency_error_s": "later_s",
         "camera_yaw_error_rad": "turn_rad",
     },
-    "ExternalPositions": {
+    "ExternalPositionStatus": {
+        "newest_position_age_s": "age_s",
         "newest_position": "place",
         "sent_count": "sent",
     },
@@ -31,12 +33,15 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "picture_kind": "fields",
     },
     "FusionAge": {
+        "climb_variance_m2ps2": "variance_m2ps2",
         "variance_changed_at_s": "changed_s",
         "no_fusion_since_s": "none_since_s",
     },
     "Impact": {
         "estimated_climb_before_impact_mps": "estimated_mps",
         "imu_climb_before_impact_mps": "felt_mps",
+        "peak_acc_z_g": "peak_g",
+        "world_z_m": "z_m",
     },
     "ImuMotion": {
         "attitude_frozen_for_s": "attitude_frozen_s",
@@ -45,22 +50,23 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "last_fall_at_s": "fell_s",
         "low_g_since_s": "light_since_s",
         "climb_rate_gained_mps": "sink_mps",
-        "vertical_acceleration_offset_mps2": "offset_mps2",
+        "up_acceleration_offset_mps2": "offset_mps2",
         "newest_impact": "blow",
-        "speed_gained_in_impact_mps": "blow_mps",
-        "last_impact_at_s": "blow_s",
+        "upward_speed_gained_mps": "blow_mps",
+        "last_impact_or_bounce_at_s": "blow_s",
         "recent_samples": "last_moment",
         "climb_steady_since_s": "steady_s",
         "steady_climb_mps": "steady_mps",
+        "velocity_gained_mps": "velocity_mps",
         "lateral_steady_since_s": "steady_aside_s",
         "mean_lateral_velocity_mps": "steady_aside_mps",
-        "mean_lateral_specific_force_g": "aside_g",
+        "mean_specific_force_body_xy_g": "aside_g",
         "last_lateral_push_at_s": "pushed_s",
         "accelerometer_offset_g": "offset_g",
         "last_telemetry_gap_ended_at_s": "silent_s",
         "last_gap_that_may_hide_fall_ended_at_s": "gap_s",
         "integration_restarted_at_s": "started_s",
-        "descent_while_frozen_m": "sunk_m",
+        "height_change_in_gap_m": "sunk_m",
         "mean_hover_thrust": "hover_thrust",
         "roll_pitch_error_rad": "misled_rad",
         "body_roll_pitch_rate_radps": "turning_radps",
@@ -76,6 +82,8 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "successive_marker_conflicts": "disagreeing_frames",
         "visual_inertial_motion": "felt",
         "has_estimated_position_jumped": "jumped",
+        "external_position_age_s": "position_age_s",
+        "external_position_problem": "position_problem",
         "camera_imu_mismatch": "mismatch",
         "has_new_frame": "new_frame",
         "operator_request": "operator",
@@ -103,14 +111,15 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "is_holding_position": "held",
         "failed_attempts": "attempts",
         "external_positions": "outside",
+        "planner_exception_name": "error",
     },
     "UnfilteredPose": {
-        "gear_to_target_m": "e_m",
+        "gear_to_target_level_m": "e_m",
         "vehicle_to_target_yaw_rad": "e_yaw_rad",
     },
     "VisualInertialMotion": {
-        "lateral_velocity_mps": "velocity_mps",
-        "acceleration_bias_mps2": "bias_mps2",
+        "velocity_world_xy_mps": "velocity_mps",
+        "acceleration_bias_world_xy_mps2": "bias_mps2",
     },
 }
 """The key of a field in the log, by the names of the dataclass and the field in the program."""

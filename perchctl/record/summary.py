@@ -13,7 +13,7 @@ import numpy as np
 from perchctl.errors import LogIncomplete
 from perchctl.mission import (
     CameraFindings,
-    ContactOffset,
+    GearToTargetDistance,
     HoverReport,
     Outcome,
     Touchdown,
@@ -77,7 +77,7 @@ class FlightSummary:
     locked: bool = False
     fell: bool = False
     findings: CameraFindings | None = None
-    contact: ContactOffset | None = None
+    contact: GearToTargetDistance | None = None
     touchdown: Touchdown | None = None
     hover: HoverReport | None = None
     lost_records: int = 0
@@ -120,7 +120,7 @@ class FlightSummary:
             locked=bool(end.get("locked", False)),
             fell=bool(end.get("fell", False)),
             findings=findings,
-            contact=_part_in(end, ContactOffset, _CONTACT),
+            contact=_part_in(end, GearToTargetDistance, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             hover=_part_in(end, HoverReport, _HOVER),
             lost_records=int(end.get("lost_records") or 0),
@@ -221,7 +221,7 @@ def is_simulated(header: Mapping[str, Any]) -> bool:
 
 
 # The keys of each part of the summary in the record, and the part's fields, in order.
-_CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
+_CONTACT = {"contact_aside_m": "distance_xy_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _HOVER = {
     "hover_s": "duration_s",

@@ -242,7 +242,7 @@ class LogWatcher:
             locked=report.is_locked_by_supervisor,
             fell=fell,
             findings=report.findings,
-            contact=report.last_contact_offset,
+            contact=report.gear_to_target_at_last_contact,
             touchdown=report.touchdown,
             hover=report.hover,
             simulated=self.simulated,

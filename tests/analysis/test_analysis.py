@@ -12,7 +12,7 @@ import pytest
 from perchctl.analysis import FlightAnalysis, newest_logs, show_record, show_text
 from perchctl.analysis.flight import contact_ascent
 from perchctl.analysis.show import COLUMNS
-from perchctl.mission import ContactOffset, Event, EventKind, Phase
+from perchctl.mission import Event, EventKind, GearToTargetDistance, Phase
 from perchctl.record import FlightLog, read_log
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
@@ -71,7 +71,7 @@ def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
     flight = FlightAnalysis(read_log(path))
     text, record = show_text(flight), show_record(flight)
     assert text.startswith("PERCHED: hanging still with the motors off\n")
-    offset = ContactOffset(0.0032, 0.0034)
+    offset = GearToTargetDistance(0.0032, 0.0034)
     assert ("contact", "3.2 +- 3.4 mm off centre, by the camera's estimate") in replace(
         flight.summary, contact=offset
     ).rows()

@@ -173,7 +173,7 @@ def test_land_is_one_ctrl_c_and_never_two_and_cut_motors_stops_at_once(
         switch.press()
         assert switch.read() is OperatorRequest.LAND  # the first Ctrl-C repeats Land
         assert press(flight.page.url, flight.page.token, "cut") == 200
-        assert switch.read() is OperatorRequest.STOP
+        assert switch.read() is OperatorRequest.CUT_MOTORS
 
 
 # --- how it ended ----------------------------------------------------------------------------

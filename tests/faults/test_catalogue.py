@@ -83,7 +83,7 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
         for now_s[0] in presses_s:
             switch.press()
         now_s[0] += 1.0
-        assert (switch.read() is OperatorRequest.STOP) is stops
+        assert (switch.read() is OperatorRequest.CUT_MOTORS) is stops
         assert (emergency_stop_s(presses_s) is not None) is stops
 
 

@@ -41,7 +41,7 @@ def test_a_row_claims_what_its_sentence_says(name: str) -> None:
     row, claims = LAST_ROWS[name], ROW_CLAIMS[name]
     if row.to is not Phase.ABORTED:
         assert PHASE_CLAIMS[row.to] <= claims or "hangs on the target" in claims
-    if row.stop is not None:
+    if row.stop_command is not None:
         assert "motors off" in claims
     if isinstance(row.reason, str):
         said = {

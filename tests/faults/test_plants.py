@@ -62,7 +62,7 @@ def lands_fast(patch: Patch) -> None:
         return Land(land.height_m, max(0.1, (known[-1] - land.height_m) / 1.5))
 
     def by_itself(c: Context) -> Action:
-        slow = c.belief.is_positioned_by_target or c.belief.is_in_magnet_reach
+        slow = c.belief.is_target_position_source or c.belief.is_possibly_in_magnet_reach
         return by_setpoints(c) if slow else descent._command_onboard_landing(c)
 
     patch.setattr(descent, "make_onboard_landing_command", fast)

@@ -358,7 +358,7 @@ def test_ctrl_c_lands_all_and_again_cuts_all() -> None:
     rig.pass_s(1.5)
     rig.switch.press()
     rig.fleet.step()
-    assert rig.words == [OperatorRequest.STOP] * 4
+    assert rig.words == [OperatorRequest.CUT_MOTORS] * 4
 
 
 def test_a_stop_in_the_round_of_the_start_keeps_the_fleet_on_the_floor(
@@ -417,7 +417,7 @@ def test_after_a_failure_the_operator_still_cuts_all_and_orders_are_repeated(fai
     assert len(failed["v1"].orders) - before == 5, "signs of life"
     failed.switch.cut()
     failed.fleet.run(Rounds(failed, 1))
-    assert failed.words == [OperatorRequest.STOP] * 4
+    assert failed.words == [OperatorRequest.CUT_MOTORS] * 4
     assert failed.fleet.failure is not None
 
 
@@ -442,7 +442,7 @@ def test_one_that_cannot_be_ordered_keeps_no_other_from_its_order(
     monkeypatch.setattr(failed["v0"], "send", send)
     failed.switch.cut()
     failed.fleet.run(Rounds(failed, 1))
-    assert failed.words[1:] == [OperatorRequest.STOP] * 3
+    assert failed.words[1:] == [OperatorRequest.CUT_MOTORS] * 3
 
 
 @pytest.mark.parametrize(

@@ -68,8 +68,8 @@ def test_a_parent_that_comes_back_does_not_take_the_landing_back() -> None:
     switch.take(Order(may_take_off=True))
     assert switch.read() is OperatorRequest.LAND
     assert not switch.may_take_off
-    switch.take(Order(word=OperatorRequest.STOP))
-    assert switch.read() is OperatorRequest.STOP
+    switch.take(Order(word=OperatorRequest.CUT_MOTORS))
+    assert switch.read() is OperatorRequest.CUT_MOTORS
 
 
 def test_signs_of_life_keep_it_flying_for_ever() -> None:
@@ -98,7 +98,7 @@ def test_a_slow_loop_notices_a_silent_parent_too() -> None:
     assert readings(switch, clock, 2 * LONGEST_WATCH_STEP_S, every_s=0.05) is OperatorRequest.LAND
 
 
-@pytest.mark.parametrize("word", [OperatorRequest.LAND, OperatorRequest.STOP])
+@pytest.mark.parametrize("word", [OperatorRequest.LAND, OperatorRequest.CUT_MOTORS])
 def test_a_word_comes_before_a_permission_and_is_never_taken_back(word: OperatorRequest) -> None:
     switch, _ = listening()
     switch.take(Order(may_take_off=True, word=word))

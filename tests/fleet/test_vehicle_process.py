@@ -215,8 +215,8 @@ def test_what_is_no_order_lands_and_the_motors_can_still_be_cut(
     assert not switch.may_take_off
     parent.send(Order(may_climb=True, sent_s=time.monotonic()))
     assert switch.climb_withheld() == switch.lost
-    parent.send(Order(word=OperatorRequest.STOP))
-    until(lambda: switch.read() is OperatorRequest.STOP)
+    parent.send(Order(word=OperatorRequest.CUT_MOTORS))
+    until(lambda: switch.read() is OperatorRequest.CUT_MOTORS)
     assert isinstance(parent.receive(1.0), Status), "it goes on telling where it is"
 
 

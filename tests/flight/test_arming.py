@@ -232,7 +232,7 @@ class UnarmedAndGuarded(Guarded, Unarmed):
         self.own, self._asked_s = [], 0.0
 
 
-@pytest.mark.parametrize("pressed", [OperatorRequest.LAND, OperatorRequest.STOP])
+@pytest.mark.parametrize("pressed", [OperatorRequest.LAND, OperatorRequest.CUT_MOTORS])
 def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: OperatorRequest) -> None:
     link, camera = UnarmedAndGuarded(), Camera()
     hang_in_the_camera(link, camera, 0.1, 3.0)
@@ -247,7 +247,7 @@ def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: OperatorRequ
 
 @pytest.mark.parametrize(
     ("pressed", "order"),
-    [(OperatorRequest.LAND, Arm(False)), (OperatorRequest.STOP, EmergencyStop())],
+    [(OperatorRequest.LAND, Arm(False)), (OperatorRequest.CUT_MOTORS, EmergencyStop())],
 )
 def test_the_word_reaches_an_armed_vehicle_whose_first_turn_of_flight_hangs(
     pressed: OperatorRequest, order: Command

@@ -115,7 +115,7 @@ def test_it_perches_by_the_sight_of_the_target_alone() -> None:
     def see(tick: Tick) -> None:
         assert tick.external_positions is not None
         phase = tick.state.phase
-        ages_s[phase] = max(ages_s.get(phase, 0.0), tick.external_positions.age_s)
+        ages_s[phase] = max(ages_s.get(phase, 0.0), tick.external_positions.newest_position_age_s)
 
     it = fly_lockstep(TARGET_ONLY, 3, watchers=(Watcher(see),))
     assert it.report.phase is Phase.PERCHED

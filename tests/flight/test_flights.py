@@ -203,7 +203,7 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
 )
 def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     flown = fly_short(
-        operator_at={phase: OperatorRequest.LAND, Phase.LANDING: OperatorRequest.STOP}
+        operator_at={phase: OperatorRequest.LAND, Phase.LANDING: OperatorRequest.CUT_MOTORS}
     )
     report = flown.report
     assert flown.way[-3:] == [phase.value, "LANDING", "ABORTED"]

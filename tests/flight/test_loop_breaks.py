@@ -190,7 +190,9 @@ def test_without_positions_from_outside_it_comes_down_level() -> None:
 
 def test_ctrl_c_twice_stops_it_too() -> None:
     rig = rescuing(supervisor=AIRBORNE | HL_ACTIVE)
-    rig.operator = lambda: OperatorRequest.STOP if rig.link.now_s > 0.5 else OperatorRequest.NONE
+    rig.operator = lambda: (
+        OperatorRequest.CUT_MOTORS if rig.link.now_s > 0.5 else OperatorRequest.NONE
+    )
     rig.rescue(telemetry(0.0))
     assert rig.link.said(EmergencyStop)[0] == pytest.approx(0.5, abs=0.05)
     assert rig.link.now_s < 1.0
@@ -200,7 +202,7 @@ def test_the_operators_stop_in_it_is_repeated() -> None:
     """Until the vehicle says that it is locked, and also while the link is closing."""
     link = Guarded()
     rig = Rig(link, watcher=breaks_at(1.5))
-    rig.operator = lambda: OperatorRequest.STOP if link.now_s > 1.8 else OperatorRequest.NONE
+    rig.operator = lambda: OperatorRequest.CUT_MOTORS if link.now_s > 1.8 else OperatorRequest.NONE
     with pytest.raises(Broken):
         rig.fly()
     ended_s = link.now_s

@@ -61,14 +61,15 @@ ANSWER_S = 0.25
     ([0.0], 0.0, OperatorRequest.LAND),
     ([0.0], 100.0, OperatorRequest.LAND),
     ([0.0, SAME_PRESS_S - 0.01], 9.0, OperatorRequest.LAND),  # too soon to count
-    ([0.0, 0.2, 0.3], 0.3, OperatorRequest.STOP),  # but three do
-    ([0.0, LONGEST_DELAY_S], LONGEST_DELAY_S, OperatorRequest.STOP),  # no keyboard waits so long
+    ([0.0, 0.2, 0.3], 0.3, OperatorRequest.CUT_MOTORS),  # but three do
+    # no keyboard waits so long
+    ([0.0, LONGEST_DELAY_S], LONGEST_DELAY_S, OperatorRequest.CUT_MOTORS),
     ([0.0, 0.5, 0.53, 0.56], 9.0, OperatorRequest.LAND),  # held for half a second
     ([0.0, 0.2, 0.22, 0.24], 9.0, OperatorRequest.LAND),  # by a keyboard that is set to be fast
-    ([0.0, 0.4, 0.55, 0.7], 9.0, OperatorRequest.STOP),  # a key or a hand: nobody can tell
+    ([0.0, 0.4, 0.55, 0.7], 9.0, OperatorRequest.CUT_MOTORS),  # a key or a hand: nobody can tell
     ([0.0, 0.4, 0.49, 0.58, 0.67], 9.0, OperatorRequest.LAND),
-    ([0.0, 0.24, 0.46], 0.46, OperatorRequest.STOP),  # a key's first gap is longer
-    ([0.0, 0.4, 0.6, 0.7], 0.7, OperatorRequest.STOP),  # and the others are alike
+    ([0.0, 0.24, 0.46], 0.46, OperatorRequest.CUT_MOTORS),  # a key's first gap is longer
+    ([0.0, 0.4, 0.6, 0.7], 0.7, OperatorRequest.CUT_MOTORS),  # and the others are alike
 ])  # fmt: skip
 def test_the_table_of_presses(
     presses_s: list[float], read_s: float, order: OperatorRequest
@@ -79,8 +80,8 @@ def test_the_table_of_presses(
 @given(again_s=st.floats(SAME_PRESS_S, 60.0))
 def test_a_second_press_stops_within_a_quarter_of_a_second(again_s: float) -> None:
     it = Pressed(0.0, again_s)
-    assert it.at(again_s + ANSWER_S) is OperatorRequest.STOP
-    assert it.at(99.0) is OperatorRequest.STOP
+    assert it.at(again_s + ANSWER_S) is OperatorRequest.CUT_MOTORS
+    assert it.at(99.0) is OperatorRequest.CUT_MOTORS
 
 
 # --- a hand, or a key that is held: by the times of the presses alone ----------------------------
@@ -112,11 +113,11 @@ def keys(
 def test_a_hand_that_hammers_stops_at_its_third_press_or_soon_after(presses_s: list[float]) -> None:
     """What might still be a key is waited for: until it lets go, or for a second."""
     second_s = next((t for t in presses_s if t >= LONGEST_DELAY_S), 99.0)
-    assert Pressed(*presses_s).at(presses_s[-1] + ANSWER_S) is OperatorRequest.STOP
+    assert Pressed(*presses_s).at(presses_s[-1] + ANSWER_S) is OperatorRequest.CUT_MOTORS
     heard = [t for t in presses_s if t <= second_s]
     assert (
         Pressed(*heard).at(heard[-1] + (0.0 if second_s < 99.0 else ANSWER_S))
-        is OperatorRequest.STOP
+        is OperatorRequest.CUT_MOTORS
     )
 
 
@@ -124,7 +125,7 @@ def test_a_hand_that_hammers_stops_at_its_third_press_or_soon_after(presses_s: l
 def test_presses_that_are_alike_stop_at_the_third(rate_hz: float, off: float) -> None:
     """Three within a second, none of them a key's: its first gap is longer."""
     gap_s = 1.0 / rate_hz
-    assert Pressed(0.0, gap_s, gap_s * (1.0 + off)).at(gap_s * 2.1) is OperatorRequest.STOP
+    assert Pressed(0.0, gap_s, gap_s * (1.0 + off)).at(gap_s * 2.1) is OperatorRequest.CUT_MOTORS
 
 
 @given(keys())
@@ -133,9 +134,9 @@ def test_a_key_that_is_held_lands_for_a_second_and_then_stops(presses_s: list[fl
     for t_s, next_s in itertools.pairwise(presses_s):
         it.press(t_s)
         over = t_s - presses_s[0] >= LONGEST_DELAY_S - 1e-9
-        assert it.at(t_s) is (OperatorRequest.STOP if over else OperatorRequest.LAND)
-        assert it.at(next_s) is (OperatorRequest.STOP if over else OperatorRequest.LAND)
-    assert it.at(2.0) is OperatorRequest.STOP
+        assert it.at(t_s) is (OperatorRequest.CUT_MOTORS if over else OperatorRequest.LAND)
+        assert it.at(next_s) is (OperatorRequest.CUT_MOTORS if over else OperatorRequest.LAND)
+    assert it.at(2.0) is OperatorRequest.CUT_MOTORS
 
 
 @given(st.floats(0.25, 1.0, exclude_max=True), st.floats(0.03, 0.2), st.floats(0.0, 0.99))
@@ -155,7 +156,7 @@ def test_a_key_let_go_is_one_press(presses_s: list[float], count: int) -> None:
     it = Pressed(*heard)
     assert len(heard) < 3 or it.at(60.0) is OperatorRequest.LAND
     it.press(61.0)
-    assert it.at(61.0) is OperatorRequest.STOP
+    assert it.at(61.0) is OperatorRequest.CUT_MOTORS
 
 
 @given(st.lists(st.floats(0.001, 1.5), min_size=1, max_size=20), st.floats(0.01, 0.1))
@@ -185,15 +186,15 @@ def test_an_order_never_falls(silences_s: list[float]) -> None:
 
 @pytest.mark.parametrize(("count", "after_s", "order"), [
     (1, 0.3, OperatorRequest.LAND),  # until no third has come
-    (2, 0.3, OperatorRequest.STOP),  # three within a second
+    (2, 0.3, OperatorRequest.CUT_MOTORS),  # three within a second
     (3, 0.09, OperatorRequest.LAND),  # faster than a hand, from 0.5 s on
-    (3, 0.45, OperatorRequest.STOP),
+    (3, 0.45, OperatorRequest.CUT_MOTORS),
 ])  # fmt: skip
 def test_presses_that_are_heard_late_and_together(
     count: int, after_s: float, order: OperatorRequest
 ) -> None:
     """Several signals arrive as one while no thread gets a turn; when each came is unknown."""
-    it = Pressed(0.0) if order is OperatorRequest.STOP or count == 1 else Pressed(-0.5, 0.0)
+    it = Pressed(0.0) if order is OperatorRequest.CUT_MOTORS or count == 1 else Pressed(-0.5, 0.0)
     it.now_s = 50.0 + after_s
     it.switch.press(count)
     assert it.switch.read() is order
@@ -205,7 +206,7 @@ def test_signals_that_are_read_together_are_all_presses() -> None:
         wakeup = signal.set_wakeup_fd(-1)
         signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         os.write(wakeup, bytes([signal.SIGINT] * 3))
-        until(lambda: switch.read() is OperatorRequest.STOP)
+        until(lambda: switch.read() is OperatorRequest.CUT_MOTORS)
 
 
 @given(st.lists(st.sampled_from(["land", "read"]), max_size=50))
@@ -215,7 +216,7 @@ def test_landing_is_never_a_stop_and_cutting_is_one_at_once(acts: list[str]) -> 
         getattr(it.switch, act)()
         assert it.at(0.0) <= OperatorRequest.LAND
     it.switch.cut()
-    assert it.at(0.0) is OperatorRequest.STOP
+    assert it.at(0.0) is OperatorRequest.CUT_MOTORS
 
 
 def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
@@ -225,7 +226,7 @@ def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
         it.now_s = 50.0 + STOP_HANG_S
         it.switch.interrupt()  # it may still land, or be stopped
     it = Pressed(0.0, SAME_PRESS_S)
-    assert it.at(1.0) is OperatorRequest.STOP
+    assert it.at(1.0) is OperatorRequest.CUT_MOTORS
     it.now_s = 51.0 + STOP_HANG_S
     with pytest.raises(Interrupted, match="the flight did not end after the motors were cut"):
         it.switch.interrupt()
@@ -309,7 +310,7 @@ def test_ctrl_c_works_while_the_main_thread_hangs_in_a_library() -> None:
         flight.sends("Land", "LAND")
         time.sleep(SAME_PRESS_S)
         flight.process.send_signal(signal.SIGINT)
-        flight.sends("EmergencyStop", "STOP")
+        flight.sends("EmergencyStop", "CUT_MOTORS")
 
 
 @pytest.mark.parametrize(
@@ -359,7 +360,8 @@ with operator_signals(switch, say), cut_key(switch, 0) as has_key:
         time.sleep(0.01)
         if "raises" in sys.argv and switch.read().name == "LAND":
             raise SystemExit(9)
-        if switch.read().name == "STOP" or ("leaves" in sys.argv and switch.read().name == "LAND"):
+        leaves = "leaves" in sys.argv and switch.read().name == "LAND"
+        if leaves or switch.read().name == "CUT_MOTORS":
             break
 print(switch.read().name, flush=True)
 if "background" in sys.argv:
@@ -413,7 +415,7 @@ def test_the_space_bar_cuts_the_motors_and_no_other_key_does() -> None:
         assert it.read() == ""
         assert termios.tcgetattr(it.ours) != it.before
         it.type("x ")
-        assert it.next() == "STOP"
+        assert it.next() == "CUT_MOTORS"
         assert it.process.wait(10.0) == 0
         assert termios.tcgetattr(it.ours) == it.before
 

@@ -93,7 +93,11 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     last = told.turns[-1]
     assert last.observation is not None
     assert last.observation.t_s > BREAKS_S
-    assert (last.role, last.command, last.error) == ("failed", None, "ZeroDivisionError")
+    assert (last.role, last.command, last.planner_exception_name) == (
+        "failed",
+        None,
+        "ZeroDivisionError",
+    )
     turns = [*told.of_ticks, last]
     assert last.number == turns[-2].number + 1
     assert not any(each.difference for each in replay_decisions(turns, rig.profile))
@@ -116,7 +120,7 @@ def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
     rig.link.send = fails  # type: ignore[method-assign]
     told = broken(rig, ZeroDivisionError)
     last = told.turns[-1]
-    assert (last.role, last.error) == ("flown", None)
+    assert (last.role, last.planner_exception_name) == ("flown", None)
     assert (last.t_s, last.command) in rig.link.sent
     assert not any(
         each.difference for each in replay_decisions([*told.of_ticks, last], rig.profile)

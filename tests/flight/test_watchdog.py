@@ -97,8 +97,8 @@ ARMED_BITS = ARMED | CAN_FLY
 
 
 @pytest.mark.parametrize(("word", "bits", "sent"), [
-    (OperatorRequest.STOP, ARMED_BITS, EmergencyStop()),
-    (OperatorRequest.STOP, AIRBORNE, EmergencyStop()),  # the first command may have gone out
+    (OperatorRequest.CUT_MOTORS, ARMED_BITS, EmergencyStop()),
+    (OperatorRequest.CUT_MOTORS, AIRBORNE, EmergencyStop()),  # the first command may have gone out
     (OperatorRequest.LAND, ARMED_BITS, Arm(False)),
     (OperatorRequest.LAND, ARMED_BITS | FLYING, None),  # in the air disarming would drop it
     (OperatorRequest.LAND, READY, None),
@@ -115,7 +115,7 @@ def test_the_operators_word_counts_before_the_first_tick(
 
 
 def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
-    dog = Watchdog(PROFILE, lambda: OperatorRequest.STOP)
+    dog = Watchdog(PROFILE, lambda: OperatorRequest.CUT_MOTORS)
     times_s = [T_S + CUT_PERIOD_S * k for k in range(4)]
     bits = [ARMED_BITS, ARMED_BITS, ARMED_BITS, LOCKED]
     sent = [
@@ -282,7 +282,7 @@ def test_the_operator_lands_a_silent_loop_at_once() -> None:
 
 def test_the_operators_stop_cuts_while_the_loop_is_silent() -> None:
     rig = Rig()
-    rig.operator = OperatorRequest.STOP
+    rig.operator = OperatorRequest.CUT_MOTORS
     assert rig.after(0.02) is None  # the loop's own: its row records it
     assert rig.after(0.15) == EmergencyStop()
 
@@ -319,14 +319,14 @@ def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -
     else:
         rig.dog.end(motors_off=closing == "motors off")
     assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4
-    rig.operator = OperatorRequest.STOP
+    rig.operator = OperatorRequest.CUT_MOTORS
     assert rig.after(0.06) == (None if closing == "motors off" else EmergencyStop())
 
 
 @pytest.mark.parametrize("by_planner", [True, False])
 def test_an_emergency_stop_is_repeated_until_it_is_confirmed(by_planner: bool) -> None:
     rig = Rig(EmergencyStop() if by_planner else HOVER)
-    rig.operator = OperatorRequest.STOP
+    rig.operator = OperatorRequest.CUT_MOTORS
     times = [0.2 + 0.05 * i for i in range(20)]
     cuts = [s for s in times if rig.after(s) == EmergencyStop()]
     assert len(cuts) == 10
@@ -339,7 +339,7 @@ def test_an_emergency_stop_is_repeated_until_it_is_confirmed(by_planner: bool) -
 
 def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
     rig = Rig()
-    rig.operator = OperatorRequest.STOP
+    rig.operator = OperatorRequest.CUT_MOTORS
     cuts = [rig.poll(0.2 + 0.05 * i, None) for i in range(1000)]
     assert cuts.count(EmergencyStop()) == MAX_CUTS
 
@@ -395,7 +395,7 @@ def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
     """No sight comes without the loop, and its own landing would fly by none."""
     profile = Profile.model_validate({"positioning": by})
     dog = Watchdog(profile, lambda: OperatorRequest.NONE, lambda now_s: now_s - T_S + age_s)
-    obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=age_s)
+    obs = Observation(T_S, telemetry(T_S, 1.0), external_position_age_s=age_s)
     dog.tick(T_S + PERIOD_S, remembering(IN_AIR, last_telemetry=obs.telemetry), HOVER, obs)
     for i in range(60):
         now_s = T_S + LAND_S + 0.1 + 0.05 * i
@@ -409,7 +409,7 @@ def test_what_has_waited_for_the_loop_is_felt_too() -> None:
     felt = []
     for waits in (True, False):
         dog = Watchdog(profile, lambda: OperatorRequest.NONE)
-        obs = Observation(T_S, telemetry(T_S, 0.1), position_age_s=0.05)
+        obs = Observation(T_S, telemetry(T_S, 0.1), external_position_age_s=0.05)
         low = remembering(IN_AIR, phase=Phase.LANDING, last_telemetry=obs.telemetry)
         dog.tick(T_S + PERIOD_S, low, RawThrust(HOVER_THRUST), obs)
         samples: list[Telemetry] = []

@@ -13,7 +13,7 @@ import numpy as np
 
 from perchctl.mission import (
     Event,
-    ExternalPositions,
+    ExternalPositionStatus,
     Observation,
     Phase,
     PlannerState,
@@ -131,7 +131,7 @@ def tick(
     target: TargetEstimate | None = None,
     consistency: CameraErrors | None = None,
     delay_used_s: float = 0.0,
-    outside: ExternalPositions | None = None,
+    outside: ExternalPositionStatus | None = None,
 ) -> Tick:
     obs = Observation(
         t_s, sample, target, last_good_frame_age_s=0.03, camera_latency_above_profile_s=delay_used_s

@@ -29,8 +29,8 @@ CEILING_M = 2.2
 FINE_BATTERY = BatteryFit(
     takeoff_rest_v=4.1,
     rest_v=4.08,
-    filtered_thrust_fraction=HOVER_THRUST / 65535,
-    mean_thrust_fraction=HOVER_THRUST / 65535,
+    lagged_thrust_fraction=HOVER_THRUST / 65535,
+    mean_airborne_thrust_fraction=HOVER_THRUST / 65535,
     time_under_load_s=5.0,
 )
 """After some seconds of flight: enough for every attempt."""

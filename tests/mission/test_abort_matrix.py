@@ -64,7 +64,7 @@ ALL = PRE_LANDING_PHASES | {Phase.LANDING}
 
 # event: (what happens, seconds it lasts, where it counts, how it ends, outcome)
 EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcome]] = {
-    "operator-stop": (_obs(operator_request=OperatorRequest.STOP), 0.1, ALL, STOP,
+    "operator-stop": (_obs(operator_request=OperatorRequest.CUT_MOTORS), 0.1, ALL, STOP,
         Outcome.EMERGENCY),
     "locked": (_bits(LOCKED), 0.1, ALL, STOP, Outcome.SAFETY),
     "tumbled": (_bits(TUMBLED), 0.1, ALL, STOP, Outcome.SAFETY),
@@ -78,7 +78,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         1.5, PRE_LANDING_PHASES, LAND, Outcome.SAFETY,
     ),
     "position-lost": (
-        _obs(position_age_s=0.8, position_problem="occluded"), 0.1,
+        _obs(external_position_age_s=0.8, external_position_problem="occluded"), 0.1,
         CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
     ),
     "heading-lost": (
@@ -220,7 +220,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
         _obs(tick_start_delay_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
         _tel(velocity_variance_m2ps2=0.08),
-        _obs(position_age_s=0.3),
+        _obs(external_position_age_s=0.3),
     ],
     ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure", "position-stale"],
 )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState, planner
 from perchctl.mission.phase import PRE_LANDING_PHASES
-from perchctl.mission.phases.align import MAX_CLIMB_WAIT_S
+from perchctl.mission.phases.align import MAX_WAIT_FOR_CLIMB_PERMISSION_S
 from perchctl.vehicle import Command, PositionSetpoint
 from tests.helpers.mission import PROFILE, remembering, state_in
 from tests.mission.rig import BEGIN_S, TICK_S, at, fly, times
@@ -45,14 +45,16 @@ def test_a_climb_begins_only_in_a_tick_with_permission(spells: list[tuple[bool, 
 def test_without_permission_it_lands_in_the_end(x_m: float) -> None:
     """The wait is no alignment that took too long, but has a row and a limit of its own."""
     look = at(position_m=(x_m, 0.0, HEIGHT_M), obs={"climb_withheld_reason": WHY})
-    flown = fly(state_in(Phase.ALIGN, BEGIN_S), look, MAX_CLIMB_WAIT_S + 1.0, one_phase=True)
+    flown = fly(
+        state_in(Phase.ALIGN, BEGIN_S), look, MAX_WAIT_FOR_CLIMB_PERMISSION_S + 1.0, one_phase=True
+    )
     if x_m:
         assert flown.state.row_name == "align-timeout"
         return
     assert flown.state.row_name == "climb-not-permitted"
     assert (flown.state.phase, flown.state.outcome) == (Phase.LANDING, Outcome.SAFETY)
     assert flown.state.reason == f"no permission to climb for 20 s: {WHY}"
-    assert flown.ticks[-1].t_s == pytest.approx(BEGIN_S + MAX_CLIMB_WAIT_S, abs=0.1)
+    assert flown.ticks[-1].t_s == pytest.approx(BEGIN_S + MAX_WAIT_FOR_CLIMB_PERMISSION_S, abs=0.1)
     waiting = flown.ticks[-2].state
     assert waiting.pause_reason == f"waiting for permission to climb: {WHY}"
     assert waiting.hold_reason == ""
@@ -60,7 +62,7 @@ def test_without_permission_it_lands_in_the_end(x_m: float) -> None:
 
 def test_it_climbs_as_soon_as_it_may() -> None:
     state, look = state_in(Phase.ALIGN, BEGIN_S), at(HEIGHT_M)
-    for t_s in times(MAX_CLIMB_WAIT_S - 1.0):
+    for t_s in times(MAX_WAIT_FOR_CLIMB_PERMISSION_S - 1.0):
         state, _ = step(state, look(t_s), may=False)
     state, _ = step(state, look(t_s + TICK_S), may=True)
     assert state.phase is Phase.ASCEND

@@ -9,9 +9,9 @@ import pytest
 from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
-    CONTACT,
     IMU_SHOWS_SUPPORT,
     MIN_PRESS_TO_HOVER_THRUST_RATIO,
+    TARGET_CONTACT,
     is_pressing,
 )
 from perchctl.profile import Profile
@@ -51,7 +51,7 @@ def touching(
 
 def is_contact(obs: Observation, profile: Profile = PROFILE, **remembered: Any) -> bool:
     pressing = remembering(state_in(Phase.PERCH, z_m=HANG_Z_M), **remembered)
-    return CONTACT in observing(pressing, obs, profile).belief.condition_start_times_s
+    return TARGET_CONTACT in observing(pressing, obs, profile).belief.condition_start_times_s
 
 
 @pytest.mark.parametrize("profile", [PROFILE, MOCAP, BY_TARGET], ids=["deck", "mocap", "target"])
@@ -122,7 +122,7 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     above = PositionSetpoint(0.0, 0.0, HANG_Z_M + 0.2, 0.0)
     b = observing(replace(pressing, setpoint=above), obs).belief
     found = [
-        CONTACT in b.condition_start_times_s,
+        TARGET_CONTACT in b.condition_start_times_s,
         CLIMB_BLOCKED in b.condition_start_times_s,
         IMU_SHOWS_SUPPORT in b.condition_start_times_s,
         is_pressing(b),

@@ -83,14 +83,16 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
         gear_to_target_world_xy_m=(0.03, 0.04),
         gear_to_target_sigma_m=0.01,
     )
-    state = remembering(state_in(phase), dead_reckoning=dead_reckoning, last_contact_offset=None)
+    state = remembering(
+        state_in(phase), dead_reckoning=dead_reckoning, gear_to_target_at_last_contact=None
+    )
     report = FlightReport.from_state(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
-        assert report.last_contact_offset is None
+        assert report.gear_to_target_at_last_contact is None
         return
-    assert report.last_contact_offset is not None
-    assert report.last_contact_offset.lateral_offset_m == pytest.approx(0.05)
-    assert 0.01 <= report.last_contact_offset.sigma_m < 0.02
+    assert report.gear_to_target_at_last_contact is not None
+    assert report.gear_to_target_at_last_contact.distance_xy_m == pytest.approx(0.05)
+    assert 0.01 <= report.gear_to_target_at_last_contact.sigma_m < 0.02
 
 
 def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
@@ -122,6 +124,8 @@ def hangs(z_m: float) -> Look:
 
     def look(t_s: float) -> Observation:
         sample = telemetry(t_s, z_m, thrust=0, acc_x_g=1e-4 * (round(100 * t_s) % 3))
-        return observation(t_s, telemetry=sample, target=None, position_age_s=t_s - BEGIN_S)
+        return observation(
+            t_s, telemetry=sample, target=None, external_position_age_s=t_s - BEGIN_S
+        )
 
     return look

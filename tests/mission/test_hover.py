@@ -23,7 +23,7 @@ from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.thrust import (
     ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION,
     HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
-    HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION,
+    ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION,
     HoverThrust,
 )
 from perchctl.mission.phase import Phase
@@ -63,7 +63,7 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
     settled_s = (
-        12.0 * HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION / drift
+        12.0 * ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION / drift
     )  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
     found = measured(
@@ -76,8 +76,8 @@ def test_it_converges_to_what_is_measured(first: float, true: float, drift: floa
 def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: float) -> None:
     """P = r d for a scalar Kalman filter, within the step of a tick."""
     found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
-    assert found.sigma == pytest.approx(
-        math.sqrt(HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION * drift), rel=0.05
+    assert found.sigma_fraction == pytest.approx(
+        math.sqrt(ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION * drift), rel=0.05
     )
 
 
@@ -88,7 +88,7 @@ def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: 
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
     assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
-    assert slow.sigma == pytest.approx(fast.sigma, rel=0.05)
+    assert slow.sigma_fraction == pytest.approx(fast.sigma_fraction, rel=0.05)
 
 
 @given(old=thrusts, one=thrusts, other=thrusts, sigma=st.floats(1e-3, 0.2))
@@ -179,13 +179,13 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
     later = HoverThrust(50_000.0, sigma).propagate_without_measurement(dt_s)
-    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
+    assert sigma <= later.sigma_fraction <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
     found = HoverThrust().with_measurement(48_000.0, 0.02)
     assert found.thrust == 48_000.0
-    assert math.isfinite(found.sigma)
+    assert math.isfinite(found.sigma_fraction)
 
 
 def test_a_tick_without_a_measurement_makes_it_less_sure() -> None:
@@ -193,4 +193,7 @@ def test_a_tick_without_a_measurement_makes_it_less_sure() -> None:
     start = remembering(state_in(Phase.PERCH), hover_thrust=50_000.0)
     later = observing(start, observation(10.5))
     assert later.belief.hover_thrust == 50_000.0
-    assert later.belief.hover_thrust_estimate.sigma > start.belief.hover_thrust_estimate.sigma
+    assert (
+        later.belief.hover_thrust_estimate.sigma_fraction
+        > start.belief.hover_thrust_estimate.sigma_fraction
+    )

@@ -18,7 +18,7 @@ from perchctl.mission.belief.motion import (
     NO_FUSION_TIMEOUT_S,
 )
 from perchctl.mission.belief.reckoning import (
-    MAGNET_REACH_M,
+    MAGNET_REACH_BELOW_TARGET_M,
     MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS,
     DeadReckoning,
     add_sighting,
@@ -42,7 +42,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert motion.acceleration_frozen_for_s == pytest.approx(2.99)
     assert motion.last_telemetry_gap_ended_at_s == pytest.approx(2.99)
     assert motion.last_fall_at_s < 0.0
-    assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
+    assert abs(motion.velocity_gained_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.acceleration_frozen_for_s == 0.0
     assert alive.last_fall_at_s > 0.0
@@ -130,7 +130,7 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
     misled, true = flown(flight(True)), flown(flight(False))
     assert true.roll_pitch_error_rad == (0.0, 0.0)
     assert misled.roll_pitch_error_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
-    assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
+    assert misled.velocity_gained_mps[:2] == pytest.approx(true.velocity_gained_mps[:2], abs=0.04)
 
 
 @given(
@@ -142,7 +142,10 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = gear_below_target_m - MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * silent_s < MAGNET_REACH_M
+    near = (
+        gear_below_target_m - MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * silent_s
+        < MAGNET_REACH_BELOW_TARGET_M
+    )
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
         (

@@ -24,7 +24,7 @@ from perchctl.mission import (
     planner,
     rest,
 )
-from perchctl.mission.belief.contact import IMU_SHOWS_SUPPORT, MOTORS_STOPPED
+from perchctl.mission.belief.contact import IMU_SHOWS_SUPPORT, MOTORS_OFF_AS_COMMANDED
 from perchctl.mission.belief.motion import FusionAge
 from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
 from perchctl.mission.belief.quality import BATTERY_LOW
@@ -73,13 +73,16 @@ MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, LOW_M = 1.5, 0.2
 # sent then to a vehicle that is free.
 KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
     "position": (DECKS, {}, {}, PositionSetpoint),
-    "sight": (BY_TARGET, {"position_age_s": 0.05}, {}, PositionSetpoint),
+    "sight": (BY_TARGET, {"external_position_age_s": 0.05}, {}, PositionSetpoint),
     "onboard": (DECKS, {"link_problem": "gone"}, {}, Land),
     "height": (DECKS, {}, {"is_heading_lost": True}, RawThrust),
-    "imu": (BY_TARGET, {"position_age_s": 3.0}, {"dead_reckoning_since_s": NOW_S - 1.0}, RawThrust),
-    "nothing": (
-        BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"dead_reckoning_since_s": NOW_S - 1.0},
+    "imu": (
+        BY_TARGET, {"external_position_age_s": 3.0}, {"dead_reckoning_since_s": NOW_S - 1.0},
         RawThrust,
+    ),
+    "nothing": (
+        BY_TARGET, {"external_position_age_s": 3.0, "age_s": 0.6},
+        {"dead_reckoning_since_s": NOW_S - 1.0}, RawThrust,
     ),
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
@@ -208,7 +211,7 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     ("observed", "with_decks", "is_target_positioned"),
     [
         ({}, PositionSetpoint, PositionSetpoint),
-        ({"position_age_s": 0.6}, RawThrust, RawThrust),
+        ({"external_position_age_s": 0.6}, RawThrust, RawThrust),
         (
             {"camera_imu_mismatch": CameraImuMismatch(camera_latency_error_s=0.2)},
             PositionSetpoint,
@@ -257,7 +260,7 @@ def uncorrected(for_s: float) -> dict[str, Any]:
     ("profile", "state", "observed", "placed"),
     [
         (MOCAP, {}, {}, True),
-        (MOCAP, {}, {"position_age_s": 0.6}, False),  # its last ones have it stand still
+        (MOCAP, {}, {"external_position_age_s": 0.6}, False),  # its last ones have it stand still
         (DECKS, {}, uncorrected(0.6), False),
         (DECKS, {}, uncorrected(0.3), True),
         # What once came down blindly, or went astray, believes no sight and no position again.
@@ -297,8 +300,8 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     ("known", "changes", "spent"),
     [
         # Nothing flies for long on the least thrust; on more it may, and motors stop on proof only.
-        ("nothing", {"thrust": 0.4 * HOVER_THRUST}, True),
-        ("nothing", {"thrust": 0.9 * HOVER_THRUST}, False),
+        ("nothing", {"last_commanded_raw_thrust": 0.4 * HOVER_THRUST}, True),
+        ("nothing", {"last_commanded_raw_thrust": 0.9 * HOVER_THRUST}, False),
         # What only ended the stream to a setpoint on the floor would be cut and locked.
         ("onboard", {"setpoint": PositionSetpoint(0.0, 0.0, 0.1, 0.0)}, True),
         ("onboard", {"setpoint": PositionSetpoint(0.0, 0.0, 1.0, 0.0)}, False),
@@ -328,7 +331,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
-        floor_detected_at_s=NOW_S - 0.5, thrust=half, dead_reckoning=aside,
+        floor_detected_at_s=NOW_S - 0.5, last_commanded_raw_thrust=half, dead_reckoning=aside,
     )  # fmt: skip
     state, command = descent.act(c)
     assert (state.descent.floor_detected_at_s is not None) is stands
@@ -339,7 +342,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 @pytest.mark.parametrize(("impact_mps", "floor"), [(-0.3, True), (0.3, False)])
 def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, floor: bool) -> None:
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
-    imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_at_s=NOW_S - 0.05)
+    imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_or_bounce_at_s=NOW_S - 0.05)
     struck = DeadReckoning(imu=imu, climb_before_impact_mps=impact_mps)
     c = context("imu", z_m=0.15, dead_reckoning=struck)
     c = Context(
@@ -354,7 +357,7 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     """The height may be wrong by as much: what sinks still is not on the floor, nor what climbs,
     as where the landing is ordered just after the lift-off."""
     sinks = {"velocity_mps": (0.0, 0.0, vz_mps)}
-    c = context("sight", z_m=0.0, tel=sinks, thrust=0.9 * HOVER_THRUST)
+    c = context("sight", z_m=0.0, tel=sinks, last_commanded_raw_thrust=0.9 * HOVER_THRUST)
     assert isinstance(descent.act(c)[1], StopMotors if stops else RawThrust)
 
 
@@ -379,13 +382,17 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
     dead_reckoning = DeadReckoning(
         imu=imu,
-        acceleration_bias_mps2=(acceleration_bias_mps2 * cos, acceleration_bias_mps2 * sin, 0.0),
+        acceleration_bias_world_mps2=(
+            acceleration_bias_mps2 * cos,
+            acceleration_bias_mps2 * sin,
+            0.0,
+        ),
         mean_specific_force_world_xy_mps2=(reads_mps2 * cos, reads_mps2 * sin),
         time_under_position_control_s=true_for_s,
     )
     c = context("imu", dead_reckoning=dead_reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(
-        NOW_S - age_s, (0.0, 0.0), dead_reckoning.acceleration_bias_mps2[:2], 0.0
+        NOW_S - age_s, (0.0, 0.0), dead_reckoning.acceleration_bias_world_mps2[:2], 0.0
     )
     c = context_at(c.state, replace(c.obs, imu=imu, visual_inertial_motion=felt), c.profile)
     command = descent.act(c)[1]
@@ -472,7 +479,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
         last_telemetry=telemetry(NOW_S, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
-        catch_setpoint_above_vehicle_m=1.0, condition_start_times_s={MOTORS_STOPPED: 0.0,
+        catch_setpoint_above_vehicle_m=1.0, condition_start_times_s={MOTORS_OFF_AS_COMMANDED: 0.0,
         BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
@@ -481,7 +488,9 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         later_s, telemetry=telemetry(later_s, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, **off)
     )
     after = observing(state, obs, profile)
-    assert after.belief.condition_start_times_s[MOTORS_STOPPED] == (later_s if stale else 0.0)
+    assert after.belief.condition_start_times_s[MOTORS_OFF_AS_COMMANDED] == (
+        later_s if stale else 0.0
+    )
     assert after.belief.condition_start_times_s[BATTERY_LOW] == 1.0
     assert (after.catch_setpoint_above_vehicle_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
@@ -504,7 +513,7 @@ def ended(
     floor_detected_at_s: float | None = None,
     **observed: Any,
 ) -> RestState:
-    seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
+    seen = {"target": None, "external_position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_commanded_at_s=NOW_S - 1.0,
@@ -585,7 +594,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     phase: Phase, gear_below_target_m: float
 ) -> None:
     """The loop comes back after 11 s, and the motors stand still already."""
-    seen = {"target": None, "position_age_s": 11.0, "imu": UNMOVED}
+    seen = {"target": None, "external_position_age_s": 11.0, "imu": UNMOVED}
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = remembering(
@@ -618,7 +627,7 @@ BIT = st.fixed_dictionaries(
         "supervisor": st.sampled_from([AIRBORNE, AIRBORNE, READY, AIRBORNE | HL_ACTIVE]),
         "age_s": st.sampled_from([0.01, 0.01, 0.15, 0.3, 0.7]),
         "behind_s": st.sampled_from([0.0, 0.0, 0.5]),
-        "position_age_s": st.sampled_from([0.02, 0.02, 0.6, 2.0, math.inf]),
+        "external_position_age_s": st.sampled_from([0.02, 0.02, 0.6, 2.0, math.inf]),
         "target": st.sampled_from(["seen", "unseen", "none"]),
         "once": st.sampled_from(
             [
@@ -682,7 +691,7 @@ def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
             yield felt(
                 observation(
                     t_s, telemetry=tel, target=None if bit["target"] == "none" else target,
-                    has_new_frame=seen, position_age_s=bit["position_age_s"],
+                    has_new_frame=seen, external_position_age_s=bit["external_position_age_s"],
                     **(bit["once"] if i == 0 else {}),
                 )
             )  # fmt: skip

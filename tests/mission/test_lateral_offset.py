@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.lateral_offset import (
     MAX_AGE_OF_NEWEST_PICTURE_S,
-    MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS,
-    LateralOffset,
+    MAX_VELOCITY_SIGMA_TO_PREDICT_MPS,
     LateralOffsetFilter,
+    LateralState,
     LateralVector,
     MotionSample,
 )
@@ -74,7 +74,7 @@ def watch(
     return filtered
 
 
-def known(filtered: LateralOffsetFilter, t_s: float) -> LateralOffset:
+def known(filtered: LateralOffsetFilter, t_s: float) -> LateralState:
     found = filtered.predict(t_s)
     assert found is not None
     return found
@@ -91,10 +91,10 @@ def test_the_offset_between_late_pictures_follows_the_lean(
     now = known(watch(motion, 2.0), 2.0)
     (ex, ey), (vx, vy), _ = motion(2.0)
     fastest_mps = 2.0 * math.pi * amplitude_m / period_s
-    assert now.offset_m == pytest.approx((ex, ey), abs=0.03 * amplitude_m)
-    assert now.velocity_mps == pytest.approx((vx, vy), abs=0.15 * fastest_mps)
+    assert now.gear_to_target_world_xy_m == pytest.approx((ex, ey), abs=0.03 * amplitude_m)
+    assert now.vehicle_velocity_world_xy_mps == pytest.approx((vx, vy), abs=0.15 * fastest_mps)
     held = math.hypot(*(a - b for a, b in zip(motion(1.92)[0], (ex, ey), strict=True)))
-    assert math.dist(now.offset_m, (ex, ey)) <= max(0.3 * held, 0.03 * amplitude_m)
+    assert math.dist(now.gear_to_target_world_xy_m, (ex, ey)) <= max(0.3 * held, 0.03 * amplitude_m)
 
 
 @AGAIN
@@ -113,8 +113,12 @@ def test_the_axes_may_point_anywhere(turn_rad: float, phase_rad: float) -> None:
         return rotate(offset), rotate(velocity), rotate(acceleration)
 
     here, there = known(watch(motion, 1.5), 1.5), known(watch(rotated, 1.5), 1.5)
-    assert there.offset_m == pytest.approx(rotate(here.offset_m), abs=1e-9)
-    assert there.velocity_mps == pytest.approx(rotate(here.velocity_mps), abs=1e-9)
+    assert there.gear_to_target_world_xy_m == pytest.approx(
+        rotate(here.gear_to_target_world_xy_m), abs=1e-9
+    )
+    assert there.vehicle_velocity_world_xy_mps == pytest.approx(
+        rotate(here.vehicle_velocity_world_xy_mps), abs=1e-9
+    )
 
 
 @AGAIN
@@ -126,7 +130,9 @@ def test_a_late_picture_corrects_the_moment_that_it_shows(
     motion = swaying(0.01, 1.5, phase_rad)
     prompt = watch(motion, 2.0, latency_s=0.0, last_picture_s=1.5)
     late = watch(motion, 2.0, latency_s=latency_s, last_picture_s=1.5)
-    assert known(late, 1.9).offset_m == pytest.approx(known(prompt, 1.9).offset_m, abs=1e-12)
+    assert known(late, 1.9).gear_to_target_world_xy_m == pytest.approx(
+        known(prompt, 1.9).gear_to_target_world_xy_m, abs=1e-12
+    )
 
 
 def test_the_spread_is_what_the_estimate_errs_by() -> None:
@@ -136,14 +142,16 @@ def test_the_spread_is_what_the_estimate_errs_by() -> None:
     for seed in range(60):
         motion = swaying(0.005, 1.7, 0.1 * seed)
         now = known(watch(motion, 1.5, sigma_m=sigma_m, seed=seed), 1.5)
-        error_m = np.subtract(now.offset_m, motion(1.5)[0])
-        squares += list((error_m / now.sigma_m) ** 2)
+        error_m = np.subtract(now.gear_to_target_world_xy_m, motion(1.5)[0])
+        squares += list((error_m / now.gear_to_target_sigma_m) ** 2)
     assert 0.05 < np.mean(squares) < 1.2
 
 
 def test_the_spread_grows_until_the_estimate_is_unknown() -> None:
     filtered = watch(swaying(0.005, 1.7, 0.0), 2.0, last_picture_s=1.5)
-    spreads = [known(filtered, 1.5 + t_s).sigma_m for t_s in np.linspace(0.0, 0.48, 10)]
+    spreads = [
+        known(filtered, 1.5 + t_s).gear_to_target_sigma_m for t_s in np.linspace(0.0, 0.48, 10)
+    ]
     assert spreads == sorted(spreads)
     assert spreads[-1] > 2.0 * spreads[0]
     assert filtered.predict(1.5 + MAX_AGE_OF_NEWEST_PICTURE_S + PICTURE_S) is None
@@ -155,7 +163,7 @@ def test_nothing_is_known_before_the_pictures_show_a_velocity() -> None:
     one = LateralOffsetFilter().with_picture_measurement(1.0, (0.0, 0.0), 0.001)
     assert one.predict(1.0) is None
     with_more = watch(swaying(0.005, 1.7, 0.0), 0.5)
-    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS
+    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_TO_PREDICT_MPS
 
 
 def test_a_step_of_the_pose_is_no_velocity() -> None:
@@ -163,8 +171,8 @@ def test_a_step_of_the_pose_is_no_velocity() -> None:
     filtered = watch(swaying(0.002, 2.0, 0.0), 1.0)
     t_s = filtered.t_s + PICTURE_S
     jumped = filtered.with_picture_measurement(t_s, (0.05, 0.0), 0.001)
-    assert jumped.offset_m == (0.05, 0.0)
-    assert jumped.velocity_mps == (0.0, 0.0)
+    assert jumped.gear_to_target_world_xy_m == (0.05, 0.0)
+    assert jumped.vehicle_velocity_world_xy_mps == (0.0, 0.0)
     assert jumped.predict(t_s) is None
 
 
@@ -181,4 +189,4 @@ def test_a_wrong_lean_moves_the_estimate_by_little(bias_mps2: float) -> None:
     the next picture corrects it."""
     motion = swaying(0.005, 1.7, 0.0)
     now = known(watch(motion, 2.0, acceleration_bias_mps2=bias_mps2), 2.0)
-    assert now.offset_m == pytest.approx(motion(2.0)[0], abs=0.0012)
+    assert now.gear_to_target_world_xy_m == pytest.approx(motion(2.0)[0], abs=0.0012)

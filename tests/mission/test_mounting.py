@@ -92,7 +92,9 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
     sight = make_mounting_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
     assert sight.vehicle_world_xy_m == pytest.approx(0.3 + 0.1j)
     assert sight.target_world_xy_m == pytest.approx(0.5 + 0.2j)
-    assert sight.up_axis_offset_xy_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
+    assert sight.vehicle_to_up_axis_world_xy_m == pytest.approx(
+        1.2j * math.sin(math.radians(10.0)), rel=0.02
+    )
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:

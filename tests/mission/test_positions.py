@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.belief.contact import current_gear_offset
-from perchctl.mission.belief.quality import MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
+from perchctl.mission.belief.contact import current_gear_to_target
+from perchctl.mission.belief.quality import MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.descent import MIN_LANDING_COMMANDS
 from perchctl.mission.planner import step_mission
@@ -52,7 +52,7 @@ UNREPORTED = changed({"link.unreported": ("variance",)})
 
 
 def hidden(age_s: float) -> dict[str, Any]:
-    return {"position_age_s": age_s, "position_problem": HIDDEN}
+    return {"external_position_age_s": age_s, "external_position_problem": HIDDEN}
 
 
 # --- In the air --------------------------------------------------------------------------
@@ -69,7 +69,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
     flight = fly(state_in(phase, z_m=z_m), look, 0.5, MOCAP)
     assert flight.state.phase in (*HELD_PHASES, Phase.PERCH)
     assert not flight.state.hold_reason
-    held = [tick for tick in flight.ticks if tick.obs.position_age_s > HOLD_S]
+    held = [tick for tick in flight.ticks if tick.obs.external_position_age_s > HOLD_S]
     assert len(held) >= 7
     for tick in held:
         assert HIDDEN in tick.state.hold_reason
@@ -331,7 +331,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
     assert math.hypot(
         *flight.state.belief.dead_reckoning.unexplained_position_step_sum_xy_m
     ) == pytest.approx(sigma_m, abs=1e-3)
-    assert current_gear_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
+    assert current_gear_to_target(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
 @pytest.mark.parametrize(
@@ -369,12 +369,12 @@ def test_an_image_of_the_contact_shows_where_the_gear_is(
         return at(obs={"target": target, "has_new_frame": True}, **changes)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.5, MOCAP, feels=True)
-    offset = current_gear_offset(flight.state.belief)
+    offset = current_gear_to_target(flight.state.belief)
     if sees:
-        assert offset.lateral_offset_m == pytest.approx(math.hypot(0.003, 0.002), abs=1e-6)
+        assert offset.distance_xy_m == pytest.approx(math.hypot(0.003, 0.002), abs=1e-6)
         assert offset.sigma_m == pytest.approx(0.0011 if image_age_s < 0.3 else 0.0014, abs=2e-4)
     else:
-        assert offset.lateral_offset_m == pytest.approx(0.012, abs=1e-3)
+        assert offset.distance_xy_m == pytest.approx(0.012, abs=1e-3)
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
@@ -518,7 +518,7 @@ def gains_beside(
 
 @pytest.mark.parametrize(
     "estimate_only_mps",
-    [0.9 * MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS, 1.1 * MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS],
+    [0.9 * MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS, 1.1 * MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS],
 )
 def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     estimate_only_mps: float,
@@ -531,7 +531,7 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.is_position_diverged is (
-        estimate_only_mps > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
+        estimate_only_mps > MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
     )
     assert isinstance(command, RawThrust) is state.belief.is_position_diverged
 

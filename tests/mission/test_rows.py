@@ -14,7 +14,7 @@ import pytest
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.mission import (
     CameraImuMismatch,
-    ContactOffset,
+    GearToTargetDistance,
     ImuMotion,
     Observation,
     OperatorRequest,
@@ -26,8 +26,8 @@ from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, Mounti
 from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
-    ALLOWED_TRANSITIONS,
     TABLE,
+    TRANSITIONS_ALLOWED_FOR_OWN_ROWS,
     Transition,
     add_rows,
     first_transition,
@@ -134,7 +134,7 @@ def blind(look: Look) -> Look:
 
 def unknown(t_s: float) -> Observation:
     """Motors off, neither the target nor a position of late, and a silence not long ago."""
-    obs = replace(at(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
+    obs = replace(at(CONTACT_Z_M, **OFF)(t_s), external_position_age_s=3.0, target=None)
     return replace(obs, imu=ImuMotion(t_s=t_s, last_gap_that_may_hide_fall_ended_at_s=BEGIN_S))
 
 
@@ -147,7 +147,7 @@ OFF = {"thrust": 0.0, "supervisor": READY}
 # row of the table: its case
 CASES: dict[str, Case] = {
     "operator-stop": Case(
-        P.ALIGN, P.ABORTED, seen(operator_request=OperatorRequest.STOP), 0.1, O.EMERGENCY,
+        P.ALIGN, P.ABORTED, seen(operator_request=OperatorRequest.CUT_MOTORS), 0.1, O.EMERGENCY,
         EmergencyStop
     ),
     "hung-but-locked": Case(
@@ -177,7 +177,8 @@ CASES: dict[str, Case] = {
         P.APPROACH, P.LANDING, aside(0.2, 0.01), 0.1, O.SAFETY, RawThrust, z_m=0.3, profile=MOCAP
     ),
     "position-lost": Case(
-        P.ALIGN, P.LANDING, seen(position_age_s=0.8, position_problem="occluded"), 0.1, O.SAFETY
+        P.ALIGN, P.LANDING,
+        seen(external_position_age_s=0.8, external_position_problem="occluded"), 0.1, O.SAFETY
     ),
     "estimator-jump": Case(
         P.ALIGN, P.LANDING, seen(has_estimated_position_jumped=True), 0.8, O.SAFETY
@@ -224,7 +225,7 @@ CASES: dict[str, Case] = {
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
             "entered_s": BEGIN_S, "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
-            "last_contact_offset": ContactOffset(0.01, 0.05),
+            "gear_to_target_at_last_contact": GearToTargetDistance(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
     ),
@@ -279,7 +280,7 @@ CASES: dict[str, Case] = {
         P.PERCH, P.COMPLETE, at(CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
     ),
     "pressed-blindly": Case(
-        P.PERCH, P.RECOVER, seen(position_age_s=1.3), 0.1, profile=BY_TARGET
+        P.PERCH, P.RECOVER, seen(external_position_age_s=1.3), 0.1, profile=BY_TARGET
     ),
     "knocked-aside": Case(
         P.PERCH, P.RECOVER, at(2.0, velocity_mps=(0.4, -0.4, 0.0)), 0.1, z_m=2.0
@@ -454,16 +455,25 @@ def test_the_phases_of_a_row_cannot_grow_in_flight() -> None:
 
 
 def test_no_row_of_your_own_may_climb_stop_or_prove() -> None:
-    assert {to for _, to, _ in ALLOWED_TRANSITIONS} == {P.SEARCH, P.ALIGN, P.RECOVER, P.LANDING}
-    assert all(how >= Severity.HOLD for *_, how in ALLOWED_TRANSITIONS)
-    assert [at for at, to, _ in ALLOWED_TRANSITIONS if at is to] == [P.ALIGN]  # where it waits
-    assert {at for at, _, _ in ALLOWED_TRANSITIONS} == PRE_LANDING_PHASES - {P.COMPLETE}
+    assert {to for _, to, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS} == {
+        P.SEARCH,
+        P.ALIGN,
+        P.RECOVER,
+        P.LANDING,
+    }
+    assert all(how >= Severity.HOLD for *_, how in TRANSITIONS_ALLOWED_FOR_OWN_ROWS)
+    assert [at for at, to, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS if at is to] == [
+        P.ALIGN
+    ]  # where it waits
+    assert {at for at, _, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS} == PRE_LANDING_PHASES - {
+        P.COMPLETE
+    }
 
 
 @pytest.mark.parametrize("change", [
     {"to": P.PERCH}, {"to": P.ASCEND}, {"to": P.PERCHED}, {"to": P.ABORTED}, {"to": P.SEARCH},
     {"severity": Severity.CONTINUE}, {"severity": Severity.STOP}, {"phases": {P.COMPLETE}},
-    {"phases": {P.LANDING}}, {"stop": StopMotors()}, {"outcome": Outcome.PERCHED},
+    {"phases": {P.LANDING}}, {"stop_command": StopMotors()}, {"outcome": Outcome.PERCHED},
     {"outcome": Outcome.ENDED_BY_OPERATOR}, {"phases": set()}, {"phases": iter([P.ALIGN])},
     {"reason": None},
     {"name": "fence"}, {"phases": {"ALIGN"}}, {"phases": P.ALIGN}, {"to": "LANDING"},

@@ -52,8 +52,8 @@ def unseen(z_m: float, since_s: float = 0.0, for_s: float | None = None, **tel: 
 
     def look(t_s: float) -> Observation:
         obs = {
-            "position_age_s": t_s - BEGIN_S + since_s if for_s is None else for_s,
-            "position_problem": "the target is not seen",
+            "external_position_age_s": t_s - BEGIN_S + since_s if for_s is None else for_s,
+            "external_position_problem": "the target is not seen",
             "has_new_frame": False,
         }
         return at(z_m, obs=obs, **tel)(t_s)
@@ -108,7 +108,9 @@ def test_what_sightings_contradict_is_not_flown_by(
     beside_m: float, age_s: float, lands: bool
 ) -> None:
     """It comes down level as soon as they have done so for longer than one of them may be wrong."""
-    seen = at(1.0, obs={"rejected_sighting_to_estimate_m": beside_m, "position_age_s": age_s})
+    seen = at(
+        1.0, obs={"rejected_sighting_to_estimate_m": beside_m, "external_position_age_s": age_s}
+    )
     state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
     assert (state.phase is Phase.LANDING) is lands
     assert ("from its estimate" in state.reason) is lands
@@ -147,7 +149,7 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     speed that the attitude leaves unsure is left alone."""
     assume(math.hypot(vx_mps, vy_mps) > 0.1)
     sinks = {"velocity_mps": (0.0, 0.0, -0.5), "yaw_rad": yaw_rad}
-    look = at(obs={"position_age_s": age_s}, **sinks)
+    look = at(obs={"external_position_age_s": age_s}, **sinks)
     command = fly(
         blinded(1.0, (vx_mps, vy_mps, -SINK_RATE_SETPOINT_MPS)), look, profile=PROFILE
     ).command
@@ -196,9 +198,10 @@ def test_pictures_that_come_late_are_no_blow(later_s: float, lost: int) -> None:
 
     def look(t_s: float) -> Observation:
         age_s = 0.07 + later_s + (t_s - BEGIN_S) % period_s
-        return at(obs={"position_age_s": age_s, "camera_latency_above_profile_s": later_s}, **slow)(
-            t_s
-        )
+        return at(
+            obs={"external_position_age_s": age_s, "camera_latency_above_profile_s": later_s},
+            **slow,
+        )(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 3.0, PROFILE, feels=True, one_phase=True)
     assert flight.state.phase is not Phase.LANDING
@@ -293,7 +296,8 @@ def pressed_past_the_sight(
             measured_s=BEGIN_S + TICK_S, sigma_m=np.full(3, sigma_m),
         )  # fmt: skip
         return at(
-            z_m, obs={"target": target, "has_new_frame": not i, "position_age_s": TICK_S * i},
+            z_m,
+            obs={"target": target, "has_new_frame": not i, "external_position_age_s": TICK_S * i},
             velocity_mps=(0.0, 0.0, -0.1 if i else 0.0), thrust=1.1 * HOVER_THRUST,
             acc_z_g=1.0 + climb_mps / GRAVITY_MPS2,
         )(t_s)  # fmt: skip

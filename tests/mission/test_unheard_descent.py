@@ -61,7 +61,7 @@ def test_the_velocity_is_that_of_the_target_turned_round(
     """Wherever the target is and however often it is seen; e^-10 is left of the low pass."""
     motion = watched(place_m, velocity_mps, rate_hz)
     assert motion.is_velocity_known
-    assert motion.vehicle_velocity_mps == pytest.approx(velocity_mps, abs=1e-3)
+    assert motion.vehicle_velocity_level_mps == pytest.approx(velocity_mps, abs=1e-3)
 
 
 @given(velocity_mps=speeds_mps, step_m=st.floats(0.1, 1.0))
@@ -71,17 +71,17 @@ def test_a_step_of_the_pose_is_no_motion(
     """As when the small marker takes over from the large one."""
     before = watched((0.0, 0.0, 1.0), velocity_mps, 30.0)
     t_s = before.t_s + 1 / 30
-    stepped = np.add(before.gear_to_target_vector_m, (0.0, 0.0, step_m))
+    stepped = np.add(before.gear_to_target_level_m, (0.0, 0.0, step_m))
     after = before.with_detection(replace(target_at(t_s), e_m=stepped))
-    assert after.vehicle_velocity_mps == before.vehicle_velocity_mps
-    assert after.gear_to_target_vector_m == pytest.approx(tuple(stepped))
+    assert after.vehicle_velocity_level_mps == before.vehicle_velocity_level_mps
+    assert after.gear_to_target_level_m == pytest.approx(tuple(stepped))
 
 
 def test_after_a_gap_the_motion_has_to_be_seen_again() -> None:
     seen = watched((0.0, 0.0, 1.0), (0.0, 0.0, -0.5), 30.0)
     again = seen.with_detection(target_at(seen.t_s + 1.1))
     assert not again.is_velocity_known
-    assert again.vehicle_velocity_mps == (0.0, 0.0, 0.0)
+    assert again.vehicle_velocity_level_mps == (0.0, 0.0, 0.0)
 
 
 # --- How it comes down by that --------------------------------------------------------------------
@@ -154,7 +154,9 @@ def come_down(
         target = target_at(
             t_s, body_m=(x_m, 0.0, z_m), measured_s=t_s - PICTURES_LATE_S, measured=now
         )
-        obs = observation(t_s, telemetry=heard, target=target, position_age_s=1.1 + TICK_S * i)
+        obs = observation(
+            t_s, telemetry=heard, target=target, external_position_age_s=1.1 + TICK_S * i
+        )
         obs = replace(obs, has_new_frame=now, visual_inertial_motion=felt)
         state, command = step_mission(state, look(obs), BY_TARGET)
         commands.append(command)

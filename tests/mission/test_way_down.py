@@ -11,12 +11,19 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.belief.contact import CONTACT, MOTORS_OFF_DWELL_S
+from perchctl.mission import (
+    GearToTargetDistance,
+    ImuMotion,
+    Observation,
+    Outcome,
+    Phase,
+    PlannerState,
+)
+from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, TARGET_CONTACT
 from perchctl.mission.descent import (
-    MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M,
+    MAX_ASSUMED_HEIGHT_DRIFT_M,
     ONBOARD_LANDING_DURATION_MARGIN_S,
-    ONBOARD_LANDING_MEAN_SPEED_MPS,
+    ONBOARD_LANDING_PEAK_SPEED_MPS,
     make_onboard_landing_command,
 )
 from perchctl.mission.planner import step_mission
@@ -298,7 +305,7 @@ class InAHand(Motors):
         if unseen_s:
             target = replace(target, measured=False, tracked=False, measured_s=self.seen_until_s)
         tel = telemetry(t_s, thrust=self.thrust, position_m=at_m)
-        return observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
+        return observation(t_s, telemetry=tel, target=target, external_position_age_s=unseen_s)
 
 
 @pytest.mark.parametrize(
@@ -405,8 +412,8 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
     assert {"beside-the-magnet", row} <= flight.rows
     assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
     if ends is Phase.PERCHED:
-        assert flight.state.belief.last_contact_offset is not None
-        assert flight.state.belief.last_contact_offset.lateral_offset_m == pytest.approx(
+        assert flight.state.belief.gear_to_target_at_last_contact is not None
+        assert flight.state.belief.gear_to_target_at_last_contact.distance_xy_m == pytest.approx(
             lateral_offset_m
         )
 
@@ -421,20 +428,25 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     share: float, steady_s: float, since_s: float, touched: bool
 ) -> None:
     tel = telemetry(10.02, HANG_Z_M, thrust=share * HOVER_THRUST)
-    pressing = landing(phase=Phase.PERCH, condition_start_times_s={CONTACT: since_s})
+    pressing = landing(phase=Phase.PERCH, condition_start_times_s={TARGET_CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
     obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_steady_since_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
-    assert (after.belief.last_contact_offset is not None) is touched
+    assert (after.belief.gear_to_target_at_last_contact is not None) is touched
 
 
 def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_recovered() -> None:
     """Steady because it sticks there, the next attempt would begin pressed."""
-    touched = hanging(Phase.RECOVER, last_contact_offset=ContactOffset(0.01, 0.02))
+    touched = hanging(
+        Phase.RECOVER, gear_to_target_at_last_contact=GearToTargetDistance(0.01, 0.02)
+    )
     state = fly(touched, at(HANG_Z_M - 0.1)).state
-    assert (state.belief.vehicle_world_z_at_last_contact_m, state.belief.last_contact_offset) == (
+    assert (
+        state.belief.vehicle_world_z_at_last_contact_m,
+        state.belief.gear_to_target_at_last_contact,
+    ) == (
         None,
         None,
     )
@@ -604,7 +616,7 @@ HIGH = landing(1.8, stop_or_land_command_count=3, last_stop_or_land_command_at_s
         # how far above.
         (HIGH, cut(1.5, -0.3), True),
         (HIGH, cut(0.3, -0.3), False),
-        (HIGH, cut(1.5, -0.3, position_age_s=2.0), False),
+        (HIGH, cut(1.5, -0.3, external_position_age_s=2.0), False),
     ],
     ids=["overdue", "cut", "stands", "drops", "falls", "cut high", "cut low", "cut unplaced"],
 )
@@ -623,11 +635,11 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
     order = make_onboard_landing_command(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MAX_HEIGHT_DRIFT_FOR_ONBOARD_LANDING_M, config.drift_mps * flown_s)
+    drift_m = min(MAX_ASSUMED_HEIGHT_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
     assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_DURATION_MARGIN_S) == pytest.approx(
-        ONBOARD_LANDING_MEAN_SPEED_MPS
+        ONBOARD_LANDING_PEAK_SPEED_MPS
     )
 
 

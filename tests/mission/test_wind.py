@@ -148,7 +148,7 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
             is_estimated_velocity_being_corrected=True,
         )
     (bx, by, _), (x_mps2, y_mps2) = (
-        dead_reckoning.acceleration_bias_mps2,
+        dead_reckoning.acceleration_bias_world_mps2,
         dead_reckoning.mean_specific_force_world_xy_mps2,
     )
     assert (bx - x_mps2) / 9.81 == pytest.approx(-wind_g * math.cos(towards_rad), abs=0.01)
@@ -166,7 +166,7 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
         unseen_s = max(0.0, t_s - lost_s)
         shakes_g = 0.1 * math.sin(4.0 * math.pi * t_s)  # as in a draught: it does not rest
         pushed = {"acc_x_g": push_g if unseen_s > 0.2 else 0.0, "acc_z_g": 1.0 + shakes_g}
-        obs = at(1.9, obs={"position_age_s": 0.05 + unseen_s}, **pushed)(t_s)
+        obs = at(1.9, obs={"external_position_age_s": 0.05 + unseen_s}, **pushed)(t_s)
         if not unseen_s:
             return obs
         assert obs.target is not None
@@ -179,8 +179,8 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
         tick.state.belief.dead_reckoning for tick in flight.ticks if tick.t_s > lost_s + 0.2
     )
     last = flight.state.belief.dead_reckoning
-    assert last.acceleration_bias_mps2[0] == pytest.approx(
-        first.acceleration_bias_mps2[0], abs=1e-6
+    assert last.acceleration_bias_world_mps2[0] == pytest.approx(
+        first.acceleration_bias_world_mps2[0], abs=1e-6
     )
     way_m = 0.5 * 9.81 * push_g * 0.5**2
     assert first.gear_to_target_world_xy_m[0] - last.gear_to_target_world_xy_m[0] == pytest.approx(

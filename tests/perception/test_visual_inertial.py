@@ -117,7 +117,7 @@ def test_a_delay_is_found_and_the_speed_with_it(
     assert mismatch.camera_latency_error_s == pytest.approx(later_s, abs=1.5 * STEP_S)
     *true_mps, true_climb_mps = swing.velocity_mps(motion.t_s)
     # Between two delays of the grid the speed is off by 0.06 m/s at the most.
-    assert motion.lateral_velocity_mps == pytest.approx(true_mps, abs=0.07)
+    assert motion.velocity_world_xy_mps == pytest.approx(true_mps, abs=0.07)
     assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.07)
 
 
@@ -188,7 +188,7 @@ def test_a_turned_camera_is_found(quarters: int) -> None:
     assert motion is not None
     assert mismatch.camera_latency_error_s == 0.0
     assert mismatch.camera_yaw_error_rad == pytest.approx(turned_rad)
-    assert motion.lateral_velocity_mps == pytest.approx(
+    assert motion.velocity_world_xy_mps == pytest.approx(
         swing.velocity_mps(motion.t_s)[:2], abs=0.03
     )
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import (
-    ExternalPositions,
+    ExternalPositionStatus,
     FrameRecord,
     Observation,
     OperatorRequest,
@@ -84,7 +84,7 @@ def test_an_observation_comes_back(
     obs = Observation(
         number, telemetry, target, True, math.inf,
         camera_problem="no picture \u2028 for 1 s", operator_request=operator,
-        position_age_s=number,
+        external_position_age_s=number,
     )  # fmt: skip
     assert comes_back(Observation, obs)
     assert comes_back(Observation, Observation(0.0, telemetry))
@@ -139,10 +139,10 @@ def whole_turn() -> TickRecord:
         row_name="fence",
         is_holding_position=True,
         failed_attempts=2,
-        external_positions=ExternalPositions(0.1, None, 3, 99.0, None),
+        external_positions=ExternalPositionStatus(0.1, None, 3, 99.0, None),
         outcome=Outcome.SAFETY,
         reason="beyond the fence",
-        error="KeyError",
+        planner_exception_name="KeyError",
     )
 
 

@@ -15,7 +15,7 @@ from perchctl.mission import (
     CameraFindings,
     Event,
     EventKind,
-    ExternalPositions,
+    ExternalPositionStatus,
     FlightReport,
     Outcome,
     Phase,
@@ -118,7 +118,7 @@ def test_every_field_is_filled_by_something() -> None:
             target=pose,
             consistency=CameraErrors(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
             delay_used_s=0.005,
-            outside=ExternalPositions(0.012, "hidden", 7, 99.0, place),
+            outside=ExternalPositionStatus(0.012, "hidden", 7, 99.0, place),
         )
         record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}

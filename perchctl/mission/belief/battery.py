@@ -69,7 +69,7 @@ MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.0
 """Lower bound of the fitted ratio."""
 MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO = 3.0
 """Upper bound of the fitted ratio."""
-VOLTAGE_READING_SIGMA_V = 0.02
+ONE_SECOND_MEAN_VOLTAGE_SIGMA_V = 0.02
 """Standard deviation of one second of averaged voltage readings, V."""
 BATTERY_FIT_TIME_CONSTANT_S = 40.0
 """Time constant with which the fit forgets old readings, s. Larger: the fit follows a change of
@@ -78,7 +78,7 @@ REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
 THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 """Time constant with which the voltage reading follows a change of thrust, s."""
-MAX_THRUST_DEVIATION_TO_USE_VOLTAGE_FRACTION = 0.06
+MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE = 0.06
 """Largest difference between the current load and the filtered load, as a share of full thrust. A
 reading with a larger difference belongs to an earlier thrust and is not used."""
 MIN_COUNTED_CHARGE_FRACTION = 0.05
@@ -132,8 +132,8 @@ class BatteryFit:
     takeoff_rest_v: float | None = None
     counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
     # load, low-pass filtered with `THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
-    filtered_thrust_fraction: float = 0.0
-    mean_thrust_fraction: float = 0.0  # mean over the last seconds in the air
+    lagged_thrust_fraction: float = 0.0
+    mean_airborne_thrust_fraction: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
     time_under_load_s: float = 0.0  # total time of readings under load
     time_since_battery_reading_s: float = 0.0  # time since the last reading
@@ -212,17 +212,19 @@ def update_battery_fit(
         + thrust_fraction
         * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
         * dt_s,
-        filtered_thrust_fraction=_low_pass(
-            state.filtered_thrust_fraction,
+        lagged_thrust_fraction=_low_pass(
+            state.lagged_thrust_fraction,
             thrust_fraction,
             dt_s / THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S,
         ),
     )
     if thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
-        known = dt_s / 3.0 if state.mean_thrust_fraction else 1.0
+        known = dt_s / 3.0 if state.mean_airborne_thrust_fraction else 1.0
         state = replace(
             state,
-            mean_thrust_fraction=_low_pass(state.mean_thrust_fraction, thrust_fraction, known),
+            mean_airborne_thrust_fraction=_low_pass(
+                state.mean_airborne_thrust_fraction, thrust_fraction, known
+            ),
         )
     # reduce the last estimate by the charge that the thrust consumes
     if not is_battery_reading(battery_v):
@@ -233,7 +235,7 @@ def update_battery_fit(
             return state
         spent = (
             fit_sag_model(state).true_to_counted_discharge_ratio
-            * state.filtered_thrust_fraction
+            * state.lagged_thrust_fraction
             * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
             * dt_s
         )
@@ -245,21 +247,21 @@ def update_battery_fit(
     if thrust_fraction == 0.0 and not state.time_under_load_s:
         return replace(state, takeoff_rest_v=battery_v, rest_v=battery_v)
     if (
-        abs(thrust_fraction - state.filtered_thrust_fraction)
-        > MAX_THRUST_DEVIATION_TO_USE_VOLTAGE_FRACTION
+        abs(thrust_fraction - state.lagged_thrust_fraction)
+        > MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE
     ):
         return state
     if state.takeoff_rest_v is None:
         state = replace(
             state,
-            takeoff_rest_v=battery_v + TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction,
+            takeoff_rest_v=battery_v + TYPICAL_FULL_THRUST_SAG_V * state.lagged_thrust_fraction,
         )
-    if state.filtered_thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
+    if state.lagged_thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
         fit = _add_voltage_reading_to_sums(state, dt_s, battery_v)
         state = replace(
             state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
         )
-    now_v = battery_v + fit_sag_model(state).full_thrust_sag_v * state.filtered_thrust_fraction
+    now_v = battery_v + fit_sag_model(state).full_thrust_sag_v * state.lagged_thrust_fraction
     rest_v = (
         now_v
         if state.rest_v is None
@@ -323,16 +325,19 @@ def _add_voltage_reading_to_sums(
     off_v = (
         state.takeoff_rest_v
         - battery_v
-        - TYPICAL_FULL_THRUST_SAG_V * state.filtered_thrust_fraction
+        - TYPICAL_FULL_THRUST_SAG_V * state.lagged_thrust_fraction
         - TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO * spent_v
     )
-    weight, keep = dt_s / VOLTAGE_READING_SIGMA_V**2, math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S)
+    weight, keep = (
+        dt_s / ONE_SECOND_MEAN_VOLTAGE_SIGMA_V**2,
+        math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S),
+    )
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
     return NormalEquationSums(
-        a + weight * state.filtered_thrust_fraction * state.filtered_thrust_fraction,
-        b + weight * state.filtered_thrust_fraction * spent_v,
+        a + weight * state.lagged_thrust_fraction * state.lagged_thrust_fraction,
+        b + weight * state.lagged_thrust_fraction * spent_v,
         c + weight * spent_v * spent_v,
-        p + weight * state.filtered_thrust_fraction * off_v,
+        p + weight * state.lagged_thrust_fraction * off_v,
         q + weight * spent_v * off_v,
     )
 

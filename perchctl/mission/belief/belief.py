@@ -15,7 +15,7 @@ from typing import Any
 from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.lateral_offset import LateralOffset, LateralOffsetFilter
+from perchctl.mission.belief.lateral_offset import LateralOffsetFilter, LateralState
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.motion import ZERO_VECTOR, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
@@ -48,23 +48,23 @@ like a thrust that the vehicle does not follow."""
 
 
 @dataclass(frozen=True)
-class ContactOffset:
+class GearToTargetDistance:
     """Horizontal distance between the gear and the target's axis at a touch, m, and its standard
     deviation, m, which is infinite if unknown."""
 
-    lateral_offset_m: float
+    distance_xy_m: float
     sigma_m: float
 
-    def is_within(self, radius_m: float) -> bool:
-        """True if the offset plus one standard deviation is at most `radius_m`."""
-        return self.lateral_offset_m + self.sigma_m <= radius_m
+    def is_certainly_within(self, radius_m: float) -> bool:
+        """True if the distance plus one standard deviation is at most `radius_m`."""
+        return self.distance_xy_m + self.sigma_m <= radius_m
 
     @property
     def text(self) -> str:
-        """The offset in words, for example ``1.8 +- 0.6 mm off centre``."""
+        """The distance in words, for example ``1.8 +- 0.6 mm off centre``."""
         if not math.isfinite(self.sigma_m):
             return "at an unknown distance from the centre"
-        return f"{1e3 * self.lateral_offset_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
+        return f"{1e3 * self.distance_xy_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,7 +111,7 @@ class Belief:
     mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
     #: height of the body where the magnet may hold it
     vehicle_world_z_at_last_contact_m: float | None = None
-    last_contact_offset: ContactOffset | None = None  #: offset at the last contact
+    gear_to_target_at_last_contact: GearToTargetDistance | None = None
     #: time since which the gear is within the magnet's reach
     in_magnet_reach_since_s: float | None = None
     #: start time of each true condition
@@ -183,7 +183,7 @@ class Belief:
     # --- Reliability of the position ---
 
     @cached_property
-    def is_positioned_by_target(self) -> bool:
+    def is_target_position_source(self) -> bool:
         """True if the positions come from the target itself, without a deck or motion capture."""
         return self.profile.positioning.source.is_target
 
@@ -220,17 +220,19 @@ class Belief:
         )
 
     @cached_property
-    def position_age_s(self) -> float:
+    def position_correction_age_s(self) -> float:
         """Age, s, of the newest external position sent to the vehicle; with decks, age of the
         newest correction of the state estimate."""
         if self.profile.positioning.source.is_deck:
-            return max(self.obs.position_age_s, self.obs.imu.fusion_age.age_s(self.obs.t_s))
-        return self.obs.position_age_s
+            return max(
+                self.obs.external_position_age_s, self.obs.imu.fusion_age.age_s(self.obs.t_s)
+            )
+        return self.obs.external_position_age_s
 
     @cached_property
     def is_position_stale(self) -> bool:
         """True if the position is older than `positioning.hold_s`, too old for position control."""
-        return self.position_age_s > self.profile.positioning.hold_s
+        return self.position_correction_age_s > self.profile.positioning.hold_s
 
     @cached_property
     def is_position_trusted(self) -> bool:
@@ -238,7 +240,7 @@ class Belief:
         `POSITION_SETTLING_AFTER_GAP_S`, have not led the vehicle away from its setpoint (diverged)
         and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
-            self.is_positioned_by_target and self.obs.camera_imu_mismatch is not None
+            self.is_target_position_source and self.obs.camera_imu_mismatch is not None
         )
         returns = (
             self.position_last_stale_at_s is not None
@@ -262,7 +264,8 @@ class Belief:
         """True while the newest external position still corrects the estimated velocity: it is at
         most `MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S` older than the camera's latency."""
         return (
-            self.position_age_s <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
+            self.position_correction_age_s
+            <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
         )
 
     @cached_property
@@ -271,7 +274,7 @@ class Belief:
         corrects the estimate. The firmware's estimator ignores lateral forces."""
         is_reckoned = self.dead_reckoning.imu is not None
         if not (
-            self.is_positioned_by_target
+            self.is_target_position_source
             and is_reckoned
             and not self.is_estimated_velocity_being_corrected
         ):
@@ -311,7 +314,7 @@ class Belief:
         """True if only accelerometer and attitude remain for a descent: with the target as the
         position source, once `can_descend_by_target` is false; with a deck or motion capture, while
         positions are missing or too new to be trusted, but not once they have diverged."""
-        if self.is_positioned_by_target:
+        if self.is_target_position_source:
             return not self.can_descend_by_target
         return not (self.is_position_trusted or self.is_position_diverged)
 
@@ -323,11 +326,11 @@ class Belief:
         alternative, raw thrust). With the target as the source, `can_descend_by_target` must hold
         as well."""
         lost = self.is_position_diverged or self.dead_reckoning_since_s is not None
-        if lost or (self.is_positioned_by_target and not self.can_descend_by_target):
+        if lost or (self.is_target_position_source and not self.can_descend_by_target):
             return False
         # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
-        return not (self.is_heading_lost and (self.is_positioned_by_target or heard))
+        return not (self.is_heading_lost and (self.is_target_position_source or heard))
 
     # --- Motion ---
 
@@ -431,7 +434,7 @@ class Belief:
         )
 
     @cached_property
-    def lateral_offset(self) -> LateralOffset | None:
+    def lateral_state(self) -> LateralState | None:
         """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, in
         world axes, estimated from pictures and lean. None if the last pictures are too old or too
         few. None, too, if they contradict the vehicle's motion: the camera may then be mounted
@@ -455,7 +458,7 @@ class Belief:
     def does_camera_motion_match_vehicle(self) -> bool:
         """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
         the target is the positioning system, otherwise with its state estimate."""
-        if self.is_positioned_by_target:
+        if self.is_target_position_source:
             return (
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None
             )
@@ -464,7 +467,7 @@ class Belief:
         )
 
     @property
-    def is_in_magnet_reach(self) -> bool:
+    def is_possibly_in_magnet_reach(self) -> bool:
         """True if the magnet may hold the vehicle: after a contact, or once dead reckoning places
         the gear within its reach."""
         return (

@@ -8,9 +8,9 @@ distinguish the magnet from the floor, and both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
-height (`CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and against
-an unknown object without a position (`IMU_SHOWS_SUPPORT`). The last one also covers too little
-thrust, by the same threshold below hover thrust as the other is above it:
+height (`TARGET_CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and
+against an unknown object without a position (`IMU_SHOWS_SUPPORT`). The last one also covers too
+little thrust, by the same threshold below hover thrust as the other is above it:
 `MIN_PRESS_TO_HOVER_THRUST_RATIO` moves all of these, and `Support.AIR`. `HANGING`,
 `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to support the vehicle
 (`is_thrust_too_low_to_fly`).
@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from perchctl.mission.belief.belief import Belief, ContactOffset
+from perchctl.mission.belief.belief import Belief, GearToTargetDistance
 from perchctl.mission.belief.evidence import Condition, RequiredData
 from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
 from perchctl.profile import Profile
@@ -72,14 +72,14 @@ target is accepted. Smaller: a true contact is rejected if the last sighting is 
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
 """Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
 climb is detected late."""
-TOUCH_OFFSET_SIGMA_M = 0.001
+GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
 LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
 """Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice what a
 settled one moves. Larger: a contact's offset is reported less precisely than it is known."""
-POSITION_DECK_SIGMA_ADDED_BY_IMPACT_M = 0.002
+DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
-POSITION_DECK_SIGMA_GROWTH_MPS = 0.01
+DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
 MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M = 0.02
 """Upward drift of the estimate in spite of which a slip is still detected, m."""
@@ -120,16 +120,16 @@ HANGING_CONFIRMATION_DWELL_S = 1.0
 # --- Offset of the gear from the target ---
 
 
-def current_gear_offset(b: Belief) -> ContactOffset:
+def current_gear_to_target(b: Belief) -> GearToTargetDistance:
     """Return the distance between the gear and the target's axis, with its standard deviation: in a
     contact, from the newest image if that is more precise, otherwise by dead reckoning from the
     last sighting. With decks, the standard deviation then grows, because the estimated position
     drifts and the impact on the ceiling disturbs it."""
-    reckoned, seen = _reckoned_gear_offset(b), _gear_offset_seen_in_contact(b)
+    reckoned, seen = _reckoned_gear_to_target(b), _gear_to_target_seen_in_contact(b)
     return reckoned if seen is None or reckoned.sigma_m < seen.sigma_m else seen
 
 
-def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
+def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     """Return the distance between the gear and the target's axis in the newest image that shows the
     target, if that image was exposed during the present contact or just before it; otherwise None.
 
@@ -145,7 +145,7 @@ def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
         or target.measured_offset_m is None
         or b.obs.camera_imu_mismatch is not None
         or b.mounting.is_camera_mounting_wrong
-        or not _is_in_contact(b)
+        or not _is_in_contact_with_target(b)
     ):
         return None
     x_m, y_m, z_m = target.measured_offset_m.tolist()
@@ -155,35 +155,35 @@ def _gear_offset_seen_in_contact(b: Belief) -> ContactOffset | None:
         return None
     sigma_m = math.hypot(
         target.measured_offset_sigma_m,
-        TOUCH_OFFSET_SIGMA_M,
+        GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M,
         LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS * before_touch_s,
     )
-    return ContactOffset(math.hypot(x_m, y_m), sigma_m)
+    return GearToTargetDistance(math.hypot(x_m, y_m), sigma_m)
 
 
-def _reckoned_gear_offset(b: Belief) -> ContactOffset:
+def _reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
     dead_reckoning = b.dead_reckoning
     sigma_m = math.hypot(
         dead_reckoning.gear_to_target_sigma_m,
-        TOUCH_OFFSET_SIGMA_M,
+        GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M,
         *dead_reckoning.unexplained_position_step_sum_xy_m,
     )
     if b.profile.positioning.source.is_deck and b.is_position_valid:
         sigma_m = math.hypot(
             sigma_m,
-            POSITION_DECK_SIGMA_ADDED_BY_IMPACT_M,
-            POSITION_DECK_SIGMA_GROWTH_MPS * b.sighting_age_s,
+            DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M,
+            DECK_POSITION_SIGMA_GROWTH_MPS * b.sighting_age_s,
         )
-    return ContactOffset(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
+    return GearToTargetDistance(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
 
 
-def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
-    """Return the gear's offset from the target's axis at the last touch, while the vehicle retreats
-    from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, or once motion
-    capture shows that the vehicle has left the position of that touch."""
+def gear_to_target_at_last_touch(b: Belief) -> GearToTargetDistance | None:
+    """Return the gear's distance from the target's axis at the last touch, while the vehicle
+    retreats from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, or once
+    motion capture shows that the vehicle has left the position of that touch."""
     if (
         not b.command_history.maneuver.retreats_after_attempt
-        or b.last_contact_offset is None
+        or b.gear_to_target_at_last_contact is None
         or b.target.is_fresh
     ):
         return None
@@ -195,12 +195,12 @@ def gear_offset_at_last_touch(b: Belief) -> ContactOffset | None:
     by_capture = b.profile.positioning.source.is_mocap and b.is_position_valid
     if by_capture and away_m > b.profile.planner.perch.contact_xy_m:
         return None
-    return b.last_contact_offset
+    return b.gear_to_target_at_last_contact
 
 
-def gear_offset_at_last_touch_or_now(b: Belief) -> ContactOffset:
-    """Return the offset of the last touch while it is valid, otherwise the current offset."""
-    return gear_offset_at_last_touch(b) or current_gear_offset(b)
+def gear_to_target_at_last_touch_or_now(b: Belief) -> GearToTargetDistance:
+    """Return the distance at the last touch while it is valid, otherwise the current distance."""
+    return gear_to_target_at_last_touch(b) or current_gear_to_target(b)
 
 
 def contact_height_tolerance_m(b: Belief) -> float:
@@ -209,12 +209,12 @@ def contact_height_tolerance_m(b: Belief) -> float:
 
     The tolerance grows with the time since the last sighting, because the estimated height drifts.
     It is at most twice `perch.contact_z_m`, so that an obstacle further below is not mistaken for
-    the target. The condition `CONTACT`, which proves a touch of the target, uses its own
+    the target. The condition `TARGET_CONTACT`, which proves a touch of the target, uses its own
     tolerances.
     """
     planner = b.profile.planner
     drift_mps = (
-        MAX_HEIGHT_DRIFT_IN_PRESS_MPS if b.is_positioned_by_target else planner.landing.drift_mps
+        MAX_HEIGHT_DRIFT_IN_PRESS_MPS if b.is_target_position_source else planner.landing.drift_mps
     )
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
 
@@ -227,7 +227,7 @@ def is_at_contact_height(b: Belief) -> bool:
 def is_gear_certainly_in_magnet_reach(b: Belief) -> bool:
     """True if the gear is at the target's height and so close to its axis that the magnet reaches
     it: the offset plus one standard deviation is at most `perch.contact_xy_m`."""
-    near = current_gear_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
+    near = current_gear_to_target(b).is_certainly_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
 
 
@@ -318,7 +318,7 @@ def is_slipping(b: Belief) -> bool:
     )
 
 
-def is_motionless(b: Belief) -> bool:
+def is_vertically_motionless(b: Belief) -> bool:
     """True if the vehicle is supported and does not move vertically: the accelerometer reads 1 g
     and, if the position is valid, the vertical speed is almost zero."""
     return b.is_accelerometer_reading_one_g and (
@@ -326,7 +326,7 @@ def is_motionless(b: Belief) -> bool:
     )
 
 
-def _is_in_contact(b: Belief) -> bool:
+def _is_in_contact_with_target(b: Belief) -> bool:
     """True if position, acceleration and thrust together show a contact.
 
     The gear has stopped at the target's height, the accelerometer reads 1 g, and the thrust exceeds
@@ -338,7 +338,7 @@ def _is_in_contact(b: Belief) -> bool:
     return (
         abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
-        + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_positioned_by_target else 0)
+        + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_target_position_source else 0)
         and (steady or motionless_s >= perch.contact_dwell_s)
         and b.is_accelerometer_reading_one_g
         and b.hover_thrust > 0
@@ -351,7 +351,7 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
     return (
         is_thrust_too_low_to_fly(b)
         and not is_slipping(b)
-        and (b.is_position_valid or is_motionless(b))
+        and (b.is_position_valid or is_vertically_motionless(b))
     )
 
 
@@ -360,7 +360,7 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
     return (
         b.command_history.release_began_at_s is not None
         and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
-        and is_motionless(b)
+        and is_vertically_motionless(b)
         and not is_slipping(b)
     )
 
@@ -371,11 +371,11 @@ def _is_hanging(b: Belief) -> bool:
     slow release is safe for both."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.is_position_valid:
-        return is_thrust_too_low_to_fly(b) and is_motionless(b)
+        return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
     held = (
         is_thrust_too_low_to_fly(b)
         and b.height_m > MAX_DRIFTED_HEIGHT_STANDING_ON_FLOOR_M
-        and is_motionless(b)
+        and is_vertically_motionless(b)
     )
     if not b.command_history.maneuver.descends_to_floor:
         return held
@@ -410,7 +410,7 @@ def _is_raw_thrust_commanded(b: Belief) -> bool:
     return (b.command_history.raw_thrust or 0) > 0
 
 
-def _have_motors_stopped(b: Belief) -> bool:
+def _are_motors_off_as_commanded(b: Belief) -> bool:
     return _are_motors_off(b) and not _is_raw_thrust_commanded(b)
 
 
@@ -432,7 +432,7 @@ def _is_on_floor(b: Belief) -> bool:
     )
     handover_m = b.profile.planner.landing.handover_m
     low = b.height_m < handover_m or (came_down and b.vehicle_world_z_at_last_contact_m is None)
-    return is_thrust_too_low_to_fly(b) and low and not near_target and is_motionless(b)
+    return is_thrust_too_low_to_fly(b) and low and not near_target and is_vertically_motionless(b)
 
 
 def _is_pressing_against_obstacle(b: Belief) -> bool:
@@ -448,7 +448,7 @@ def _is_pressing_against_obstacle(b: Belief) -> bool:
         b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
         and is_above_hover_thrust(b)
     )
-    return strong and b.height_m > MIN_HEIGHT_OF_BLOCKED_CLIMB_M and is_motionless(b)
+    return strong and b.height_m > MIN_HEIGHT_OF_BLOCKED_CLIMB_M and is_vertically_motionless(b)
 
 
 def _does_imu_show_support(b: Belief) -> bool:
@@ -480,7 +480,9 @@ def _is_thrust_saturated(b: Belief) -> bool:
     )
 
 
-CONTACT = Condition("contact", _is_in_contact, required_data=RequiredData.POSITION)
+TARGET_CONTACT = Condition(
+    "contact", _is_in_contact_with_target, required_data=RequiredData.POSITION
+)
 """Contact with the target, proven by position, acceleration and thrust."""
 MAGNET_HOLDS_VEHICLE = Condition(
     "magnet holds", _is_magnet_holding_vehicle, required_data=RequiredData.TELEMETRY
@@ -494,8 +496,8 @@ HANGING_WITH_MOTORS_STOPPED = Condition(
 """The whole weight hangs: the motors stand still, and nothing slips."""
 HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
 """Something holds the vehicle up, off the floor."""
-MOTORS_STOPPED = Condition(
-    "motors stopped", _have_motors_stopped, required_data=RequiredData.TELEMETRY
+MOTORS_OFF_AS_COMMANDED = Condition(
+    "motors stopped", _are_motors_off_as_commanded, required_data=RequiredData.TELEMETRY
 )
 """The motors are off, and the last command does not let them turn."""
 MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
@@ -524,12 +526,12 @@ THRUST_SATURATED_WITHOUT_CLIMB = Condition(
 )
 """The thrust is at its limit, and the vehicle does not climb."""
 SUPPORT_CONDITIONS = (
-    CONTACT,
+    TARGET_CONTACT,
     MAGNET_HOLDS_VEHICLE,
     SLIPPING,
     HANGING_WITH_MOTORS_STOPPED,
     HANGING,
-    MOTORS_STOPPED,
+    MOTORS_OFF_AS_COMMANDED,
     MOTORS_OFF_DESPITE_THRUST_COMMAND,
     ON_FLOOR,
     CLIMB_BLOCKED,
@@ -566,7 +568,7 @@ def find_support(b: Belief) -> Support:
         return _find_what_vehicle_hangs_on(b)
     if ON_FLOOR in b.condition_start_times_s:
         return Support.FLOOR
-    if CONTACT in b.condition_start_times_s or CLIMB_BLOCKED in b.condition_start_times_s:
+    if TARGET_CONTACT in b.condition_start_times_s or CLIMB_BLOCKED in b.condition_start_times_s:
         return Support.PRESSED_SURFACE
     flies = (
         is_flying_at_hover_thrust(b)
@@ -577,12 +579,12 @@ def find_support(b: Belief) -> Support:
 
 
 def _find_what_vehicle_hangs_on(b: Belief) -> Support:
-    touched, radius_m = gear_offset_at_last_touch(b), b.profile.planner.perch.contact_xy_m
-    was_near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
+    touched, radius_m = gear_to_target_at_last_touch(b), b.profile.planner.perch.contact_xy_m
+    was_near = touched is not None and max(touched.distance_xy_m, touched.sigma_m) <= radius_m
     if was_near or is_gear_certainly_in_magnet_reach(b):
         return Support.MAGNET
-    offset = gear_offset_at_last_touch_or_now(b)
-    is_off_axis = offset.lateral_offset_m - 2.0 * offset.sigma_m > radius_m
+    gear_to_target = gear_to_target_at_last_touch_or_now(b)
+    is_off_axis = gear_to_target.distance_xy_m - 2.0 * gear_to_target.sigma_m > radius_m
     is_below = touched is None and b.target.gear_to_target_z_m > contact_height_tolerance_m(b)
     return Support.HELD_BY_OTHER_OBJECT if is_off_axis or is_below else Support.UNKNOWN
 
@@ -590,11 +592,11 @@ def _find_what_vehicle_hangs_on(b: Belief) -> Support:
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     """True if the data that the condition requires is fresh in this tick.
 
-    There are two exceptions. With the target as the only position source, `CONTACT` needs no valid
-    position during a press, because the last sighting is accurate enough for a while. During a
-    descent, `HANGING` needs no position and accepts telemetry as old as `safety.telemetry_hold_s`.
-    Otherwise, a vehicle with poor telemetry would hang on the magnet with its motors running. The
-    release that then begins still needs fresh telemetry.
+    There are two exceptions. With the target as the only position source, `TARGET_CONTACT` needs no
+    valid position during a press, because the last sighting is accurate enough for a while. During
+    a descent, `HANGING` needs no position and accepts telemetry as old as
+    `safety.telemetry_hold_s`. Otherwise, a vehicle with poor telemetry would hang on the magnet
+    with its motors running. The release that then begins still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
@@ -605,8 +607,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
             return b.is_imu_fresh
         case RequiredData.POSITION:
             reckons = (
-                condition is CONTACT
-                and b.is_positioned_by_target
+                condition is TARGET_CONTACT
+                and b.is_target_position_source
                 and b.command_history.maneuver.presses_against_target
             )
             return b.is_imu_fresh and (b.is_position_valid or reckons)

@@ -52,9 +52,9 @@ Larger: an impact corrupts the estimate."""
 MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST = 0.5
 """Share of the hover thrust at the start of the descent below which thrust is not proportional to
 force, so that nothing is learned from it."""
-MIN_CLAMPED_SPECIFIC_FORCE_G = 0.75
+MIN_SPECIFIC_FORCE_DIVISOR_G = 0.75
 """Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
-MAX_CLAMPED_SPECIFIC_FORCE_G = 1.5
+MAX_SPECIFIC_FORCE_DIVISOR_G = 1.5
 """Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
 it."""
 
@@ -67,7 +67,7 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry
-    divisor_g = min(MAX_CLAMPED_SPECIFIC_FORCE_G, max(MIN_CLAMPED_SPECIFIC_FORCE_G, tel.acc_z_g))
+    divisor_g = min(MAX_SPECIFIC_FORCE_DIVISOR_G, max(MIN_SPECIFIC_FORCE_DIVISOR_G, tel.acc_z_g))
     sample = max(MIN_FIRMWARE_POSITION_MODE_THRUST, tel.thrust / divisor_g)
     return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA_FRACTION)
 
@@ -103,9 +103,9 @@ def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     tel, old = b.telemetry, estimate_hover_thrust(b)
     thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
     start = old.estimate_before_descent or HoverThrust(
-        old.thrust, max(MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT, old.sigma)
+        old.thrust, max(MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT, old.sigma_fraction)
     )
-    first, sigma = start.thrust, start.sigma
+    first, sigma = start.thrust, start.sigma_fraction
     old = replace(old, estimate_before_descent=start)
     shows = (
         MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
@@ -117,7 +117,7 @@ def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     if (
         b.attitude_age_s > MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
         or not shows
-        or b.is_in_magnet_reach
+        or b.is_possibly_in_magnet_reach
         or is_on_floor
     ):
         return old

@@ -46,19 +46,19 @@ MIN_NIS_TO_RESTART_FILTER = 20.0
 """Normalized innovation squared, two degrees of freedom, with which a picture restarts the filter:
 exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
 wrong."""
-MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS = 0.03
+MAX_VELOCITY_SIGMA_TO_PREDICT_MPS = 0.03
 """Largest standard deviation of the filter's velocity with which the filter is used, m/s; with a
 larger one, `predict` returns None. Larger: the vehicle is steered by the first pictures' noise."""
 
 
 @dataclass(frozen=True)
-class LateralOffset:
+class LateralState:
     """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, both
     (x, y) in world axes, with their standard deviations per axis."""
 
-    offset_m: LateralVector
-    velocity_mps: LateralVector
-    sigma_m: float
+    gear_to_target_world_xy_m: LateralVector
+    vehicle_velocity_world_xy_mps: LateralVector
+    gear_to_target_sigma_m: float
     velocity_sigma_mps: float
 
 
@@ -67,8 +67,8 @@ class MotionSample(NamedTuple):
     its lean causes and its estimated velocity, both (x, y) in world axes."""
 
     t_s: float
-    acceleration_mps2: LateralVector
-    velocity_mps: LateralVector
+    lean_acceleration_world_xy_mps2: LateralVector
+    estimated_velocity_world_xy_mps: LateralVector
 
 
 class OffsetVelocityCovariance(NamedTuple):
@@ -80,7 +80,7 @@ class OffsetVelocityCovariance(NamedTuple):
     velocity_variance_m2ps2: float = 0.0  # variance of the velocity
 
 
-UNKNOWN_COVARIANCE = OffsetVelocityCovariance()
+UNSET_COVARIANCE = OffsetVelocityCovariance()
 """Covariance before the first picture; not used."""
 
 
@@ -95,9 +95,9 @@ class LateralOffsetFilter:
     """
 
     t_s: float = -math.inf
-    offset_m: LateralVector = (0.0, 0.0)
-    velocity_mps: LateralVector = (0.0, 0.0)
-    covariance: OffsetVelocityCovariance = UNKNOWN_COVARIANCE
+    gear_to_target_world_xy_m: LateralVector = (0.0, 0.0)
+    vehicle_velocity_world_xy_mps: LateralVector = (0.0, 0.0)
+    covariance: OffsetVelocityCovariance = UNSET_COVARIANCE
     samples: tuple[MotionSample, ...] = ()
 
     def with_sample(self, sample: MotionSample) -> LateralOffsetFilter:
@@ -112,62 +112,66 @@ class LateralOffsetFilter:
         return replace(self, samples=(*kept[first:], sample))
 
     def with_picture_measurement(
-        self, t_s: float, offset_m: LateralVector, sigma_m: float
+        self, t_s: float, gear_to_target_world_xy_m: LateralVector, sigma_m: float
     ) -> LateralOffsetFilter:
         """Return the filter after a picture exposed at `t_s` that measured the offset."""
         if t_s <= self.t_s:
             return self
         variance_m2 = max(sigma_m, MIN_PICTURE_OFFSET_SIGMA_M) ** 2
         if t_s - self.t_s > MAX_AGE_OF_NEWEST_PICTURE_S:
-            return self._restart(t_s, offset_m, variance_m2)
-        predicted = self._predict(t_s)
+            return self._restart(t_s, gear_to_target_world_xy_m, variance_m2)
+        predicted = self._propagate_through_samples(t_s)
         p_ee, p_ev, p_vv = predicted.covariance
         innovation_m = (
-            offset_m[0] - predicted.offset_m[0],
-            offset_m[1] - predicted.offset_m[1],
+            gear_to_target_world_xy_m[0] - predicted.gear_to_target_world_xy_m[0],
+            gear_to_target_world_xy_m[1] - predicted.gear_to_target_world_xy_m[1],
         )
         innovation_variance_m2 = p_ee + variance_m2
         if math.hypot(*innovation_m) ** 2 > MIN_NIS_TO_RESTART_FILTER * innovation_variance_m2:
-            return self._restart(t_s, offset_m, variance_m2)
+            return self._restart(t_s, gear_to_target_world_xy_m, variance_m2)
         gain_e, gain_v = p_ee / innovation_variance_m2, p_ev / innovation_variance_m2
         return replace(
             predicted,
-            offset_m=_add_scaled(predicted.offset_m, gain_e, innovation_m),
-            velocity_mps=_add_scaled(predicted.velocity_mps, gain_v, innovation_m),
+            gear_to_target_world_xy_m=_add_scaled(
+                predicted.gear_to_target_world_xy_m, gain_e, innovation_m
+            ),
+            vehicle_velocity_world_xy_mps=_add_scaled(
+                predicted.vehicle_velocity_world_xy_mps, gain_v, innovation_m
+            ),
             covariance=OffsetVelocityCovariance(
                 (1.0 - gain_e) * p_ee, (1.0 - gain_e) * p_ev, p_vv - gain_v * p_ev
             ),
         )
 
-    def predict(self, t_s: float) -> LateralOffset | None:
+    def predict(self, t_s: float) -> LateralState | None:
         """Return the estimate at `t_s`; None if the newest picture is older than
         `MAX_AGE_OF_NEWEST_PICTURE_S`, or while the velocity is less certain than
-        `MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS`."""
+        `MAX_VELOCITY_SIGMA_TO_PREDICT_MPS`."""
         if not 0.0 <= t_s - self.t_s <= MAX_AGE_OF_NEWEST_PICTURE_S:
             return None
-        if (
-            math.sqrt(self.covariance.velocity_variance_m2ps2)
-            > MAX_VELOCITY_SIGMA_TO_USE_ESTIMATE_MPS
-        ):
+        if math.sqrt(self.covariance.velocity_variance_m2ps2) > MAX_VELOCITY_SIGMA_TO_PREDICT_MPS:
             return None
-        predicted = self._predict(t_s)
+        predicted = self._propagate_through_samples(t_s)
         p_ee, _, p_vv = predicted.covariance
-        return LateralOffset(
-            predicted.offset_m, predicted.velocity_mps, math.sqrt(p_ee), math.sqrt(p_vv)
+        return LateralState(
+            predicted.gear_to_target_world_xy_m,
+            predicted.vehicle_velocity_world_xy_mps,
+            math.sqrt(p_ee),
+            math.sqrt(p_vv),
         )
 
     def _restart(
-        self, t_s: float, offset_m: LateralVector, variance_m2: float
+        self, t_s: float, gear_to_target_world_xy_m: LateralVector, variance_m2: float
     ) -> LateralOffsetFilter:
         return replace(
             self,
             t_s=t_s,
-            offset_m=offset_m,
-            velocity_mps=(0.0, 0.0),
+            gear_to_target_world_xy_m=gear_to_target_world_xy_m,
+            vehicle_velocity_world_xy_mps=(0.0, 0.0),
             covariance=OffsetVelocityCovariance(variance_m2, 0.0, INITIAL_VELOCITY_SIGMA_MPS**2),
         )
 
-    def _predict(self, t_s: float) -> LateralOffsetFilter:
+    def _propagate_through_samples(self, t_s: float) -> LateralOffsetFilter:
         """Return the filter propagated to the later time `t_s` with all samples up to it. Between
         two samples, the acceleration is their mean; after the last sample, it stays constant."""
         predicted, before = self, self.samples[0] if self.samples else None
@@ -175,28 +179,39 @@ class LateralOffsetFilter:
             if sample.t_s > predicted.t_s:
                 assert before is not None
                 mean_mps2 = _add_scaled(
-                    (0.5 * before.acceleration_mps2[0], 0.5 * before.acceleration_mps2[1]),
+                    (
+                        0.5 * before.lean_acceleration_world_xy_mps2[0],
+                        0.5 * before.lean_acceleration_world_xy_mps2[1],
+                    ),
                     0.5,
-                    sample.acceleration_mps2,
+                    sample.lean_acceleration_world_xy_mps2,
                 )
                 predicted = predicted._propagate(min(t_s, sample.t_s), mean_mps2)
                 if sample.t_s > t_s:
                     return predicted
-                predicted = predicted._with_velocity_measurement(sample.velocity_mps)
+                predicted = predicted._with_velocity_measurement(
+                    sample.estimated_velocity_world_xy_mps
+                )
             before = sample
-        return predicted._propagate(t_s, (0.0, 0.0) if before is None else before.acceleration_mps2)
+        return predicted._propagate(
+            t_s, (0.0, 0.0) if before is None else before.lean_acceleration_world_xy_mps2
+        )
 
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
         """Return the filter at `t_s` after a constant acceleration."""
         dt_s = t_s - self.t_s
         density = ACCELERATION_NOISE_SIGMA_MPS2**2 * ACCELERATION_NOISE_CORRELATION_TIME_S
         p_ee, p_ev, p_vv = self.covariance
-        moved_m = _add_scaled(self.offset_m, -dt_s, self.velocity_mps)
+        moved_m = _add_scaled(
+            self.gear_to_target_world_xy_m, -dt_s, self.vehicle_velocity_world_xy_mps
+        )
         return replace(
             self,
             t_s=t_s,
-            offset_m=_add_scaled(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
-            velocity_mps=_add_scaled(self.velocity_mps, dt_s, acceleration_mps2),
+            gear_to_target_world_xy_m=_add_scaled(moved_m, -0.5 * dt_s * dt_s, acceleration_mps2),
+            vehicle_velocity_world_xy_mps=_add_scaled(
+                self.vehicle_velocity_world_xy_mps, dt_s, acceleration_mps2
+            ),
             covariance=OffsetVelocityCovariance(
                 p_ee - 2.0 * dt_s * p_ev + dt_s**2 * p_vv + density * dt_s**3 / 3.0,
                 p_ev - dt_s * p_vv - density * dt_s**2 / 2.0,
@@ -204,17 +219,25 @@ class LateralOffsetFilter:
             ),
         )
 
-    def _with_velocity_measurement(self, velocity_mps: LateralVector) -> LateralOffsetFilter:
+    def _with_velocity_measurement(
+        self, estimated_velocity_world_xy_mps: LateralVector
+    ) -> LateralOffsetFilter:
         """Return the filter after a measurement of the vehicle's velocity at the filter's time,
         `t_s`."""
         p_ee, p_ev, p_vv = self.covariance
         variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
         gain_e, gain_v = p_ev / variance, p_vv / variance
-        innovation_mps = _add_scaled(velocity_mps, -1.0, self.velocity_mps)
+        innovation_mps = _add_scaled(
+            estimated_velocity_world_xy_mps, -1.0, self.vehicle_velocity_world_xy_mps
+        )
         return replace(
             self,
-            offset_m=_add_scaled(self.offset_m, gain_e, innovation_mps),
-            velocity_mps=_add_scaled(self.velocity_mps, gain_v, innovation_mps),
+            gear_to_target_world_xy_m=_add_scaled(
+                self.gear_to_target_world_xy_m, gain_e, innovation_mps
+            ),
+            vehicle_velocity_world_xy_mps=_add_scaled(
+                self.vehicle_velocity_world_xy_mps, gain_v, innovation_mps
+            ),
             covariance=OffsetVelocityCovariance(
                 p_ee - gain_e * p_ev, (1.0 - gain_v) * p_ev, (1.0 - gain_v) * p_vv
             ),

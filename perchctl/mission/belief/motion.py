@@ -59,13 +59,13 @@ MIN_FREE_FALL_DURATION_S = 0.1
 """Time for which a falling vehicle reads less than `MAX_FREE_FALL_READING_G`, s; a rebound is
 shorter. Larger: a fall is detected 5 cm later."""
 MAX_CLIMB_RATE_GAINED_IN_FALL_MPS = -0.25
-"""Climb rate gained within `FALL_SPEED_GAIN_TIME_CONSTANT_S` below which the vehicle falls whatever
-the accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
+"""Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle falls
+whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
 MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS = 0.5
-"""Largest upward speed, gained within `FALL_SPEED_GAIN_TIME_CONSTANT_S`, that a vehicle must lose
-before it falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a climb that is
-braked counts as a fall."""
-FALL_SPEED_GAIN_TIME_CONSTANT_S = 1.5
+"""Largest upward speed, gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S`, that a vehicle
+must lose before it falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a
+climb that is braked counts as a fall."""
+FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
 UP_ACCELERATION_OFFSET_TIME_CONSTANT_S = 3.0
@@ -75,15 +75,15 @@ MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G = -0.3
 """Acceleration along the world's upward axis below which a reading is an impact on the ceiling and
 not a fall, g. Closer to 0: the first samples of a fall are cut off."""
 MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
-"""Upward speed gained within `FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S` that only the floor can
+"""Upward speed gained within `IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S` that only the floor can
 cause, m/s. Smaller: an increase of thrust counts as the floor."""
-FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S = 0.1
+IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S = 0.1
 """Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to an
 impact."""
 MAX_IMPACT_DETECTION_DELAY_S = 0.05
 """Longest delay between the start of an impact and its detection, s; the speed before the impact is
 taken from this far back."""
-BOUNCE_WINDOW_S = 0.5
+MAX_BOUNCE_TIME_AFTER_IMPACT_S = 0.5
 """Time after an impact within which a further one is a bounce, s."""
 MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
@@ -111,7 +111,7 @@ ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 = 5.0
 """Increase of that threshold for each second between the two samples, m/s^2."""
 TILT_ERROR_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes a wrong tilt, s."""
-HOVER_THRUST_TIME_CONSTANT_S = 0.5
+MEAN_HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
 MIN_HOVER_FRACTION_OF_FULL_THRUST = 0.4
 """Share of full thrust below which no vehicle hovers."""
@@ -130,7 +130,7 @@ class FusionAge:
     """Time since the state estimate was last corrected by a measurement, derived from the variance
     of the vertical speed: without measurements, the variance only grows."""
 
-    variance_m2ps2: float | None = None  # newest variance
+    climb_variance_m2ps2: float | None = None  # newest variance
     variance_changed_at_s: float = -math.inf  # time at which that variance arrived
     no_fusion_since_s: float = math.inf  # time since which the variance has only grown
 
@@ -141,7 +141,7 @@ class FusionAge:
 
     def update(self, sample: Telemetry) -> FusionAge:
         """Return the age after one more sample; unchanged if the sample has no new variance."""
-        variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
+        variance, before = sample.climb_variance_m2ps2, self.climb_variance_m2ps2
         if variance is None or variance == before:
             return self
         least = MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S * (
@@ -163,8 +163,8 @@ class Impact:
     estimated_climb_before_impact_mps: float = 0.0
     # vertical speed just before the impact, from `ImuMotion.velocity_mps`
     imu_climb_before_impact_mps: float = 0.0
-    peak_g: float = 0.0  # largest specific force during the impact along the body's z axis
-    z_m: float = 0.0  # height in the state estimate at the impact
+    peak_acc_z_g: float = 0.0  # largest specific force during the impact along the body's z axis
+    world_z_m: float = 0.0  # height in the state estimate at the impact
 
 
 # --- Detectors: small values with one law each (tests/mission/test_detectors.py) ---
@@ -216,7 +216,7 @@ class FallDetector:
     recently is
 
         v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS, v + a dt - v dt /
-        FALL_SPEED_GAIN_TIME_CONSTANT_S)
+        FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
     `MAX_CLIMB_RATE_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less
@@ -228,19 +228,19 @@ class FallDetector:
     # time since which the accelerometer has read less than `MAX_FREE_FALL_READING_G`
     low_g_since_s: float = math.inf
     climb_rate_gained_mps: float = 0.0
-    vertical_acceleration_offset_mps2: float = 0.0
+    up_acceleration_offset_mps2: float = 0.0
 
     def update_fall(
         self, t_s: float, up_acceleration_mps2: float, acc_z_g: float, dt_s: float
     ) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`;
         `acc_z_g` is the specific force along the body's z axis at the end of that time."""
-        offset = self.vertical_acceleration_offset_mps2 + (
+        offset = self.up_acceleration_offset_mps2 + (
             max(
                 MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2,
                 min(-MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2, up_acceleration_mps2),
             )
-            - self.vertical_acceleration_offset_mps2
+            - self.up_acceleration_offset_mps2
         ) * min(1.0, dt_s / UP_ACCELERATION_OFFSET_TIME_CONSTANT_S)
         corrected_mps2 = (
             max(up_acceleration_mps2, MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2)
@@ -249,7 +249,7 @@ class FallDetector:
         sink = self.climb_rate_gained_mps + corrected_mps2 * dt_s
         sink = min(
             MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
-            sink - sink * dt_s / FALL_SPEED_GAIN_TIME_CONSTANT_S,
+            sink - sink * dt_s / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S,
         )
         light = min(self.low_g_since_s, t_s) if acc_z_g < MAX_FREE_FALL_READING_G else math.inf
         fell = sink < MAX_CLIMB_RATE_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
@@ -258,7 +258,7 @@ class FallDetector:
             last_fall_at_s=t_s if fell else self.last_fall_at_s,
             low_g_since_s=light,
             climb_rate_gained_mps=sink,
-            vertical_acceleration_offset_mps2=offset,
+            up_acceleration_offset_mps2=offset,
         )
 
 
@@ -267,21 +267,21 @@ class ImpactDetector:
     """Detector of impacts from below, for example at a touchdown. An impact adds more upward speed
     in a short time than any thrust can. Its peak force includes that of its bounces."""
 
-    speed_gained_in_impact_mps: float = 0.0
-    last_impact_at_s: float = -math.inf
+    upward_speed_gained_mps: float = 0.0
+    last_impact_or_bounce_at_s: float = -math.inf
     recent_samples: tuple[Impact, ...] = ()  # states just before an impact that begins now
     newest_impact: Impact = Impact()  # newest impact from below
 
     def update_impact(
-        self, newest_sample: Impact, z_m: float, up_acceleration_mps2: float, dt_s: float
+        self, newest_sample: Impact, world_z_m: float, up_acceleration_mps2: float, dt_s: float
     ) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`.
-        `newest_sample` holds time, speeds and specific force of the new sample, and `z_m` is its
-        estimated height."""
-        speed_gained_in_impact_mps = max(
+        `newest_sample` holds time, speeds and specific force of the new sample, and `world_z_m` is
+        its estimated height."""
+        upward_speed_gained_mps = max(
             0.0,
-            self.speed_gained_in_impact_mps
-            * math.exp(-dt_s / FLOOR_IMPACT_SPEED_GAIN_TIME_CONSTANT_S)
+            self.upward_speed_gained_mps
+            * math.exp(-dt_s / IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S)
             + up_acceleration_mps2 * dt_s,
         )
         recent = (
@@ -292,13 +292,17 @@ class ImpactDetector:
         recent_samples = (*recent, newest_sample)
         return replace(
             self,
-            speed_gained_in_impact_mps=speed_gained_in_impact_mps,
-            last_impact_at_s=newest_sample.t_s
-            if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS
-            else self.last_impact_at_s,
+            upward_speed_gained_mps=upward_speed_gained_mps,
+            last_impact_or_bounce_at_s=newest_sample.t_s
+            if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS
+            else self.last_impact_or_bounce_at_s,
             recent_samples=recent_samples,
             newest_impact=_update_newest_impact(
-                self.newest_impact, newest_sample, z_m, recent_samples, speed_gained_in_impact_mps
+                self.newest_impact,
+                newest_sample,
+                world_z_m,
+                recent_samples,
+                upward_speed_gained_mps,
             ),
         )
 
@@ -306,9 +310,9 @@ class ImpactDetector:
 def _update_newest_impact(
     old: Impact,
     newest_sample: Impact,
-    z_m: float,
+    world_z_m: float,
     recent_samples: tuple[Impact, ...],
-    speed_gained_in_impact_mps: float,
+    upward_speed_gained_mps: float,
 ) -> Impact:
     """Return the newest impact after one more sample.
 
@@ -317,20 +321,20 @@ def _update_newest_impact(
     includes the whole impact before it is detected. A bounce only adds a lower speed or a harder
     peak to the old impact.
     """
-    follows = newest_sample.t_s - old.t_s <= BOUNCE_WINDOW_S
-    if speed_gained_in_impact_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
+    follows = newest_sample.t_s - old.t_s <= MAX_BOUNCE_TIME_AFTER_IMPACT_S
+    if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
         begun = Impact(
             newest_sample.t_s,
             min(moment.estimated_climb_before_impact_mps for moment in recent_samples),
             min(moment.imu_climb_before_impact_mps for moment in recent_samples),
-            max(moment.peak_g for moment in recent_samples),
-            z_m,
+            max(moment.peak_acc_z_g for moment in recent_samples),
+            world_z_m,
         )
         if not follows:
             return begun
         return replace(
             old,
-            peak_g=max(old.peak_g, begun.peak_g),
+            peak_acc_z_g=max(old.peak_acc_z_g, begun.peak_acc_z_g),
             estimated_climb_before_impact_mps=min(
                 old.estimated_climb_before_impact_mps, begun.estimated_climb_before_impact_mps
             ),
@@ -338,7 +342,11 @@ def _update_newest_impact(
                 old.imu_climb_before_impact_mps, begun.imu_climb_before_impact_mps
             ),
         )
-    return replace(old, peak_g=max(old.peak_g, newest_sample.peak_g)) if follows else old
+    return (
+        replace(old, peak_acc_z_g=max(old.peak_acc_z_g, newest_sample.peak_acc_z_g))
+        if follows
+        else old
+    )
 
 
 @dataclass(frozen=True)
@@ -382,7 +390,7 @@ class LateralPushDetector:
     that exceeds `MIN_LATERAL_PUSH_G`, more than drag in flight causes, on average over
     `LATERAL_PUSH_TIME_CONSTANT_S`."""
 
-    mean_lateral_specific_force_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
+    mean_specific_force_body_xy_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     last_lateral_push_at_s: float = -math.inf  # time of the last lateral push
 
     def update_lateral_push(
@@ -392,15 +400,15 @@ class LateralPushDetector:
         at rest."""
         keeps = math.exp(-dt_s / LATERAL_PUSH_TIME_CONSTANT_S)
         x_g, y_g = new.acc_x_g - accelerometer_offset_g[0], new.acc_y_g - accelerometer_offset_g[1]
-        mean_x_g, mean_y_g = self.mean_lateral_specific_force_g
-        mean_lateral_specific_force_g = (
+        mean_x_g, mean_y_g = self.mean_specific_force_body_xy_g
+        mean_specific_force_body_xy_g = (
             x_g + keeps * (mean_x_g - new.acc_x_g + accelerometer_offset_g[0]),
             y_g + keeps * (mean_y_g - new.acc_y_g + accelerometer_offset_g[1]),
         )
-        pushes = math.hypot(*mean_lateral_specific_force_g) > MIN_LATERAL_PUSH_G
+        pushes = math.hypot(*mean_specific_force_body_xy_g) > MIN_LATERAL_PUSH_G
         return replace(
             self,
-            mean_lateral_specific_force_g=mean_lateral_specific_force_g,
+            mean_specific_force_body_xy_g=mean_specific_force_body_xy_g,
             last_lateral_push_at_s=new.t_s if pushes else self.last_lateral_push_at_s,
         )
 
@@ -416,15 +424,14 @@ class ImuMotion(
     never."""
 
     t_s: float = -math.inf  # time of the newest sample
-    velocity_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
+    velocity_gained_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
     accelerometer_offset_g: Vector = ZERO_VECTOR  # offset of the accelerometer at rest, body axes
     last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest gap
     # end of the newest gap that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
     integration_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
-    descent_while_frozen_m: float = (
-        0.0  # descent by the estimate while the accelerometer was frozen
-    )
+    # change of the estimated height over the successive gaps until now; at most 0
+    height_change_in_gap_m: float = 0.0
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
     # errors of roll and pitch due to corrections
     roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
@@ -455,28 +462,28 @@ class ImuMotion(
         ):
             return _restart_after_gap(motion, last, new)
         motion, up_acceleration_mps2 = _integrate_acceleration(motion, last, new, dt_s)
-        now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
+        now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_gained_mps[2], new.acc_z_g)
         motion = (
             motion.update_fall(new.t_s, up_acceleration_mps2, new.acc_z_g, dt_s)
             .update_impact(now, new.position_m[2], up_acceleration_mps2, dt_s)
-            .update_steady_speed(new.t_s, motion.velocity_mps, dt_s)
+            .update_steady_speed(new.t_s, motion.velocity_gained_mps, dt_s)
             .update_lateral_push(new, motion.accelerometer_offset_g, dt_s)
         )
         hover_thrust = _filter_hover_thrust(motion.mean_hover_thrust, new, dt_s)
-        return replace(motion, descent_while_frozen_m=0.0, mean_hover_thrust=hover_thrust)
+        return replace(motion, height_change_in_gap_m=0.0, mean_hover_thrust=hover_thrust)
 
     @staticmethod
     def compute_acceleration_world_mps2(
         sample: Telemetry,
         accelerometer_offset_g: Vector,
-        tilt_error_rad: tuple[float, float] = (0.0, 0.0),
+        roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0),
     ) -> Vector:
         """Return the acceleration in world axes from the specific force and attitude of a sample,
         corrected for the accelerometer's offset and for the error of roll and pitch,
-        `tilt_error_rad`."""
+        `roll_pitch_error_rad`."""
         roll_rad, pitch_rad = (
-            sample.roll_rad - tilt_error_rad[0],
-            sample.pitch_rad - tilt_error_rad[1],
+            sample.roll_rad - roll_pitch_error_rad[0],
+            sample.pitch_rad - roll_pitch_error_rad[1],
         )
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
@@ -504,30 +511,34 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     motion = replace(
         motion,
         climb_steady_since_s=new.t_s,
-        steady_climb_mps=motion.velocity_mps[2],
+        steady_climb_mps=motion.velocity_gained_mps[2],
         lateral_steady_since_s=new.t_s,
-        mean_lateral_velocity_mps=motion.velocity_mps[:2],
+        mean_lateral_velocity_mps=motion.velocity_gained_mps[:2],
         climb_rate_gained_mps=0.0,
-        speed_gained_in_impact_mps=0.0,
+        upward_speed_gained_mps=0.0,
         low_g_since_s=math.inf,
     )
     if last is None:
-        return replace(motion, descent_while_frozen_m=0.0)
-    descended_m = min(0.0, motion.descent_while_frozen_m + new.position_m[2] - last.position_m[2])
+        return replace(motion, height_change_in_gap_m=0.0)
+    height_change_in_gap_m = min(
+        0.0, motion.height_change_in_gap_m + new.position_m[2] - last.position_m[2]
+    )
     alive = 0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_S and new.start == last.start
-    if alive and _can_exclude_fall(last, new, descended_m):
+    if alive and _can_exclude_fall(last, new, height_change_in_gap_m):
         return replace(
-            motion, last_telemetry_gap_ended_at_s=new.t_s, descent_while_frozen_m=descended_m
+            motion,
+            last_telemetry_gap_ended_at_s=new.t_s,
+            height_change_in_gap_m=height_change_in_gap_m,
         )
     return replace(
         motion,
         last_telemetry_gap_ended_at_s=new.t_s,
         last_gap_that_may_hide_fall_ended_at_s=new.t_s,
-        descent_while_frozen_m=0.0,
+        height_change_in_gap_m=0.0,
     )
 
 
-def _can_exclude_fall(last: Telemetry, new: Telemetry, descended_m: float) -> bool:
+def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: float) -> bool:
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     unexplained_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
@@ -536,7 +547,7 @@ def _can_exclude_fall(last: Telemetry, new: Telemetry, descended_m: float) -> bo
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return (
             new.velocity_mps[2] > MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS
-            and descended_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
+            and height_change_in_gap_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
         )
     return (
         abs(gained_mps) <= MAX_SPEED_NOISE_ACROSS_GAP_MPS
@@ -563,10 +574,10 @@ def _integrate_acceleration(
         new, accelerometer_offset_g, roll_pitch_error_rad
     )
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
-    x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
+    x, y, z = (v + d for v, d in zip(motion.velocity_gained_mps, dv, strict=True))
     motion = replace(
         motion,
-        velocity_mps=(x, y, z),
+        velocity_gained_mps=(x, y, z),
         accelerometer_offset_g=accelerometer_offset_g,
         roll_pitch_error_rad=roll_pitch_error_rad,
         body_roll_pitch_rate_radps=body_roll_pitch_rate_radps,
@@ -642,7 +653,7 @@ def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     return (
         measured
         if old == 0.0
-        else old + (measured - old) * min(1.0, dt_s / HOVER_THRUST_TIME_CONSTANT_S)
+        else old + (measured - old) * min(1.0, dt_s / MEAN_HOVER_THRUST_TIME_CONSTANT_S)
     )
 
 

@@ -27,8 +27,8 @@ the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn
 MIN_TARGET_POSITION_SPREAD_RMS_M = 0.05
 """Least RMS distance of the target's estimated world positions from their mean that shows a motion
 of the target, m."""
-MAX_ROTATION_FIT_RESIDUAL_FRACTION = 0.45  # share of the target's spread
-MIN_FITTED_ROTATION_MAGNITUDE = 0.5  # magnitude of M; near 0, the world frame drifts
+MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # share of the target's spread
+MIN_FITTED_ROTATION_MODULUS = 0.5  # modulus of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 MIN_WRONG_CAMERA_YAW_RAD = math.radians(65.0)
 MIN_CONTRADICTING_SIGHTINGS = 4
@@ -52,20 +52,20 @@ _MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 class MountingSample:
     """Positions of vehicle and target at `t_s` in the world, as x + iy in m.
 
-    `up_axis_offset_xy_m` is the vector from the vehicle to the point where its upward axis meets
-    the target's plane.
+    `vehicle_to_up_axis_world_xy_m` is the vector from the vehicle to the point where its upward
+    axis meets the target's plane.
     """
 
     t_s: float
     vehicle_world_xy_m: complex
     target_world_xy_m: complex
-    up_axis_offset_xy_m: complex = 0j
+    vehicle_to_up_axis_world_xy_m: complex = 0j
 
     @property
     def up_axis_at_target_height_world_xy_m(self) -> complex:
         """Point, world x + iy in m, where the vehicle's upward axis meets the horizontal plane at
         the target's height."""
-        return self.vehicle_world_xy_m + self.up_axis_offset_xy_m
+        return self.vehicle_world_xy_m + self.vehicle_to_up_axis_world_xy_m
 
 
 def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array) -> MountingSample:
@@ -73,13 +73,13 @@ def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array
     `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
-    up_axis_offset_xy_m = (float(target_world_m[2]) - z) * up
+    vehicle_to_up_axis_world_xy_m = (float(target_world_m[2]) - z) * up
     place = complex(float(target_world_m[0]), float(target_world_m[1]))
     return MountingSample(
         t_s,
         complex(x, y),
         place,
-        complex(float(up_axis_offset_xy_m[0]), float(up_axis_offset_xy_m[1])),
+        complex(float(vehicle_to_up_axis_world_xy_m[0]), float(vehicle_to_up_axis_world_xy_m[1])),
     )
 
 
@@ -174,10 +174,10 @@ def _judge_mounting(
     turn = 1.0 - along
     if (
         abs(along) >= MIN_MOVING_RATIO
-        and abs(turn) >= MIN_FITTED_ROTATION_MAGNITUDE
+        and abs(turn) >= MIN_FITTED_ROTATION_MODULUS
         and abs(cmath.phase(turn)) >= MIN_WRONG_CAMERA_YAW_RAD
         and spread_m >= MIN_TARGET_POSITION_SPREAD_RMS_M
-        and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_FRACTION * spread_m
+        and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO * spread_m
     ):
         return replace(
             monitor,

@@ -12,7 +12,7 @@ from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
 MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 """Lateral speed that no draught causes, m/s. Larger: an impact during the press is noticed late."""
-MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS = 0.15
+MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS = 0.15
 """Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
 MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
@@ -28,7 +28,7 @@ def _does_estimate_contradict_imu(b: Belief) -> bool:
     return (
         by_capture
         and math.hypot(*b.dead_reckoning.lateral_velocity_missed_by_imu_mps)
-        > MAX_VELOCITY_DIFFERENCE_TO_IMU_MPS
+        > MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
     )
 
 
@@ -106,7 +106,7 @@ def position_loss_text(b: Belief) -> str:
     """Return a text that says how long no external position has been sent, and why."""
     if b.has_uncorrected_gust:
         return "pushed sideways while the target was out of view"
-    age_s, why = b.position_age_s, b.obs.position_problem
+    age_s, why = b.position_correction_age_s, b.obs.external_position_problem
     if b.profile.positioning.source.is_deck:
         why = why or NO_ESTIMATE_CORRECTION_TEXT
     if b.obs.rejected_sighting_to_estimate_m > 0.0:

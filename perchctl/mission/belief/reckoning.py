@@ -51,7 +51,7 @@ CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
 in reach too early."""
 MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
 """Largest climb rate during a gap in the telemetry, m/s: the limit of the position mode."""
-MAGNET_REACH_M = 0.04
+MAGNET_REACH_BELOW_TARGET_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
 MAX_BOUNCE_DISTANCE_BELOW_TARGET_M = 0.1
@@ -63,10 +63,10 @@ VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
 just before the last sighting is forgotten."""
-MAX_VELOCITY_BIAS_MPS = 0.6
+MAX_ESTIMATED_VELOCITY_BIAS_MPS = 0.6
 """Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
 counts as still while its position creeps. Smaller: the vehicle is never steady in wind."""
-VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
+ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
@@ -91,7 +91,7 @@ contact is claimed too precisely."""
 POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
-WRONG_VELOCITY_TO_BIAS_GAIN_PER_S = 1.5
+VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
 `lateral_velocity_missed_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
@@ -105,7 +105,7 @@ class DeadReckoning:
 
     imu: ImuMotion | None = None  # motion up to which this value is integrated
     velocity_mps: Vector = ZERO_VECTOR
-    acceleration_bias_mps2: Vector = ZERO_VECTOR  # error of accelerometer and attitude
+    acceleration_bias_world_mps2: Vector = ZERO_VECTOR  # error of accelerometer and attitude
     # mean lateral reading of the accelerometer
     mean_specific_force_world_xy_mps2: tuple[float, float] = (0.0, 0.0)
     estimated_velocity_mps: Vector = ZERO_VECTOR
@@ -134,7 +134,8 @@ class DeadReckoning:
     estimated_velocity_bias_world_xy_mps: tuple[float, float] = (0.0, 0.0)
     # low-passed estimated velocity
     mean_estimated_velocity_world_xy_mps: tuple[float, float] = (0.0, 0.0)
-    mean_estimated_world_xy_m: tuple[float, float] | None = None  # low-passed estimated position
+    # low-passed estimated position
+    mean_estimated_position_world_xy_m: tuple[float, float] | None = None
     time_under_position_control_s: float = 0.0  # total time in free air under position control
 
 
@@ -163,7 +164,9 @@ def advance_dead_reckoning(
     if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
         carried = not old.imu.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
         carried_mps = (
-            old.velocity_mps[2] + impact.imu_climb_before_impact_mps - old.imu.velocity_mps[2]
+            old.velocity_mps[2]
+            + impact.imu_climb_before_impact_mps
+            - old.imu.velocity_gained_mps[2]
         )
         old = replace(
             old,
@@ -209,7 +212,7 @@ def _restart(
     if is_position_diverged:
         vx, vy, vz = old.velocity_mps
         if old.imu is not None and imu.last_telemetry_gap_ended_at_s <= old.imu.t_s:
-            vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
+            vz += imu.velocity_gained_mps[2] - old.imu.velocity_gained_mps[2]
         velocity_mps = (vx, vy, vz)
     elif not is_estimate_trusted and old.imu is not None:
         vx, vy, vz = (
@@ -239,7 +242,7 @@ def _restart(
         if flew:
             climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
         min_gear_below_target_m = old.min_gear_below_target_m - climb_m
-        near = min_gear_below_target_m < MAGNET_REACH_M
+        near = min_gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
         unknown = replace(
             unknown,
             min_gear_below_target_m=min_gear_below_target_m,
@@ -278,14 +281,14 @@ def _integrate_sample(
         and imu.t_s - imu.last_lateral_push_at_s > MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
     )
     cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
-    ahead_g, left_g = imu.mean_lateral_specific_force_g
+    ahead_g, left_g = imu.mean_specific_force_body_xy_g
     reads_mps2 = (
         GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
         GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
     )
     mean_specific_force_world_xy_mps2 = [*old.mean_specific_force_world_xy_mps2]
     for i in range(3):
-        gained = imu.velocity_mps[i] - previous_imu.velocity_mps[i]
+        gained = imu.velocity_gained_mps[i] - previous_imu.velocity_gained_mps[i]
         if (
             i == 2
             and is_estimate_trusted
@@ -294,11 +297,11 @@ def _integrate_sample(
             gained = (
                 estimated_velocity_mps[2]
                 - old.estimated_velocity_mps[2]
-                + old.acceleration_bias_mps2[2] * dt_s
+                + old.acceleration_bias_world_mps2[2] * dt_s
             )
         v, b = (
-            old.velocity_mps[i] + gained - old.acceleration_bias_mps2[i] * dt_s,
-            old.acceleration_bias_mps2[i],
+            old.velocity_mps[i] + gained - old.acceleration_bias_world_mps2[i] * dt_s,
+            old.acceleration_bias_world_mps2[i],
         )
         if i < 2:
             alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
@@ -337,7 +340,7 @@ def _integrate_sample(
         old,
         imu=imu,
         velocity_mps=(vx, vy, vz),
-        acceleration_bias_mps2=(bias[0], bias[1], bias[2]),
+        acceleration_bias_world_mps2=(bias[0], bias[1], bias[2]),
         mean_specific_force_world_xy_mps2=(
             mean_specific_force_world_xy_mps2[0],
             mean_specific_force_world_xy_mps2[1],
@@ -357,37 +360,46 @@ def _integrate_sample(
     )
 
 
-def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> DeadReckoning:
+def learn_estimated_velocity_bias(
+    old: DeadReckoning, last: Telemetry, new: Telemetry
+) -> DeadReckoning:
     """Return the dead reckoning with the bias of the estimated velocity learned from two samples,
     during a flight in free air under position control.
 
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both through the same low-pass filter. It is wrong for about
-    `VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
+    `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
     """
     dt_s = new.t_s - last.t_s
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
-        return reset_velocity_bias_means(old)
-    share = 1.0 - math.exp(-dt_s / VELOCITY_BIAS_TIME_CONSTANT_S)
-    before_m = old.mean_estimated_world_xy_m or new.position_m[:2]
+        return restart_velocity_bias_filters(old)
+    share = 1.0 - math.exp(-dt_s / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S)
+    before_m = old.mean_estimated_position_world_xy_m or new.position_m[:2]
     before_mps = (
         old.estimated_velocity_bias_world_xy_mps
-        if old.mean_estimated_world_xy_m is None
+        if old.mean_estimated_position_world_xy_m is None
         else old.mean_estimated_velocity_world_xy_mps
     )
     velocity, position, bias = [], [], []
     for i in range(2):
         velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
         position.append(before_m[i] + share * (new.position_m[i] - before_m[i]))
-        bias.append(velocity[i] - (new.position_m[i] - position[i]) / VELOCITY_BIAS_TIME_CONSTANT_S)
+        bias.append(
+            velocity[i]
+            - (new.position_m[i] - position[i]) / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S
+        )
     size_mps = math.hypot(*bias)
-    part = 1.0 if size_mps <= MAX_VELOCITY_BIAS_MPS else MAX_VELOCITY_BIAS_MPS / size_mps
+    part = (
+        1.0
+        if size_mps <= MAX_ESTIMATED_VELOCITY_BIAS_MPS
+        else MAX_ESTIMATED_VELOCITY_BIAS_MPS / size_mps
+    )
     return replace(
         old,
         estimated_velocity_bias_world_xy_mps=(part * bias[0], part * bias[1]),
         mean_estimated_velocity_world_xy_mps=(velocity[0], velocity[1]),
-        mean_estimated_world_xy_m=(position[0], position[1]),
+        mean_estimated_position_world_xy_m=(position[0], position[1]),
         time_under_position_control_s=old.time_under_position_control_s + dt_s,
     )
 
@@ -407,19 +419,21 @@ def learn_acceleration_bias_at_rest(
         return old
     dt_s = imu.t_s - previous_imu.t_s
     share = 1.0 - math.exp(-dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
-    x_mps2, y_mps2 = ((imu.velocity_mps[i] - previous_imu.velocity_mps[i]) / dt_s for i in range(2))
-    bx, by, bz = old.acceleration_bias_mps2
+    x_mps2, y_mps2 = (
+        (imu.velocity_gained_mps[i] - previous_imu.velocity_gained_mps[i]) / dt_s for i in range(2)
+    )
+    bx, by, bz = old.acceleration_bias_world_mps2
     bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
-    return replace(old, acceleration_bias_mps2=(*bias, bz))
+    return replace(old, acceleration_bias_world_mps2=(*bias, bz))
 
 
-def reset_velocity_bias_means(old: DeadReckoning) -> DeadReckoning:
+def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
     """Return the dead reckoning after an interruption of the velocity-bias learning: the bias is
     kept, and the low-pass filters restart."""
     return (
         old
-        if old.mean_estimated_world_xy_m is None
-        else replace(old, mean_estimated_world_xy_m=None)
+        if old.mean_estimated_position_world_xy_m is None
+        else replace(old, mean_estimated_position_world_xy_m=None)
     )
 
 
@@ -428,14 +442,14 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
     They have given the state estimate a velocity that the accelerometer has not measured and, in
     proportion to it, a wrong tilt, which was learned as a bias."""
     (bx, by, bz), (x_mps, y_mps) = (
-        old.acceleration_bias_mps2,
+        old.acceleration_bias_world_mps2,
         old.lateral_velocity_missed_by_imu_mps,
     )
     return replace(
         old,
-        acceleration_bias_mps2=(
-            bx + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * x_mps,
-            by + WRONG_VELOCITY_TO_BIAS_GAIN_PER_S * y_mps,
+        acceleration_bias_world_mps2=(
+            bx + VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S * x_mps,
+            by + VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S * y_mps,
             bz,
         ),
     )

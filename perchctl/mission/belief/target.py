@@ -109,14 +109,14 @@ class VisualMotion:
     Attributes:
         t_s: exposure of the newest detection.
         detected_since_s: exposure of the first detection after the last gap.
-        gear_to_target_vector_m: newest position of the target from the gear (ahead, left, up), m.
+        gear_to_target_level_m: newest position of the target from the gear (ahead, left, up), m.
         vehicle_velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf
     detected_since_s: float = -math.inf
-    gear_to_target_vector_m: Vector = ZERO_VECTOR
-    vehicle_velocity_mps: Vector = ZERO_VECTOR
+    gear_to_target_level_m: Vector = ZERO_VECTOR
+    vehicle_velocity_level_mps: Vector = ZERO_VECTOR
 
     @property
     def is_velocity_known(self) -> bool:
@@ -134,13 +134,13 @@ class VisualMotion:
             return VisualMotion(t_s, t_s, e_m)
         moved_mps = [
             (before - now) / dt_s
-            for before, now in zip(self.gear_to_target_vector_m, e_m, strict=True)
+            for before, now in zip(self.gear_to_target_level_m, e_m, strict=True)
         ]
         if math.hypot(*moved_mps) > MAX_PLAUSIBLE_CAMERA_VELOCITY_MPS:
-            return replace(self, t_s=t_s, gear_to_target_vector_m=e_m)
+            return replace(self, t_s=t_s, gear_to_target_level_m=e_m)
         share = 1.0 - math.exp(-dt_s / CAMERA_VELOCITY_TIME_CONSTANT_S)
         ahead, left, up = (
             old + share * (new - old)
-            for old, new in zip(self.vehicle_velocity_mps, moved_mps, strict=True)
+            for old, new in zip(self.vehicle_velocity_level_mps, moved_mps, strict=True)
         )
         return VisualMotion(t_s, self.detected_since_s, e_m, (ahead, left, up))

@@ -17,7 +17,7 @@ from perchctl.values import replace
 
 MIN_FIRMWARE_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION = 0.02
+ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION = 0.02
 """Standard deviation of a hover-thrust measurement averaged over one second, as a share of the
 thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter follows
 a sagging battery late. Smaller: the filter learns these variations."""
@@ -44,25 +44,33 @@ class HoverThrust:
     """
 
     thrust: float = 0.0
-    sigma: float = math.inf
+    sigma_fraction: float = math.inf
     estimate_before_descent: HoverThrust | None = None
 
     @property
     def is_imprecise(self) -> bool:
         """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
-        return self.sigma > MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION
+        return self.sigma_fraction > MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION
 
-    def propagate(self, dt_s: float, drift_per_sqrt_s: float) -> HoverThrust:
+    def propagate(self, dt_s: float, drift_fraction_per_sqrt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later; its standard deviation has grown by a random walk of
-        `drift_per_sqrt_s`, a share of the thrust per square root of a second."""
-        return replace(self, sigma=math.sqrt(self.sigma**2 + drift_per_sqrt_s**2 * dt_s))
+        `drift_fraction_per_sqrt_s`, a share of the thrust per square root of a second."""
+        return replace(
+            self,
+            sigma_fraction=math.sqrt(self.sigma_fraction**2 + drift_fraction_per_sqrt_s**2 * dt_s),
+        )
 
     def propagate_without_measurement(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
-        sigma = self.propagate(dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT).sigma
+        sigma = self.propagate(
+            dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT
+        ).sigma_fraction
         return replace(
-            self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION))
+            self,
+            sigma_fraction=min(
+                sigma, max(self.sigma_fraction, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
+            ),
         )
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
@@ -70,11 +78,13 @@ class HoverThrust:
         it more weight; with 0, nothing changes."""
         if dt_s <= 0.0:
             return self
-        if math.isinf(self.sigma):
+        if math.isinf(self.sigma_fraction):
             return replace(
-                self, thrust=thrust, sigma=HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION / math.sqrt(dt_s)
+                self,
+                thrust=thrust,
+                sigma_fraction=ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION / math.sqrt(dt_s),
             )
-        variance = self.sigma**2
-        gain = variance / (variance + HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION**2 / dt_s)
+        variance = self.sigma_fraction**2
+        gain = variance / (variance + ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
-        return replace(self, thrust=corrected, sigma=math.sqrt((1.0 - gain) * variance))
+        return replace(self, thrust=corrected, sigma_fraction=math.sqrt((1.0 - gain) * variance))

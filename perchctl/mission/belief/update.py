@@ -27,7 +27,7 @@ from perchctl.mission.belief.contact import (
     IMU_SHOWS_SUPPORT,
     MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M,
     MAX_RAW_THRUST,
-    MOTORS_STOPPED,
+    MOTORS_OFF_AS_COMMANDED,
     SUPPORT_CONDITIONS,
     is_evidence_fresh,
     is_flying_at_hover_thrust,
@@ -48,7 +48,7 @@ from perchctl.mission.belief.mounting import (
 )
 from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
-    MAGNET_REACH_M,
+    MAGNET_REACH_BELOW_TARGET_M,
     MAX_HEIGHT_INTEGRATION_STEP_S,
     MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S,
     DeadReckoning,
@@ -56,8 +56,8 @@ from perchctl.mission.belief.reckoning import (
     add_sighting,
     advance_dead_reckoning,
     learn_acceleration_bias_at_rest,
-    learn_velocity_bias,
-    reset_velocity_bias_means,
+    learn_estimated_velocity_bias,
+    restart_velocity_bias_filters,
 )
 from perchctl.mission.observation import Observation
 from perchctl.profile import Profile
@@ -82,7 +82,7 @@ KEEPALIVE_RAW_THRUST = 1000
 MEAN_LEAN_TIME_CONSTANT_S = 0.5
 """Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
-TARGET_SCATTER_DECAY_PER_FRAME = 0.9
+TARGET_SCATTER_FRACTION_KEPT_PER_FRAME = 0.9
 """Share of the target's spread that remains after each frame."""
 
 
@@ -139,7 +139,7 @@ def start_dead_reckoning(b: Belief) -> Belief:
     )
 
 
-def reset_conditions(b: Belief) -> Belief:
+def reset_phase_dependent_conditions(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: all conditions restart, except for those that
     are independent of the phase."""
     return replace(
@@ -176,7 +176,9 @@ def _update_target(b: Belief) -> Belief:
     spread_m = 0.0
     if b.last_target_world_m is not None:
         moved_m = float(np.linalg.norm(target.world_m - b.last_target_world_m))
-        spread_m = max(moved_m, TARGET_SCATTER_DECAY_PER_FRAME * b.target_position_scatter_m)
+        spread_m = max(
+            moved_m, TARGET_SCATTER_FRACTION_KEPT_PER_FRAME * b.target_position_scatter_m
+        )
     return replace(b, last_target_world_m=target.world_m, target_position_scatter_m=spread_m)
 
 
@@ -185,15 +187,17 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
     imu = b.obs.imu
     kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
     off_s = max(imu.motors_off_since_s, imu.last_telemetry_gap_ended_at_s)
-    if MOTORS_STOPPED in b.condition_start_times_s and math.isfinite(off_s):
+    if MOTORS_OFF_AS_COMMANDED in b.condition_start_times_s and math.isfinite(off_s):
         # All samples from the gap have arrived, and the motors are off in each. Without this
         # exception, a loop with a gap in every tick would never see the end of a landing.
-        kept[MOTORS_STOPPED] = max(off_s, b.condition_start_times_s[MOTORS_STOPPED])
+        kept[MOTORS_OFF_AS_COMMANDED] = max(
+            off_s, b.condition_start_times_s[MOTORS_OFF_AS_COMMANDED]
+        )
     return replace(
         b,
         condition_start_times_s=kept,
         position_last_stale_at_s=b.obs.t_s
-        if b.is_positioned_by_target
+        if b.is_target_position_source
         else b.position_last_stale_at_s,
     )
 
@@ -227,7 +231,7 @@ def _shift_remembered_positions(b: Belief) -> Belief:
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
     return replace(
         b,
-        dead_reckoning=reset_velocity_bias_means(b.dead_reckoning),
+        dead_reckoning=restart_velocity_bias_filters(b.dead_reckoning),
         takeoff_position_m=None
         if b.takeoff_position_m is None
         else _translate(b.takeoff_position_m, moved_m),
@@ -312,9 +316,9 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
         and is_in_free_air
         and b.last_telemetry
     ):
-        new = learn_velocity_bias(new, b.last_telemetry, obs.telemetry)
+        new = learn_estimated_velocity_bias(new, b.last_telemetry, obs.telemetry)
     else:
-        new = reset_velocity_bias_means(new)
+        new = restart_velocity_bias_filters(new)
     if b.is_position_trusted and not source.is_target and b.last_telemetry is not None:
         new = accumulate_unexplained_position_step(new, b.last_telemetry, obs.telemetry)
     return new
@@ -332,7 +336,7 @@ def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckon
     )
     hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
     touched = b.vehicle_world_z_at_last_contact_m is not None or hangs
-    if not touched or not new.gear_below_target_m < MAGNET_REACH_M or not rests:
+    if not touched or not new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M or not rests:
         return new
     is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < STILL_AT_CONTACT_DWELL_S
     x_mps, y_mps, _ = new.velocity_mps
@@ -362,8 +366,11 @@ def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
         new,
-        velocity_mps=(*motion.lateral_velocity_mps, climb_mps),
-        acceleration_bias_mps2=(*motion.acceleration_bias_mps2, new.acceleration_bias_mps2[2]),
+        velocity_mps=(*motion.velocity_world_xy_mps, climb_mps),
+        acceleration_bias_world_mps2=(
+            *motion.acceleration_bias_world_xy_mps2,
+            new.acceleration_bias_world_mps2[2],
+        ),
     )
 
 
@@ -374,7 +381,7 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     if target is None:
         return new
     seen = obs.has_new_frame and target.measured
-    if not seen and not (b.is_position_valid and not b.is_positioned_by_target):
+    if not seen and not (b.is_position_valid and not b.is_target_position_source):
         return new
     yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -403,7 +410,7 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
     it touches the target, so its distance below becomes 0.
     """
     near = (
-        b.is_positioned_by_target
+        b.is_target_position_source
         and not b.command_history.maneuver.descends_to_floor
         and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M
     )
@@ -426,7 +433,8 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
     near = (
-        new.gear_below_target_m < MAGNET_REACH_M and b.command_history.floor_detected_at_s is None
+        new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
+        and b.command_history.floor_detected_at_s is None
     )
     if b.vehicle_world_z_at_last_contact_m is None and not near:
         return None
@@ -434,7 +442,7 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
     again = (
         in_magnet_reach_since_s is not None
         and b.imu.last_fall_at_s > in_magnet_reach_since_s
-        and new.gear_below_target_m < MAGNET_REACH_M
+        and new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
     )
     return b.obs.t_s if in_magnet_reach_since_s is None or again else in_magnet_reach_since_s
 

@@ -12,7 +12,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low_to_continue
+from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low_for_any_attempt
 from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
 from perchctl.mission.phases.recover import has_recovered
@@ -24,7 +24,7 @@ from perchctl.mission.setpoints import (
 )
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
-MAX_CLIMB_WAIT_S = 20.0
+MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
 """Longest wait for permission to climb, s. Larger: the battery of a vehicle without permission runs
 down. Smaller: a neighbour whose landing or hanging process, which the parent ends after 10 s, bars
 the climb ends this flight, too."""
@@ -59,11 +59,13 @@ def is_charge_too_low_for_attempt(c: Context) -> bool:
     it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
     return (
-        begins and c.state.failed_attempts < c.planner.attempts and is_charge_too_low_to_continue(c)
+        begins
+        and c.state.failed_attempts < c.planner.attempts
+        and is_charge_too_low_for_any_attempt(c)
     )
 
 
-def hover_height_m(c: Context) -> float | None:
+def planned_hover_height_m(c: Context) -> float | None:
     """Return the height above the ground at which the vehicle would hover below the target, m; None
     if the mission does not hover."""
     hover, b = c.planner.hover, c.belief
@@ -76,7 +78,7 @@ def hover_height_m(c: Context) -> float | None:
 
 def is_hover_height_unsafe(c: Context) -> bool:
     """True if an aligned vehicle would hover near the ground, or at the height limit."""
-    height_m = hover_height_m(c)
+    height_m = planned_hover_height_m(c)
     if height_m is None or not is_aligned(c):
         return False
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
@@ -86,7 +88,7 @@ def is_hover_height_unsafe(c: Context) -> bool:
 def unsafe_hover_reason(c: Context) -> str:
     """Return a text with the height at which the vehicle would hover and the range of allowed
     heights."""
-    hover, height_m = c.planner.hover, hover_height_m(c)
+    hover, height_m = c.planner.hover, planned_hover_height_m(c)
     assert hover is not None
     assert height_m is not None
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
@@ -134,9 +136,10 @@ ALIGN = PhaseDefinition(
         land_row(
             "climb-not-permitted",
             {Phase.ALIGN},
-            lambda c: c.true_for_s(CLIMB_WITHHELD) > MAX_CLIMB_WAIT_S,
+            lambda c: c.true_for_s(CLIMB_WITHHELD) > MAX_WAIT_FOR_CLIMB_PERMISSION_S,
             lambda c: (
-                f"no permission to climb for {MAX_CLIMB_WAIT_S:g} s: {c.obs.climb_withheld_reason}"
+                f"no permission to climb for {MAX_WAIT_FOR_CLIMB_PERMISSION_S:g} s: "
+                f"{c.obs.climb_withheld_reason}"
             ),
         ),
         Transition(

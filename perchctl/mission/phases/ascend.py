@@ -26,12 +26,12 @@ returns to ALIGN."""
 MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M = 0.15
 """Largest height of the setpoint above the vehicle during the climb, m. Larger: the setpoint runs
 far ahead of a weak vehicle."""
-MIN_ASCENT_CLIMB_RATE_MPS = 0.02
+MIN_ASCENT_SETPOINT_CLIMB_RATE_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
 HOVER_HEIGHT_TOLERANCE_M = 0.05
 """Largest vertical distance from the hover's place at which the vehicle has reached it, m. Larger:
 the hover begins during the climb. Smaller: an error of the height keeps it from beginning."""
-HOVER_SETPOINT_TOLERANCE_M = 0.01
+HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
 """The same distance of the setpoint, m, which stays at this height during the hover. Larger: the
 vehicle hovers too low. Smaller: noise of the target's height keeps the hover from beginning."""
 MAX_TARGET_LOST_S = 1.5
@@ -40,35 +40,40 @@ positioning system holds the vehicle in place meanwhile. Larger: the vehicle wai
 has moved or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
 
 
-def cone_radius_m(c: Context) -> float:
+def ascent_cone_radius_m(c: Context) -> float:
     """Return the radius of the cone at the present height, m: the largest offset from the target's
     axis."""
     ascend = c.planner.ascend
     return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.gear_to_target_z_m)
 
 
-def standoff_m(c: Context) -> float:
+def ascent_end_below_target_m(c: Context) -> float:
     """Return the distance of the gear below the target at which the ascent ends, m."""
     hover = c.planner.hover
     return c.planner.ascend.standoff_m if hover is None else hover.below_m
 
 
-def is_near_standoff(c: Context) -> bool:
+def has_reached_ascent_end_height(c: Context) -> bool:
     """True if the gear has reached the height at which the ascent settles."""
-    return c.belief.target.gear_to_target_z_m <= standoff_m(c) + c.planner.ascend.settle_z_m
+    return (
+        c.belief.target.gear_to_target_z_m
+        <= ascent_end_below_target_m(c) + c.planner.ascend.settle_z_m
+    )
 
 
 def _is_settled_at_standoff(c: Context) -> bool:
     """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
     the small marker recently."""
-    ascend, target, offset = c.planner.ascend, c.belief.target, c.belief.lateral_offset
+    ascend, target, lateral = c.planner.ascend, c.belief.target, c.belief.lateral_state
     gear_to_target_distance_xy_m = (
-        target.gear_to_target_distance_xy_m if offset is None else math.hypot(*offset.offset_m)
+        target.gear_to_target_distance_xy_m
+        if lateral is None
+        else math.hypot(*lateral.gear_to_target_world_xy_m)
     )
     return (
         target.is_fresh
         and target.is_small_marker_fresh
-        and is_near_standoff(c)
+        and has_reached_ascent_end_height(c)
         and gear_to_target_distance_xy_m <= ascend.settle_xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.belief.speed_mps <= ascend.settle_speed_mps
@@ -80,12 +85,13 @@ def _is_at_hover_position(c: Context) -> bool:
     which the mission hovers. The tolerances are those of ALIGN, since the small marker may be too
     far away to be seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
-    goal_z_m = target.vehicle_world_z_when_touching_m - standoff_m(c)
+    goal_z_m = target.vehicle_world_z_when_touching_m - ascent_end_below_target_m(c)
     return (
         target.is_fresh
         and setpoint is not None
-        and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_TOLERANCE_M
-        and abs(target.gear_to_target_z_m - standoff_m(c)) <= HOVER_HEIGHT_TOLERANCE_M
+        and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_HEIGHT_TOLERANCE_M
+        and abs(target.gear_to_target_z_m - ascent_end_below_target_m(c))
+        <= HOVER_HEIGHT_TOLERANCE_M
         and target.gear_to_target_distance_xy_m <= align.xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
         and c.belief.speed_mps <= MAX_SPEED_HOVERING_IN_PLACE_MPS
@@ -105,12 +111,12 @@ def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, every moment without it is too long, since the position drifts."""
     b = c.belief
-    patience_s = 0.0 if b.is_positioned_by_target else MAX_TARGET_LOST_S
+    patience_s = 0.0 if b.is_target_position_source else MAX_TARGET_LOST_S
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 
 NEAR_STANDOFF_HEIGHT = Condition[Context](
-    "near the stand-off", lambda c: c.belief.target.is_tracked and is_near_standoff(c)
+    "near the stand-off", lambda c: c.belief.target.is_tracked and has_reached_ascent_end_height(c)
 )
 """The gear is at the stand-off below a tracked target."""
 SETTLED_AT_STANDOFF = Condition[Context]("settled", _is_settled_at_standoff)
@@ -132,15 +138,15 @@ def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or make_setpoint_at_vehicle(c)
-    goal_z = target.vehicle_world_z_when_touching_m - standoff_m(c)
+    goal_z = target.vehicle_world_z_when_touching_m - ascent_end_below_target_m(c)
     may_climb = (
         target.is_fresh
         and target.gear_to_target_distance_xy_m
-        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * cone_radius_m(c)
+        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * ascent_cone_radius_m(c)
     )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.gear_to_target_z_m < ascend.near_m else ascend.speed_mps
-    speed = min(speed, max(MIN_ASCENT_CLIMB_RATE_MPS, goal_z - setpoint.z_m))
+    speed = min(speed, max(MIN_ASCENT_SETPOINT_CLIMB_RATE_MPS, goal_z - setpoint.z_m))
     return fly_under_target(
         c,
         goal_z,
@@ -172,7 +178,7 @@ ASCEND = PhaseDefinition(
         Transition(
             "outside-cone",
             {Phase.ASCEND},
-            lambda c: c.belief.target.gear_to_target_distance_xy_m > cone_radius_m(c),
+            lambda c: c.belief.target.gear_to_target_distance_xy_m > ascent_cone_radius_m(c),
             Phase.ALIGN,
             "drifted out of the cone",
             Severity.HOLD,
@@ -191,7 +197,7 @@ ASCEND = PhaseDefinition(
             {Phase.ASCEND},
             lambda c: c.true_for_s(AT_HOVER_POSITION) >= c.planner.ascend.settle_dwell_s,
             Phase.HOVER,
-            lambda c: f"steady {standoff_m(c):g} m below the target",
+            lambda c: f"steady {ascent_end_below_target_m(c):g} m below the target",
         ),
         Transition(
             "settled",

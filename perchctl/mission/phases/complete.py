@@ -5,23 +5,23 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import (
     MAGNET_HOLDS_VEHICLE,
+    MOTORS_OFF_AS_COMMANDED,
     MOTORS_OFF_DWELL_S,
-    MOTORS_STOPPED,
-    gear_offset_at_last_touch_or_now,
+    gear_to_target_at_last_touch_or_now,
     has_slipped,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
-from perchctl.mission.release import lower_thrust, release_by_thrust, stop_motors
+from perchctl.mission.release import reduce_press_before_release, release_by_thrust, stop_motors
 from perchctl.mission.rest import is_still_hanging
 from perchctl.mission.setpoints import Action
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
-MOTOR_STOP_TIMEOUT_S = 10.0
+MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S = 10.0
 """Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 
 
@@ -30,7 +30,7 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],
-        last_contact_offset=gear_offset_at_last_touch_or_now(previous_context.belief),
+        gear_to_target_at_last_contact=gear_to_target_at_last_touch_or_now(previous_context.belief),
     )
     return replace(state, belief=belief, release_began_at_s=None)
 
@@ -42,7 +42,9 @@ def act(c: Context) -> Action:
         return stop_motors(c)
     holds = c.true_for_s(MAGNET_HOLDS_VEHICLE) >= c.planner.complete.hold_dwell_s
     return (
-        release_by_thrust(c) if holds or c.state.release_began_at_s is not None else lower_thrust(c)
+        release_by_thrust(c)
+        if holds or c.state.release_began_at_s is not None
+        else reduce_press_before_release(c)
     )
 
 
@@ -59,7 +61,7 @@ def is_release_monitoring_over(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return (
         time_since_motor_stop_command_s(c) >= c.planner.complete.watch_s
-        and c.true_for_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S
+        and c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= MOTORS_OFF_DWELL_S
     )
 
 
@@ -109,7 +111,7 @@ COMPLETE = PhaseDefinition(
             {Phase.COMPLETE},
             lambda c: (
                 time_since_motor_stop_command_s(c)
-                > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S
+                > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S
             ),
             lambda c: (
                 f"motors stopped, but telemetry still reports a thrust of {c.telemetry.thrust:.0f}"

@@ -3,8 +3,9 @@
 The mission is that of a perch up to ASCEND, which ends at the hover's place instead of the
 stand-off. HOVER itself never climbs. A vehicle that sinks below its place, for example because the
 estimated height drifts, climbs back in ASCEND; its time goes on if that takes at most
-`MAX_RETURN_TO_HOVER_HEIGHT_S`. A vehicle that leaves its place returns to ALIGN, and its time
-starts anew. So a completed hover has kept its place for the whole time, apart from such climbs.
+`MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its place returns to ALIGN, and its
+time starts anew. So a completed hover has kept its place for the whole time, apart from such
+climbs.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
 from perchctl.mission.phases.ascend import (
-    cone_radius_m,
+    ascent_cone_radius_m,
     is_returning_to_hover_height,
     is_target_lost,
 )
@@ -35,7 +36,7 @@ estimated height moves the vehicle further. Smaller: the noise of the target's h
 back needlessly."""
 SUNK_BELOW_HOVER_HEIGHT_DWELL_S = 0.3
 """Time for which the vehicle must be so low, s."""
-MAX_RETURN_TO_HOVER_HEIGHT_S = 5.0
+MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S = 5.0
 """Longest time of a climb back after which the hover's time goes on, s. Larger: a weak vehicle
 counts as hovering although it is too low. Smaller: a windy climb starts the time anew."""
 MAX_HOVER_HEIGHT_ERROR_M = 0.15
@@ -65,10 +66,10 @@ def time_since_hover_began_s(c: Context) -> float:
 
 def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     """Restart the hover timer and the position errors. Both continue if the vehicle has only
-    climbed back to its hover position within `MAX_RETURN_TO_HOVER_HEIGHT_S`."""
+    climbed back to its hover position within `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`."""
     if (
         is_returning_to_hover_height(previous_context.state)
-        and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_S
+        and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S
     ):
         return state
     return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
@@ -89,11 +90,11 @@ def distance_below_hover_height_m(c: Context) -> float:
 
 def has_left_hover_position(c: Context) -> bool:
     """True if the gear's offset from the target's axis exceeds the radius of the approach cone
-    (`cone_radius_m`), or its height differs from that of the hover by more than
+    (`ascent_cone_radius_m`), or its height differs from that of the hover by more than
     `MAX_HOVER_HEIGHT_ERROR_M`."""
     lateral_m = c.belief.target.gear_to_target_distance_xy_m
     return (
-        lateral_m > cone_radius_m(c)
+        lateral_m > ascent_cone_radius_m(c)
         or abs(distance_below_hover_height_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, MOTORS_STOPPED
+from perchctl.mission.belief.contact import MOTORS_OFF_AS_COMMANDED, MOTORS_OFF_DWELL_S
 from perchctl.mission.belief.reckoning import correct_acceleration_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
@@ -39,7 +39,8 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
         previous_context.state.phase is Phase.RECOVER
         and VehicleDiagnosis.HANGING_AT_LAST_TOUCH not in diagnosis
     ):
-        b = replace(b, last_contact_offset=None)  # no evidence of a support at that position
+        # no evidence of a support at that position
+        b = replace(b, gear_to_target_at_last_contact=None)
     # With a wrong mounting, the setpoint leads in a wrong direction.
     setpoint = None if VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis else state.setpoint
     return enter_descent(replace(state, belief=b, setpoint=setpoint), previous_context.state)
@@ -49,7 +50,8 @@ def make_rest_state_predicate(rest_state: RestState) -> Predicate:
     """Return the predicate that the motors are off and the vehicle is in the rest state
     `rest_state`."""
     return lambda c: (
-        c.true_for_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S and find_rest_state(c) is rest_state
+        c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= MOTORS_OFF_DWELL_S
+        and find_rest_state(c) is rest_state
     )
 
 
@@ -119,7 +121,7 @@ LANDING = PhaseDefinition(
         ),
         abort_during_landing_row(
             "hangs-or-stands",
-            lambda c: c.true_for_s(MOTORS_STOPPED) >= TARGET_RECHECK_DURATION_S,
+            lambda c: c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= TARGET_RECHECK_DURATION_S,
             "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
             "whether the vehicle hangs or stands: look before you touch it",
         ),

@@ -2,7 +2,7 @@
 
 ASCEND ends with the vehicle settled at the stand-off; PERCH has no entry action of its own. The
 setpoint rises through the target, or raw thrust presses (`planner.perch` in the profile,
-`PerchConfig`). Position, acceleration and thrust together prove a contact (`CONTACT` in
+`PerchConfig`). Position, acceleration and thrust together prove a contact (`TARGET_CONTACT` in
 `belief/contact.py`). A contact within the magnet's radius leads to COMPLETE. A contact outside it
 leads to RECOVER, and so does a push from the side, a press without contact, and with the target
 alone a press that lasts too long without a new position; each of these is a failed attempt. The
@@ -13,7 +13,7 @@ obstacle. No hold applies in this phase because a hold would leave the vehicle p
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import CONTACT, current_gear_offset
+from perchctl.mission.belief.contact import TARGET_CONTACT, current_gear_to_target
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.quality import LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT, position_loss_text
 from perchctl.mission.context import Context
@@ -55,9 +55,9 @@ def act(c: Context) -> Action:
     return fly_to(c, setpoint, corrects_height=False)
 
 
-def is_in_contact(c: Context) -> bool:
+def is_contact_proven(c: Context) -> bool:
     """True once a contact is proven."""
-    return c.true_for_s(CONTACT) >= c.planner.perch.contact_dwell_s
+    return c.true_for_s(TARGET_CONTACT) >= c.planner.perch.contact_dwell_s
 
 
 def contact_evidence_text(c: Context) -> str:
@@ -65,7 +65,7 @@ def contact_evidence_text(c: Context) -> str:
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
         by = f"acceleration and thrust ({position_loss_text(c.belief)})"
-    return f"contact proven by {by}; {current_gear_offset(c.belief).text}"
+    return f"contact proven by {by}; {current_gear_to_target(c.belief).text}"
 
 
 PERCH = PhaseDefinition(
@@ -77,21 +77,26 @@ PERCH = PhaseDefinition(
             "beside-the-magnet",
             {Phase.PERCH},
             lambda c: (
-                is_in_contact(c)
-                and not current_gear_offset(c.belief).is_within(c.planner.perch.contact_xy_m)
+                is_contact_proven(c)
+                and not current_gear_to_target(c.belief).is_certainly_within(
+                    c.planner.perch.contact_xy_m
+                )
             ),
-            lambda c: f"contact {current_gear_offset(c.belief).text}",
+            lambda c: f"contact {current_gear_to_target(c.belief).text}",
         ),
-        Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_evidence_text),
+        Transition(
+            "contact", {Phase.PERCH}, is_contact_proven, Phase.COMPLETE, contact_evidence_text
+        ),
         back_off_row(
             "pressed-blindly",
             {Phase.PERCH},
             lambda c: (
-                c.belief.is_positioned_by_target
-                and c.belief.position_age_s > MAX_PRESS_DURATION_WITHOUT_SIGHTING_S
+                c.belief.is_target_position_source
+                and c.belief.position_correction_age_s > MAX_PRESS_DURATION_WITHOUT_SIGHTING_S
             ),
             lambda c: (
-                f"no contact {c.belief.position_age_s:.1f} s after the last sighting of the target"
+                f"no contact {c.belief.position_correction_age_s:.1f} s "
+                "after the last sighting of the target"
             ),
         ),
         back_off_row(

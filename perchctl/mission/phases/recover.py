@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from perchctl.mission.belief.belief import ContactOffset
+from perchctl.mission.belief.belief import GearToTargetDistance
 from perchctl.mission.belief.contact import (
-    CONTACT,
     IMU_SHOWS_SUPPORT,
-    current_gear_offset,
+    TARGET_CONTACT,
+    current_gear_to_target,
     is_at_contact_height,
 )
 from perchctl.mission.belief.evidence import Condition
@@ -64,7 +64,7 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     )
     belief = replace(
         state.belief,
-        last_contact_offset=_find_touch_offset(previous_context, diagnosis),
+        gear_to_target_at_last_contact=_find_gear_to_target_at_touch(previous_context, diagnosis),
         # The vehicle counts as within the magnet's reach until its position is below.
         vehicle_world_z_at_last_contact_m=z_m if touched else b.vehicle_world_z_at_last_contact_m,
     )
@@ -82,21 +82,26 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     )
 
 
-def _find_touch_offset(
+def _find_gear_to_target_at_touch(
     previous_context: Context, diagnosis: VehicleDiagnosis
-) -> ContactOffset | None:
-    """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
+) -> GearToTargetDistance | None:
+    """Return the distance between gear and target at the touch that ended the attempt; None if no
+    touch is known."""
     old, b = previous_context.state, previous_context.belief
     # the contact was proven, and the vehicle has not come off
     if VehicleDiagnosis.STILL_AT_PROVEN_CONTACT in diagnosis:
-        return b.last_contact_offset
+        return b.gear_to_target_at_last_contact
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
-        return b.last_contact_offset if b.vehicle_world_z_at_last_contact_m is not None else None
-    proven = b.true_for_s(CONTACT) >= previous_context.planner.perch.contact_dwell_s
+        return (
+            b.gear_to_target_at_last_contact
+            if b.vehicle_world_z_at_last_contact_m is not None
+            else None
+        )
+    proven = b.true_for_s(TARGET_CONTACT) >= previous_context.planner.perch.contact_dwell_s
     # `IMU_SHOWS_SUPPORT` includes that dwell time
     carried = proven or b.true_for_s(IMU_SHOWS_SUPPORT) >= 0.0
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
-        return current_gear_offset(b)
+        return current_gear_to_target(b)
     return None
 
 

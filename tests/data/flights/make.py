@@ -80,7 +80,7 @@ def _seen(log: Path) -> None:
     }
     profile = short_profile(SMALL | changes)
     watcher = LogWatcher.open_lockstep(log, profile, 4, record=True)
-    flight = fly_lockstep(profile, 4, watcher, **ordered({Phase.PERCH: OperatorRequest.STOP}))
+    flight = fly_lockstep(profile, 4, watcher, **ordered({Phase.PERCH: OperatorRequest.CUT_MOTORS}))
     watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
 
@@ -101,7 +101,7 @@ def _hung_within(log: Path) -> None:
             return real(parts)
 
         patch.setattr(lockstep, "fly", fly)
-        _fly(log, operator_at={Phase.ALIGN: OperatorRequest.STOP})
+        _fly(log, operator_at={Phase.ALIGN: OperatorRequest.CUT_MOTORS})
 
 
 FLIGHTS: dict[str, Callable[[Path], None]] = {
@@ -110,7 +110,7 @@ FLIGHTS: dict[str, Callable[[Path], None]] = {
     "slipped": partial(_fly, changes={"simulation.first_contact_fails": 1.0}),
     "hovered": partial(_fly, changes={"planner.hover": {"below_m": 0.6, "duration_s": 1.0}}),
     "seen": _seen,
-    "stopped": partial(_fly, operator_at={Phase.ALIGN: OperatorRequest.STOP}),
+    "stopped": partial(_fly, operator_at={Phase.ALIGN: OperatorRequest.CUT_MOTORS}),
     "link-silent": partial(_fault, fault="link-silent", seed=2),
     "hung-within": _hung_within,
     "hung": partial(_fault, fault="hung", seed=2),
