@@ -144,8 +144,8 @@ def has_recovered(c: Context) -> bool:
 
 
 def unsteady_reason(c: Context) -> str:
-    """Return a text that names the observations that kept the vehicle from being steady; their
-    cause is unknown."""
+    """Return a text that lists the measurements by which the vehicle was judged unsteady. It says
+    what was observed, not why."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:
