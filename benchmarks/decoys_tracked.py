@@ -128,7 +128,7 @@ def tracked(decoy: Decoy, in_flight: bool, seed: int, blur_px: float) -> Count:
             off_m = float(np.linalg.norm(target.e_m - true))
             count = Count(
                 count.frames + 1,
-                count.measured + target.measured,
+                count.measured + target.is_measured_in_newest_frame,
                 count.wrong + (off_m > WRONG_M and not anew),
                 count.anew + anew,
                 count.worst_m if anew else max(count.worst_m, off_m),

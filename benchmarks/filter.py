@@ -152,7 +152,7 @@ def run(
 
 def compared(output: PipelineOutput, e_m: Array, yaw: float) -> tuple[Array, Array, float] | None:
     target, pose = output.target, next(iter(output.poses.values()), None)
-    if target is None or pose is None or not target.measured:
+    if target is None or pose is None or not target.is_measured_in_newest_frame:
         return None
     filtered = np.array([*(target.e_m - e_m), wrap_rad(target.e_yaw_rad - yaw)])
     still = np.array([*(pose.e_m - e_m), wrap_rad(pose.e_yaw_rad - yaw)])

@@ -42,7 +42,7 @@ from perchctl.vision import (
     VehicleState,
     make_camera_only_profile,
     make_pipeline,
-    target_covariance_cam,
+    target_rotation_translation_cov_cam,
     to_grey,
 )
 
@@ -284,7 +284,7 @@ def _add_pose(
     R_level_body = np.eye(3) if attitude is None else attitude.R_level_body
     T_level_cam = make_T(R_level_body, np.zeros(3)) @ T_body_cam
     order = [3, 4, 5, 0, 1, 2]
-    covariance = target_covariance_cam(pose)[np.ix_(order, order)]
+    covariance = target_rotation_translation_cov_cam(pose)[np.ix_(order, order)]
     print_m = T_level_cam[:3, :3].T @ pose.shift_per_print_error_sigma_m
     covariance[:3, :3] += print_m @ print_m.T
     level = None if attitude is None else T_level_cam @ T_cam_target

@@ -55,7 +55,7 @@ def edge_fit(file: Path) -> None:
     """The profiles across the sides, the edges on them, and where the lines meet."""
     view = _view("Edge fit")
     figure, whole, near = _panels(view)
-    markers = prepare_marker_sides(_expected(view)[None], [_LARGE.border_cells], CAMERA)
+    markers = prepare_marker_sides(_expected(view)[None], [_LARGE.cells_along_border], CAMERA)
     assert markers is not None
     edges, _ = measure_edges(view.image, markers, CAMERA, with_inner_edges=False)
     used = edges.points_normalised[edges.weight > 0.0]
@@ -117,8 +117,8 @@ def cut_view_fit(file: Path) -> None:
     small = SETUP.patterns["small"]
     outline = make_outline(
         _LARGE.drawing,
-        _LARGE.border_cells.print_tolerance_cells,
-        small.border_cells.print_tolerance_cells,
+        _LARGE.cells_along_border.print_tolerance_cells,
+        small.cells_along_border.print_tolerance_cells,
     )
     R, t = cv2.Rodrigues(view.pose[0])[0], view.pose[1] / 0.075
     start = RigidPose(np.asarray(R) @ np.diag([1.0, -1.0, -1.0]), t)
@@ -142,7 +142,7 @@ def search_and_refinement(file: Path) -> None:
     view = _view("Search")
     figure, whole, near = _panels(view, zoom_px=_NEARER_PX)
     raw = search(view.picture, {}).corners_px["large"]
-    subpix = refine_subpix(view.image, raw, _LARGE.border_cells.cells_per_side).corners_px
+    subpix = refine_subpix(view.image, raw, _LARGE.cells_along_border.cells_per_side).corners_px
     near.plot(*raw.T, "s", color=ORANGE, label="found by the search", zorder=5)
     near.plot(*subpix.T, "o", color=VERMILLION, label="subpixel refinement", zorder=5)
     _finish(figure, file, whole, view)
@@ -226,11 +226,11 @@ def _drawing(view: View, file: Path) -> None:
     n = 44
     grid = make_sampling_grid(n, drawing.photometric_fit_reach_half_sides)
     H = homography_from_centred_square(undistort_px(fit.corners_px, CAMERA))
-    x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
+    x, y = distort_px(project_nodes(H, grid.node_uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
     node_px = drawing.photometric_fit_reach_half_sides * mean_side_px(fit.corners_px) / n
     rows, _ = render_blurred(
-        drawing, n, round(np.log(fit.blur_px / node_px) / 0.02)
+        drawing, n, round(np.log(fit.blur_sigma_px / node_px) / 0.02)
     ).illumination_basis
     drawn = rows.T @ np.linalg.lstsq(rows.T, grey, rcond=None)[0]
     figure = new_figure(7.2, 2.4, dpi=100)
@@ -247,7 +247,7 @@ def _drawing(view: View, file: Path) -> None:
     low, high = float(grey.min()), float(grey.max())
     for ax, values, title in (
         (seen, grey, "picture on the grid"),
-        (model, drawn, f"drawing, blur {fit.blur_px:.1f} px"),
+        (model, drawn, f"drawing, blur {fit.blur_sigma_px:.1f} px"),
         (rest, grey - drawn + 0.5 * (low + high), "difference"),
     ):
         ax.imshow(values.reshape(n, n), cmap="gray", vmin=low, vmax=high)

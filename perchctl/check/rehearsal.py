@@ -197,7 +197,12 @@ def _note(
     seen = output.detections
     done.target_pictures += seen.large is not None or seen.small is not None
     target = output.target
-    if stands and target is not None and target.measured and target.world_m is not None:
+    if (
+        stands
+        and target is not None
+        and target.is_measured_in_newest_frame
+        and target.world_m is not None
+    ):
         done.target_places.append((frame.t_s, target.world_m))
     prints.add(output)
     done.newest_outputs = [*done.newest_outputs[1 - KEPT_FRAMES :], (frame, output)]
@@ -213,10 +218,10 @@ def _blur_px(
             seen = output.detections.get(name)
             if seen is None:
                 continue
-            rim = pipeline.detector_setup.patterns[name].border_cells
+            rim = pipeline.detector_setup.patterns[name].cells_along_border
             corners = seen.corners_px.reshape(1, 4, 2)
             (refined,) = refine_corners_by_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:
-                found_px.append(refined.sharpest_side_blur_px)
+                found_px.append(refined.sharpest_side_blur_sigma_px)
                 break  # the large marker if it was seen
     return float(np.median(found_px)) if found_px else None

@@ -68,7 +68,9 @@ def _update_before_decision(
     state = observe(state, obs, profile, maneuver)
     consecutive_target_frames, target = state.consecutive_target_frames, obs.target
     if obs.has_new_frame:
-        measured = target is not None and target.measured and target.world_m is not None
+        measured = (
+            target is not None and target.is_measured_in_newest_frame and target.world_m is not None
+        )
         consecutive_target_frames = consecutive_target_frames + 1 if measured else 0
         if measured and is_hovering(state):
             state = _add_hover_error(state, obs, profile)

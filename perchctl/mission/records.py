@@ -17,7 +17,7 @@ from perchctl.mission.rest import RestState
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
-from perchctl.vision import CameraErrors, PictureKind, PipelineOutput, TargetEstimate
+from perchctl.vision import CameraCalibrationErrors, PictureKind, PipelineOutput, TargetEstimate
 
 TickRole = Literal["waiting", "redone", "flown", "failed"]
 
@@ -203,7 +203,7 @@ class Tick:
     record: TickRecord
     state: PlannerState
     output: PipelineOutput | None = None
-    camera_errors: CameraErrors | None = None
+    camera_errors: CameraCalibrationErrors | None = None
 
     @property
     def observation(self) -> Observation:

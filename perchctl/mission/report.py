@@ -18,7 +18,7 @@ from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import CameraErrors
+from perchctl.vision import CameraCalibrationErrors
 
 MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
@@ -77,19 +77,25 @@ class CameraFindings:
 
     @classmethod
     def from_camera_errors(
-        cls, camera_errors: CameraErrors, camera: CameraConfig, *, simulated: bool = False
+        cls,
+        camera_errors: CameraCalibrationErrors,
+        camera: CameraConfig,
+        *,
+        simulated: bool = False,
     ) -> CameraFindings:
         """Return the findings from a flight's estimates, with advice on each error that is beyond
         its limit and significant at 95 %; no advice if the flight was `simulated`."""
-        latency_s = camera.start_latency_s + camera_errors.delay_s
-        x, y, z = (math.degrees(turn) for turn in camera_errors.mount_rotation_xyz_rad)
+        latency_s = camera.start_latency_s + camera_errors.latency_above_profile_s
+        x, y, z = (math.degrees(turn) for turn in camera_errors.mount_rotation_from_profile_xyz_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in camera_errors.mount_rotation_sigma_xyz_rad)
-        found, advice = cls(latency_s, camera_errors.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
+        found, advice = cls(latency_s, camera_errors.latency_sigma_s, (x, y, z), (sx, sy, sz)), []
         if simulated:
             return found
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
         if set_here and _is_significant(
-            camera_errors.delay_s, MIN_REPORTED_LATENCY_ERROR_S, camera_errors.delay_sigma_s
+            camera_errors.latency_above_profile_s,
+            MIN_REPORTED_LATENCY_ERROR_S,
+            camera_errors.latency_sigma_s,
         ):
             advice.append(
                 f"the latency is {found.latency_text}, not {camera.start_latency_s * 1e3:.0f} ms "
@@ -191,7 +197,7 @@ class FlightReport:
         obs: Observation,
         profile: Profile,
         history: tuple[Event, ...],
-        camera_errors: CameraErrors | None,
+        camera_errors: CameraCalibrationErrors | None,
         *,
         simulated: bool = False,
     ) -> FlightReport:

@@ -18,7 +18,7 @@ from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.perception.history import History, attitude_at, velocity_at
 from perchctl.profile import USED_LATENCY_S
 from perchctl.values import replace
-from perchctl.vision import CameraErrors, MarkerPose, PoseSetup, VehicleState
+from perchctl.vision import CameraCalibrationErrors, MarkerPose, PoseSetup, VehicleState
 
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
@@ -55,7 +55,7 @@ class OnlineCalibration:
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
-    newest: CameraErrors | None = None
+    newest: CameraCalibrationErrors | None = None
     solved_s: float = -math.inf
     applied_delay_s: float = 0.0
     coarse_delay_s: float | None = None
@@ -68,7 +68,7 @@ class OnlineCalibration:
         unknown latency."""
         if self.newest is None:
             return UNKNOWN_SIGMA_S
-        return min(UNKNOWN_SIGMA_S, self.newest.delay_sigma_s)
+        return min(UNKNOWN_SIGMA_S, self.newest.latency_sigma_s)
 
 
 def update_calibration(
@@ -85,8 +85,8 @@ def update_calibration(
     `t_s` is the image's arrival time minus the profile's latency. A pose is ignored if it is not
     finite or too close, or if the attitude at its time is unknown.
     """
-    new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
-    delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
+    new, likely = old, old.newest is not None and old.newest.latency_sigma_s < LIKELY_S
+    delay_s = old.newest.latency_above_profile_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
@@ -118,7 +118,11 @@ def apply_latency(
     belong to an earlier latency, and are restarted.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
-    sure_s = found.delay_s if found is not None and found.delay_sigma_s <= USED_SIGMA_S else None
+    sure_s = (
+        found.latency_above_profile_s
+        if found is not None and found.latency_sigma_s <= USED_SIGMA_S
+        else None
+    )
     if correction_s is not None:
         coarse_s = correction_s
         if sure_s is not None and abs(sure_s - correction_s) > CHANGED_S:
@@ -302,7 +306,9 @@ def add_rows(
     )
 
 
-def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
+def solve_consistency(
+    sums: ConsistencySums, attitude_sigma_rad: float
+) -> CameraCalibrationErrors | None:
     """Return the errors of latency and mounting; None if the frames cover less than a second.
 
     `attitude_sigma_rad` is the standard deviation of the bias of the estimated roll and pitch.
@@ -321,10 +327,14 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Camer
         math.hypot(sigma[column - 1], attitude_sigma_rad) for column in (TILT_X, TILT_Y)
     )
     turn = math.atan2(found[TURN - 1], 1.0 - found[SCALE - 1])
-    return CameraErrors(
-        delay_s=float(found[DELAY - 1]),
-        delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
-        mount_rotation_xyz_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
+    return CameraCalibrationErrors(
+        latency_above_profile_s=float(found[DELAY - 1]),
+        latency_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
+        mount_rotation_from_profile_xyz_rad=(
+            float(found[TILT_X - 1]),
+            float(found[TILT_Y - 1]),
+            turn,
+        ),
         mount_rotation_sigma_xyz_rad=(
             tilt_x,
             tilt_y,

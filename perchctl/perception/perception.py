@@ -28,7 +28,7 @@ from perchctl.perception.visual_inertial import (
 from perchctl.profile import USED_LATENCY_S, Profile
 from perchctl.values import replace
 from perchctl.vision import (
-    CameraErrors,
+    CameraCalibrationErrors,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -122,7 +122,7 @@ class Perception:
         """Standard deviation of the latency in use, s; 0 for a latency set in the profile."""
         return 0.0 if self._measured_latency is None else self.calibration.delay_sigma_s
 
-    def camera_errors(self) -> CameraErrors | None:
+    def camera_errors(self) -> CameraCalibrationErrors | None:
         """Return the errors of latency and mounting from all images so far; None if there are too
         few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
@@ -148,7 +148,7 @@ class Perception:
                 history.imu.accelerometer_offset_g,
                 measured,
             )
-        if output.target is not None and output.target.measured:
+        if output.target is not None and output.target.is_measured_in_newest_frame:
             self.calibration = update_calibration(
                 self.calibration,
                 t_s,

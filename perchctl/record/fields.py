@@ -157,7 +157,9 @@ def tick_record(
         "tel_age_s": tick.telemetry_age_s,
         "cam_age_s": tick.last_good_frame_age_s,
         "late_s": tick.tick_start_delay_s,
-        "delay_s": None if tick.camera_errors is None else tick.camera_errors.delay_s,
+        "delay_s": None
+        if tick.camera_errors is None
+        else tick.camera_errors.latency_above_profile_s,
         "delay_used_s": tick.camera_latency_above_profile_s or None,
         "true_miss_m": true_miss_m,
         **_xyz("true_", true_position_m),
@@ -242,10 +244,10 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
         **_xyz("ev", target.velocity_mps, "mps"),
         **_xyz("es", target.sigma_m),
         "esyaw_rad": target.sigma_yaw_rad,
-        "measured": target.measured,
+        "measured": target.is_measured_in_newest_frame,
         "tracked": target.tracked,
-        "target_age_s": target.t_s - target.measured_s,
-        "unseen": target.unseen,
+        "target_age_s": target.t_s - target.last_measured_at_s,
+        "unseen": target.unseen_frames,
         **_xyz("t", target.world_m),
         "tyaw_rad": target.world_yaw_rad,
     }

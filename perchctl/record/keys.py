@@ -95,6 +95,14 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
     "SentCommand": {
         "sender": "by",
     },
+    "TargetEstimate": {
+        "last_measured_at_s": "measured_s",
+        "small_marker_last_measured_at_s": "small_measured_s",
+        "is_measured_in_newest_frame": "measured",
+        "unseen_frames": "unseen",
+        "measured_gear_to_target_world_m": "measured_offset_m",
+        "measured_gear_to_target_sigma_m": "measured_offset_sigma_m",
+    },
     "TickInputs": {
         "late_samples": "late",
         "camera_problem": "problem",

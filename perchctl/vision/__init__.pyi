@@ -14,11 +14,11 @@ from .pipeline import step as step
 from .pose import PoseSetup as PoseSetup
 from .pose import estimate_pose as estimate_pose
 from .pose import square_corners as square_corners
-from .pose import target_covariance_cam as target_covariance_cam
+from .pose import target_rotation_translation_cov_cam as target_rotation_translation_cov_cam
 from .target_selection import target_level_to_world as target_level_to_world
 from .target_selection import target_world_to_level as target_world_to_level
 from .types import MARKERS as MARKERS
-from .types import CameraErrors as CameraErrors
+from .types import CameraCalibrationErrors as CameraCalibrationErrors
 from .types import CameraModel as CameraModel
 from .types import Detection as Detection
 from .types import Frame as Frame

@@ -27,7 +27,7 @@ _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # a pixel counts if its difference exceeds this multiple of the mean difference within the fields
-_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
+_MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _COMBING_CHECK_INTERVAL_FRAMES = 3
@@ -43,11 +43,13 @@ _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
 _MAX_FRAME_GAP_S = (
     0.25  # s; after a longer gap, the previous frame says nothing about the field order
 )
-_MIN_FIELD_ORDER_VOTES = (
+_MIN_ABS_FIELD_ORDER_VOTE_SUM = (
     1.0  # sum of votes, each at most 1, that decides the order: two frames at least
 )
-_MAX_FIELD_ORDER_VOTES = 3.0  # limit of the sum, so that a change of the order is detected soon
-_MIN_FIELD_ORDER_REVERSAL_VOTES = 1.0  # sum of votes that reverses an earlier decision
+_MAX_ABS_FIELD_ORDER_VOTE_SUM = (
+    3.0  # limit of the sum, so that a change of the order is detected soon
+)
+_MIN_FIELD_ORDER_REVERSAL_VOTE_SUM = 1.0  # sum of votes that reverses an earlier decision
 
 
 def is_combed(image: GreyImage) -> bool:
@@ -68,7 +70,9 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
+    least = max(
+        _MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY
+    )
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
@@ -103,10 +107,10 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
     return result
 
 
-def interpolated_edge_sigma_px(blur_px: float) -> float:
+def interpolated_edge_sigma_px(blur_sigma_px: float) -> float:
     """Return the position error, px (standard deviation), of a nearly horizontal edge in an
-    interpolated field. `blur_px` is the edge's blur (standard deviation)."""
-    return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_px * blur_px)
+    interpolated field. `blur_sigma_px` is the edge's blur (standard deviation)."""
+    return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_sigma_px * blur_sigma_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
@@ -146,7 +150,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
         new = FieldState(
             picture_kind,
             skipped,
-            state.top_field_first_votes,
+            state.top_field_first_vote_sum,
             state.is_top_field_first,
             frame_periods_s,
             frame.t_s,
@@ -195,9 +199,9 @@ def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...
 
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
-    before, top_field_first_votes, is_top_field_first = (
+    before, top_field_first_vote_sum, is_top_field_first = (
         state.previous_image,
-        state.top_field_first_votes,
+        state.top_field_first_vote_sum,
         state.is_top_field_first,
     )
     near = (
@@ -213,21 +217,22 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        top_field_first_votes = min(
-            max(top_field_first_votes + vote, -_MAX_FIELD_ORDER_VOTES), _MAX_FIELD_ORDER_VOTES
+        top_field_first_vote_sum = min(
+            max(top_field_first_vote_sum + vote, -_MAX_ABS_FIELD_ORDER_VOTE_SUM),
+            _MAX_ABS_FIELD_ORDER_VOTE_SUM,
         )
-    if is_top_field_first is None and abs(top_field_first_votes) > _MIN_FIELD_ORDER_VOTES:
-        is_top_field_first = top_field_first_votes > 0.0
+    if is_top_field_first is None and abs(top_field_first_vote_sum) > _MIN_ABS_FIELD_ORDER_VOTE_SUM:
+        is_top_field_first = top_field_first_vote_sum > 0.0
     elif (
         is_top_field_first is not None
-        and (top_field_first_votes if not is_top_field_first else -top_field_first_votes)
-        > _MIN_FIELD_ORDER_REVERSAL_VOTES
+        and (top_field_first_vote_sum if not is_top_field_first else -top_field_first_vote_sum)
+        > _MIN_FIELD_ORDER_REVERSAL_VOTE_SUM
     ):
         is_top_field_first = not is_top_field_first
     return replace(
         state,
         last_frame_t_s=frame.t_s,
-        top_field_first_votes=top_field_first_votes,
+        top_field_first_vote_sum=top_field_first_vote_sum,
         is_top_field_first=is_top_field_first,
         previous_image=frame.image,
     )

@@ -47,10 +47,10 @@ _SI_PER_PAPER_UNIT = np.array(
 _ACCELERATION_CORRELATION_TIME_S = 0.1
 """Duration of an acceleration, s: the density of the white noise is its square times this,
 (m/s^2)^2 s."""
-_WORLD_FRAME_DRIFT_VARIANCE_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+_WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
 m^2)."""
-_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
+_WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
 _MAX_NIS_WITHOUT_RESTART = 25.0
 """Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
 5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
@@ -62,24 +62,27 @@ class ProcessNoise:
     """Process noise of the tracks, as standard deviations of white accelerations.
 
     Attributes:
-        acceleration_sigma_mps2: of the target along each axis.
-        heading_acceleration_sigma_radps2: of the target's heading.
-        level_frame_acceleration_sigma_radps2: angular acceleration of the level frame about its
-            origin, the gear; it moves a target in proportion to its distance.
+        target_acceleration_sigma_mps2: of the target along each axis.
+        target_heading_acceleration_sigma_radps2: of the target's heading.
+        level_frame_angular_acceleration_sigma_radps2: angular acceleration of the level frame about
+            its origin, the gear; it moves a target in proportion to its distance.
         is_world_frame_drifting: True if the tracks are in the world frame of the state estimate,
             which drifts against the room.
     """
 
-    acceleration_sigma_mps2: float
-    heading_acceleration_sigma_radps2: float
-    level_frame_acceleration_sigma_radps2: float = 0.0
+    target_acceleration_sigma_mps2: float
+    target_heading_acceleration_sigma_radps2: float
+    level_frame_angular_acceleration_sigma_radps2: float = 0.0
     is_world_frame_drifting: bool = False
 
     @cached_property
-    def rate_noise_cov_per_s(self) -> Array:
+    def yaw_xyz_rate_noise_cov_per_s(self) -> Array:
         """Covariance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
         push = np.array(
-            [self.heading_acceleration_sigma_radps2, *3 * [self.acceleration_sigma_mps2]]
+            [
+                self.target_heading_acceleration_sigma_radps2,
+                *3 * [self.target_acceleration_sigma_mps2],
+            ]
         )
         return np.diag(push * push) * _ACCELERATION_CORRELATION_TIME_S
 
@@ -128,14 +131,14 @@ class TrackMeasurement:
     """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
     means the setup's R.
 
-    `shift_per_bias_sigma` (4, 4) has one row per element of z and one column per bias: the
+    `yaw_xyz_shift_per_bias_sigma` (4, 4) has one row per element of z and one column per bias: the
     vehicle's roll and pitch, the print's size and curl. A column is the change of z for one
     standard deviation of that bias. None means no biases.
     """
 
     z: Array
     R: Array | None = None
-    shift_per_bias_sigma: Array | None = None
+    yaw_xyz_shift_per_bias_sigma: Array | None = None
 
 
 @cache
@@ -162,7 +165,9 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     if measured:
         acceleration_noise = (
             ProcessNoise(
-                config.drift_mps2, _HEADING_ACCELERATION_SIGMA_RADPS2, is_world_frame_drifting=True
+                config.drift_mps2,
+                _WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2,
+                is_world_frame_drifting=True,
             )
             if is_world_frame
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
@@ -207,17 +212,19 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_world_frame_drifting:
-        Q[MEASURED, MEASURED] += _WORLD_FRAME_DRIFT_VARIANCE_PER_S * dt_s
+        Q[MEASURED, MEASURED] += _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S * dt_s
     return Q
 
 
 def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
     """Return the process noise of the rates of (yaw, x, y, z) per second, (4, 4)."""
-    if noise.level_frame_acceleration_sigma_radps2 == 0.0:
-        return noise.rate_noise_cov_per_s
-    turned2 = noise.level_frame_acceleration_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
+    if noise.level_frame_angular_acceleration_sigma_radps2 == 0.0:
+        return noise.yaw_xyz_rate_noise_cov_per_s
+    turned2 = (
+        noise.level_frame_angular_acceleration_sigma_radps2**2 * _ACCELERATION_CORRELATION_TIME_S
+    )
     x, y, z = target_position_m.tolist()
-    density = noise.rate_noise_cov_per_s.copy()
+    density = noise.yaw_xyz_rate_noise_cov_per_s.copy()
     density[1:, 1:] += turned2 * (
         (x * x + y * y + z * z) * _IDENTITY_3 - np.outer(target_position_m, target_position_m)
     )
@@ -233,10 +240,10 @@ def start_track(measurement: TrackMeasurement, t_s: float, setup: FilterSetup) -
     if measurement.R is not None:
         P[MEASURED, MEASURED] = measurement.R
     shift_per_bias_sigma = np.zeros((8, 4))
-    if measurement.shift_per_bias_sigma is not None:
-        shift_per_bias_sigma[MEASURED] = measurement.shift_per_bias_sigma
+    if measurement.yaw_xyz_shift_per_bias_sigma is not None:
+        shift_per_bias_sigma[MEASURED] = measurement.yaw_xyz_shift_per_bias_sigma
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_bias_sigma=shift_per_bias_sigma
+        t_s=t_s, x=x, P=P, unseen_frames=0, state_shift_per_bias_sigma=shift_per_bias_sigma
     )
 
 
@@ -286,13 +293,13 @@ def step_track(
             begun.P[MEASURED, MEASURED] += np.outer(off, off)
             return begun
     x, P, gain = _kalman_update(x, P, measurement.z, R)
-    shift_per_bias_sigma = F.dot(track.shift_per_bias_sigma)
-    if measurement.shift_per_bias_sigma is not None:
+    shift_per_bias_sigma = F.dot(track.state_shift_per_bias_sigma)
+    if measurement.yaw_xyz_shift_per_bias_sigma is not None:
         shift_per_bias_sigma += gain.dot(
-            measurement.shift_per_bias_sigma - shift_per_bias_sigma[MEASURED]
+            measurement.yaw_xyz_shift_per_bias_sigma - shift_per_bias_sigma[MEASURED]
         )
     return MarkerTrack(
-        t_s=t_s, x=x, P=P, unseen_frames=0, shift_per_bias_sigma=shift_per_bias_sigma
+        t_s=t_s, x=x, P=P, unseen_frames=0, state_shift_per_bias_sigma=shift_per_bias_sigma
     )
 
 
@@ -352,5 +359,5 @@ def _predict_from_state(
         x=x,
         P=P,
         unseen_frames=unseen_frames,
-        shift_per_bias_sigma=F @ track.shift_per_bias_sigma,
+        state_shift_per_bias_sigma=F @ track.state_shift_per_bias_sigma,
     )

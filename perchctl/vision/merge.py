@@ -26,9 +26,9 @@ from perchctl.vision.types import (
     VisibleMarkers,
 )
 
-MAX_CONSISTENT_CHI2 = 4.0
+MAX_CONSISTENT_CHI2_PER_DOF = 4.0
 """Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
-_POSITION_AND_YAW = [X, Y, Z, YAW]
+_XYZ_YAW_STATE_INDICES = [X, Y, Z, YAW]
 _VISIBLE_MARKERS_BY_POSE_SOURCE = {
     "joint": VisibleMarkers.BOTH,
     "large": VisibleMarkers.LARGE,
@@ -44,18 +44,18 @@ class MergedTarget:
     Attributes:
         track_frame_xyz_yaw: position and yaw of the target (4,).
         track_frame_velocity_mps: velocity of that position (3,).
-        position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance of the yaw,
-            without constant errors.
-        shift_per_bias_sigma_m: change (3, 4) of the position by one standard deviation of each
-            constant error, one column per error (see `TrackMeasurement`).
+        track_frame_position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance
+            of the yaw, without constant errors.
+        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position by one standard deviation
+            of each constant error, one column per error (see `TrackMeasurement`).
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
 
     track_frame_xyz_yaw: Array
     track_frame_velocity_mps: Array
-    position_cov_m2: Array
-    shift_per_bias_sigma_m: Array
+    track_frame_position_cov_m2: Array
+    track_frame_shift_per_bias_sigma_m: Array
     yaw_var_rad2: float
     unseen_frames: int
     stage: VisibleMarkers
@@ -80,7 +80,7 @@ def measure_markers(
     joint = None
     if config.method == "joint" and len(seen) == 2:
         joint = estimate_pose(seen, t_s, attitude, setup, previous_target_normal_cam, start_pose)
-    clear = joint is not None and joint.chi2 < MAX_CONSISTENT_CHI2
+    clear = joint is not None and joint.chi2_per_dof < MAX_CONSISTENT_CHI2_PER_DOF
     enough = clear and config.stages == "seen"
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
     singles: dict[str, MarkerPose] = {}
@@ -121,9 +121,9 @@ def merge_tracks(
     poses_by_track: Mapping[str, MarkerPose],
     weights: WeightsConfig,
 ) -> MergedTarget | None:
-    """Return the target as the mean of both markers' tracks, weighted by W (`make_weight_matrix`;
-    equations 5, 8, 12 of the paper), from the tracks that this frame's poses update, or otherwise
-    from the tracks measured last; None without tracks."""
+    """Return the target as the mean of both markers' tracks, weighted by W
+    (`make_marker_weight_matrix`; equations 5, 8, 12 of the paper), from the tracks that this
+    frame's poses update, or otherwise from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())
@@ -132,10 +132,10 @@ def merge_tracks(
     if len(used) == 1:
         ((name, track),) = used.items()
         return MergedTarget(
-            track_frame_xyz_yaw=track.x[_POSITION_AND_YAW],
+            track_frame_xyz_yaw=track.x[_XYZ_YAW_STATE_INDICES],
             track_frame_velocity_mps=track.x[VELOCITY],
-            position_cov_m2=track.P[POSITION, POSITION],
-            shift_per_bias_sigma_m=track.shift_per_bias_sigma[POSITION],
+            track_frame_position_cov_m2=track.P[POSITION, POSITION],
+            track_frame_shift_per_bias_sigma_m=track.state_shift_per_bias_sigma[POSITION],
             yaw_var_rad2=float(track.P[YAW, YAW]),
             unseen_frames=least,
             stage=_VISIBLE_MARKERS_BY_POSE_SOURCE[poses_by_track[name].source]
@@ -143,17 +143,17 @@ def merge_tracks(
             else VisibleMarkers.NONE,
         )
     large, small = used["large"], used["small"]
-    order = _POSITION_AND_YAW
-    W2 = make_weight_matrix(weights) ** 2  # squared: the errors are independent
+    order = _XYZ_YAW_STATE_INDICES
+    W2 = make_marker_weight_matrix(weights) ** 2  # squared: the errors are independent
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
     return MergedTarget(
         track_frame_xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
         track_frame_velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
-        position_cov_m2=np.diag(variance[:3]),
-        shift_per_bias_sigma_m=w[:, None] * large.shift_per_bias_sigma[POSITION]
-        + (1.0 - w[:, None]) * small.shift_per_bias_sigma[POSITION],
+        track_frame_position_cov_m2=np.diag(variance[:3]),
+        track_frame_shift_per_bias_sigma_m=w[:, None] * large.state_shift_per_bias_sigma[POSITION]
+        + (1.0 - w[:, None]) * small.state_shift_per_bias_sigma[POSITION],
         yaw_var_rad2=float(variance[3]),
         unseen_frames=least,
         stage=VisibleMarkers.BOTH if poses_by_track else VisibleMarkers.NONE,
@@ -164,11 +164,11 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
     """Increase the target's covariance so that it also covers the position of a rival: a
     target-like pattern, with the state `rival_state` (8,), whose position contradicts the target's
     track. With the difference d between the two positions, the covariance grows by d d^T."""
-    off = rival_state[_POSITION_AND_YAW] - merged.track_frame_xyz_yaw
+    off = rival_state[_XYZ_YAW_STATE_INDICES] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
-        position_cov_m2=merged.position_cov_m2 + np.outer(off_m, off_m),
+        track_frame_position_cov_m2=merged.track_frame_position_cov_m2 + np.outer(off_m, off_m),
         yaw_var_rad2=merged.yaw_var_rad2 + off_rad * off_rad,
     )
 
@@ -188,9 +188,10 @@ frame earlier."""
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the detections with their corners moved to where they were at the frame's time.
 
-    If `readout_s` is None, the corners are not moved, and `rolling_shutter_error_shift_px` is their
-    possible shift for a typical readout time. Otherwise the corners are moved, and
-    `rolling_shutter_error_shift_px`, `sigma_px` and `cov_px2` include the error of that correction.
+    If `readout_s` is None, the corners are not moved, and `corner_shift_per_readout_sigma_px` is
+    their possible shift for a typical readout time. Otherwise the corners are moved, and
+    `corner_shift_per_readout_sigma_px`, `sigma_px` and `cov_px2` include the error of that
+    correction.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
@@ -208,7 +209,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
-            out.append(replace(d, rolling_shutter_error_shift_px=moved_px))
+            out.append(replace(d, corner_shift_per_readout_sigma_px=moved_px))
         else:
             turned_px = FLOW_ACROSS_SIGMA_FRACTION * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
@@ -218,7 +219,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    rolling_shutter_error_shift_px=FLOW_ALONG_SIGMA_FRACTION * moved_px,
+                    corner_shift_per_readout_sigma_px=FLOW_ALONG_SIGMA_FRACTION * moved_px,
                 )
             )
     return out
@@ -234,7 +235,7 @@ def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -
     return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
 
 
-def make_weight_matrix(weights: WeightsConfig) -> Array:
+def make_marker_weight_matrix(weights: WeightsConfig) -> Array:
     """Return the weight matrix W (4, 8) of the paper's equation 9. The columns are x, y, z and yaw,
     each for the large and the small marker."""
     W = np.zeros((4, 8))
@@ -246,7 +247,7 @@ def make_weight_matrix(weights: WeightsConfig) -> Array:
 def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
     """Return the weighted mean of (x, y, z, yaw) of the two markers, each (4,), by equation 8 of
     the paper. The mean of the yaw angles is taken on the circle."""
-    W = make_weight_matrix(weights)
+    W = make_marker_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
     return np.asarray(merged)

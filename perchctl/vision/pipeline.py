@@ -308,7 +308,7 @@ def step_detections(
     )
     output = PipelineOutput(
         detections=detections,
-        poses=marker_poses.poses,
+        poses=marker_poses.poses_by_source,
         target=target,
         stage=stage,
         frames_with_contradicting_markers=disagreeing,
@@ -349,7 +349,7 @@ def estimate(
         target = replace(
             target,
             stage=VisibleMarkers.NONE,
-            measured=False,
+            is_measured_in_newest_frame=False,
             tracked=False,
             velocity_mps=nothing,
             world_velocity_mps=nothing,
@@ -388,29 +388,29 @@ def _estimate_at_frame(
     frames = _express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline)
     offset_m, offset_sigma_m = None, math.inf
     if not measured and previous_estimate is not None:
-        offset_m = previous_estimate.measured_offset_m
-        offset_sigma_m = previous_estimate.measured_offset_sigma_m
+        offset_m = previous_estimate.measured_gear_to_target_world_m
+        offset_sigma_m = previous_estimate.measured_gear_to_target_sigma_m
     elif measured and attitude is not None:
         offset_m = attitude.R_world_level.dot(frames["e_m"])
         offset_sigma_m = float(frames["sigma_m"][:2].max())
     return TargetEstimate(
         t_s=t_s,
-        measured_s=t_s
+        last_measured_at_s=t_s
         if measured
         else never
         if previous_estimate is None
-        else previous_estimate.measured_s,
-        small_measured_s=t_s
+        else previous_estimate.last_measured_at_s,
+        small_marker_last_measured_at_s=t_s
         if small
         else never
         if previous_estimate is None
-        else previous_estimate.small_measured_s,
+        else previous_estimate.small_marker_last_measured_at_s,
         stage=merged.stage,
-        measured=measured,
+        is_measured_in_newest_frame=measured,
         tracked=True,
-        unseen=merged.unseen_frames,
-        measured_offset_m=offset_m,
-        measured_offset_sigma_m=offset_sigma_m,
+        unseen_frames=merged.unseen_frames,
+        measured_gear_to_target_world_m=offset_m,
+        measured_gear_to_target_sigma_m=offset_sigma_m,
         **frames,
     )
 
@@ -422,7 +422,10 @@ def _express_in_level_and_world(
     pipeline: Pipeline,
 ) -> dict[str, Any]:
     place_m, yaw_rad = merged.track_frame_xyz_yaw[:3], float(merged.track_frame_xyz_yaw[3])
-    position_cov_m2, error_shifts_m = merged.position_cov_m2, merged.shift_per_bias_sigma_m
+    position_cov_m2, error_shifts_m = (
+        merged.track_frame_position_cov_m2,
+        merged.track_frame_shift_per_bias_sigma_m,
+    )
     seen: dict[str, Any] = {"velocity_mps": merged.track_frame_velocity_mps}
     if attitude is not None and is_in_world_frame:
         turn = attitude.R_world_level.T

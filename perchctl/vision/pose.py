@@ -26,7 +26,9 @@ _ATTITUDE_TILT_SIGMA_RAD = math.radians(
     6.0
 )  # combined error of the mounting, the attitude estimate and the ceiling
 _PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
-_MIN_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
+_MIN_CURLED_CHI2_PER_DOF = (
+    3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
+)
 _MAX_CHI2_FRACTION_WITH_CURL = (
     0.5  # largest share of chi-squared that may remain if curl is the cause
 )
@@ -53,7 +55,7 @@ class PoseSetup:
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def curl_lift_m(self) -> dict[_PoseSource, Array]:
+    def lift_per_curl_sigma_m(self) -> dict[_PoseSource, Array]:
         """Height of each corner above the flat sheet, m, for one standard deviation of the sheet's
         curl: (8, 2), or (16, 2) for ``joint``. The columns are the two modes of `curl_lift`. Each
         corner has two equal rows, one for its x and one for its y in the image."""
@@ -94,7 +96,7 @@ def estimate_pose(
     image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_points_px):
         return None  # the lens model cannot image these corners
-    K, lift = setup.camera.K, setup.curl_lift_m[source]
+    K, lift = setup.camera.K, setup.lift_per_curl_sigma_m[source]
     points = weigh_corners(detections, setup.corners_m[source], image_points_px, K, lift)
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
@@ -109,7 +111,11 @@ def estimate_pose(
     if solution is None or not solution.rms_reprojection_px <= max_rms_reprojection_px:
         return None
     pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
-    if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
+    if (
+        source != "joint"
+        or pose.chi2_per_dof < _MIN_CURLED_CHI2_PER_DOF
+        or setup.target.curl_per_m == 0.0
+    ):
         return pose
     if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
         return pose  # interpolated rows make sides look curled
@@ -121,8 +127,8 @@ def estimate_pose(
         return pose
     bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
     return (
-        replace(bent, chi2=pose.chi2)
-        if bent.chi2 < _MAX_CHI2_FRACTION_WITH_CURL * pose.chi2
+        replace(bent, chi2_per_dof=pose.chi2_per_dof)
+        if bent.chi2_per_dof < _MAX_CHI2_FRACTION_WITH_CURL * pose.chi2_per_dof
         else pose
     )
 
@@ -155,37 +161,37 @@ def _make_marker_pose(
 ) -> MarkerPose:
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
-    R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
+    R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec_rad))
     cov, chi2, curl = pose_covariance(points, solution)
-    e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
+    e_m = R_level_body.dot(R_body_cam.dot(solution.tvec_m) + t_body_cam_m - setup.gear_body_m)
     R_level_target = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # derivative of (e, e_yaw) by (rvec, tvec)
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR_drvec)
     cov_e = G.dot(cov).dot(G.T)
     # If the print is larger by some percentage, the target is further away by the same percentage.
-    print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
+    print_cam = np.array([setup.target.size_sigma * solution.tvec_m, curl[3:]])
     print_shift_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_shift_m.dot(print_shift_m.T)
     sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
     return MarkerPose(
         source=source,
         t_s=t_s,
-        rvec_rad=solution.rvec,
-        tvec_m=solution.tvec,
+        rvec_rad=solution.rvec_rad,
+        tvec_m=solution.tvec_m,
         e_m=e_m,
         e_yaw_rad=yaw_of(R_level_target),
         sigma_m=sigma[:3],
         sigma_yaw_rad=float(sigma[3]),
         rms_reprojection_px=solution.rms_reprojection_px,
-        chi2=chi2,
+        chi2_per_dof=chi2,
         xyz_yaw_cov=cov_e,
         shift_per_print_error_sigma_m=print_shift_m,
         rvec_tvec_cov=cov,
     )
 
 
-def target_covariance_cam(pose: MarkerPose) -> Array:
+def target_rotation_translation_cov_cam(pose: MarkerPose) -> Array:
     """Return the covariance (6, 6) of the target's pose in the camera frame, as small rotations
     (rad) about and translations (m) along the camera's x, y and z. Print errors are not
     included."""
@@ -238,10 +244,10 @@ _MAX_LINEARISED_MOTION_PX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """A possible pose of the marker in the camera: rvec (3,) rad and tvec (3,) m."""
+    """A possible pose of the marker in the camera: `rvec_rad` (3,) and `tvec_m` (3,)."""
 
-    rvec: Array
-    tvec: Array
+    rvec_rad: Array
+    tvec_m: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +278,7 @@ class TiltPrior:
         `sigma_rad`."""
         return (
             self.target_normal_cam is not None
-            and angle_to_expected_normal_rad(candidate.rvec, self.target_normal_cam)
+            and angle_to_expected_normal_rad(candidate.rvec_rad, self.target_normal_cam)
             > self.sigma_rad
         )
 
@@ -280,7 +286,7 @@ class TiltPrior:
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the more likely one of the two possible poses of a planar marker; None if neither is
     valid."""
-    candidates = [_refine(points, c) for c in _solve_closed_form(points)]
+    candidates = [_refine_unweighted(points, c) for c in _solve_closed_form(points)]
     scored = [_score_candidate(c, points) for c in candidates if _is_valid_candidate(c)]
     if not scored:
         return None
@@ -298,7 +304,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
     deviation; None if the steps do not converge."""
     candidate: PoseCandidate = start
     before = math.inf
-    W = points.whitening
+    W = points.whitening_matrix
     for _ in range(_MAX_GAUSS_NEWTON_STEPS):
         scored = _score_candidate(candidate, points)
         A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
@@ -322,12 +328,12 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
             # Errors are linear in a step of this size.
             reprojection_error_px = scored.reprojection_error_px - moved_px
-            rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
+            rvec, tvec = scored.rvec_rad - step[:3], scored.tvec_m - step[3:]
             return ScoredPose(rvec, tvec, reprojection_error_px, scored.reprojection_jacobian)
         if gain < 1e-4 + 1e-6 * cost:
             return scored
         candidate, before = (
-            PoseCandidate(candidate.rvec - step[:3], candidate.tvec - step[3:]),
+            PoseCandidate(candidate.rvec_rad - step[:3], candidate.tvec_m - step[3:]),
             cost,
         )
         if not _is_valid_candidate(candidate):
@@ -336,13 +342,13 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 
 class PoseCovariance(NamedTuple):
-    """Covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and the shift
-    (6,) of (rvec, tvec), rad and m, for one standard deviation of a bowl-shaped curl of the
+    """Covariance (6, 6) of (rvec, tvec), chi-squared of the corners per degree of freedom, and the
+    shift (6,) of (rvec, tvec), rad and m, for one standard deviation of a bowl-shaped curl of the
     sheet."""
 
-    cov: Array
-    chi2: float
-    pose_shift_per_curl_sigma: Array
+    rvec_tvec_cov: Array
+    chi2_per_dof: float
+    rvec_tvec_shift_per_curl_sigma: Array
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
@@ -351,7 +357,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     The covariance includes corner noise (at least as large as the residuals), shifts common to all
     corners, and a twist of the sheet, but not its bowl-shaped curl.
     """
-    W = points.whitening
+    W = points.whitening_matrix
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
     curl = _whitened_paper_curl_shift(points, scored)
@@ -363,7 +369,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
     growth = max((_CORNER_SIGMA_PRIOR_DOF + chi2) / (_CORNER_SIGMA_PRIOR_DOF + freedom), 0.7)
-    common = gain.dot(points.whitened_corner_shift_per_error)
+    common = gain.dot(points.whitened_shift_per_error_sigma)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
     curled, twisted = gain.dot(curl).T
@@ -375,10 +381,13 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
     each curl mode."""
-    target_normal_cam = rotation_matrix(scored.rvec)[:, 2]
+    target_normal_cam = rotation_matrix(scored.rvec_rad)[:, 2]
     # In the image, a corner above the sheet's plane moves as if the target moved along its normal.
-    moved = scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None] * points.curl_lift_m
-    return np.asarray(points.whitening.dot(moved))
+    moved = (
+        scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None]
+        * points.lift_per_curl_sigma_m
+    )
+    return np.asarray(points.whitening_matrix.dot(moved))
 
 
 def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> float:
@@ -402,12 +411,12 @@ def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
 
 
 def _is_valid_candidate(candidate: PoseCandidate) -> bool:
-    rvec, tvec = candidate.rvec, candidate.tvec
+    rvec, tvec = candidate.rvec_rad, candidate.tvec_m
     return bool(is_finite(rvec) and is_finite(tvec) and tvec[2] > 0.0)
 
 
-def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
-    first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
+def _refine_unweighted(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
+    first = start.rvec_rad.reshape(3, 1).copy(), start.tvec_m.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(
             points.object_points_m, points.image_points_px, points.K, None, *first
@@ -418,7 +427,7 @@ def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
 
 
 def _score_candidate(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
-    rvec, tvec = candidate.rvec, candidate.tvec
+    rvec, tvec = candidate.rvec_rad, candidate.tvec_m
     projected, reprojection_jacobian = cv2.projectPoints(
         points.object_points_m, rvec, tvec, points.K, None
     )
@@ -429,8 +438,8 @@ def _score_candidate(candidate: PoseCandidate, points: WeightedCorners) -> Score
 def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
     """Return the second solution of a planar marker: the candidate refined from a normal that is
     mirrored about the line of sight. Empty if both normals are nearly the same."""
-    R = rotation_matrix(scored.rvec)
-    normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
+    R = rotation_matrix(scored.rvec_rad)
+    normal, sight = R[:, 2], scored.tvec_m / np.linalg.norm(scored.tvec_m)
     other = 2.0 * float(normal @ sight) * sight - normal
     axis = np.cross(normal, other)
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
@@ -438,7 +447,7 @@ def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> lis
     if angle < _MIN_FLIP_ANGLE_RAD or sine < 1e-9:
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
-    turned = _refine(points, PoseCandidate(rvec, scored.tvec))
+    turned = _refine_unweighted(points, PoseCandidate(rvec, scored.tvec_m))
     return [_score_candidate(turned, points)] if _is_valid_candidate(turned) else []
 
 
@@ -453,7 +462,7 @@ def _choose_most_likely_pose(
         total = float(((s.reprojection_error_px / sigma) ** 2).sum())
         if prior.target_normal_cam is not None:
             total += (
-                angle_to_expected_normal_rad(s.rvec, prior.target_normal_cam) / prior.sigma_rad
+                angle_to_expected_normal_rad(s.rvec_rad, prior.target_normal_cam) / prior.sigma_rad
             ) ** 2
         return total
 
@@ -463,34 +472,40 @@ def _choose_most_likely_pose(
 # --- A sheet that is not flat: effect of its curl on corners, and their weights ---
 
 
-def curl_lift(object_points_m: Array, paper_curvature_per_m: float) -> Array:
+def curl_lift(object_points_m: Array, curl_sigma_per_m: float) -> Array:
     """Return the height of corners (n, 3) above the flat sheet for one standard deviation of two
     curl modes: a bowl (all corners on one side) and a saddle (neighbouring corners on opposite
-    sides). `paper_curvature_per_m` is the height per squared distance from the centre. Shape (2n,
+    sides). `curl_sigma_per_m` is the height per squared distance from the centre. Shape (2n,
     2), m; each corner has two equal rows, for its x and y."""
     x, y = object_points_m[:, 0], object_points_m[:, 1]
-    lift: Array = paper_curvature_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
+    lift: Array = curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
-def curl_weight_matrix(whitened_curl: Array) -> Array:
-    """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is `whitened_curl`
-    (2n, k), one column per mode."""
-    inner = np.linalg.inv(np.eye(whitened_curl.shape[1]) + whitened_curl.T @ whitened_curl)
-    weight: Array = np.eye(len(whitened_curl)) - whitened_curl @ inner @ whitened_curl.T
+def curl_weight_matrix(whitened_shift_per_curl_sigma: Array) -> Array:
+    """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is
+    `whitened_shift_per_curl_sigma` (2n, k), one column per mode."""
+    inner = np.linalg.inv(
+        np.eye(whitened_shift_per_curl_sigma.shape[1])
+        + whitened_shift_per_curl_sigma.T @ whitened_shift_per_curl_sigma
+    )
+    weight: Array = (
+        np.eye(len(whitened_shift_per_curl_sigma))
+        - whitened_shift_per_curl_sigma @ inner @ whitened_shift_per_curl_sigma.T
+    )
     return weight
 
 
 # --- Weights of the corners in the pose solution ---
 # A fitted line has errors of offset and tilt, and moves the corners at both of its ends. Their
 # errors across the line have the variance s^2 and a correlation of -1/2, so half the line's offset
-# is known to s/2 and its tilt to s sqrt(3)/2: `whitening` transforms the corner errors to these
-# independent ones. A shift of all edges (clipped white, ink) is part of the covariance only: in the
-# fit, faults of small markers would corrupt it.
+# is known to s/2 and its tilt to s sqrt(3)/2: `whitening_matrix` transforms the corner errors to
+# these independent ones. A shift of all edges (clipped white, ink) is part of the covariance only:
+# in the fit, faults of small markers would corrupt it.
 
 
 _IDENTITY_8 = np.eye(8)
-_TILT_WHITENING_FACTOR = np.array(1.0 / math.sqrt(3.0))
+_TILT_TO_OFFSET_WHITENING_RATIO = np.array(1.0 / math.sqrt(3.0))
 _PREVIOUS_CORNER_INDICES = np.array([3, 0, 1, 2])
 _SIDE_START_CORNER_INDICES = np.arange(4)  # side k runs from corner k ...
 _SIDE_END_CORNER_INDICES = np.array([1, 2, 3, 0])  # ... to corner k + 1
@@ -518,12 +533,12 @@ class WeightedCorners:
         object_points_m, image_points_px: corners (n, 3) on the target, and (n, 2) in the image of a
             pinhole camera `K` (3, 3).
         sigma_px: standard deviations (n,).
-        whitening: matrix (2n, 2n) that makes the errors independent, with unit variance.
-        whitened_corner_shift_per_error: whitened shift of the corners by one standard deviation of
+        whitening_matrix: matrix (2n, 2n) that makes the errors independent, with unit variance.
+        whitened_shift_per_error_sigma: whitened shift of the corners by one standard deviation of
             each error common to several of them, one column per error (2n, k): white grown over
-            black at all edges, `rolling_shutter_error_shift_px` of the detections, and the jitter
-            of each detection's rows.
-        curl_lift_m: result (2n, 2) of `curl_lift`.
+            black at all edges, `corner_shift_per_readout_sigma_px` of the detections, and the
+            jitter of each detection's rows.
+        lift_per_curl_sigma_m: result (2n, 2) of `curl_lift`.
         allows_for_curl: True if the sheet may be curled, which reduces the weight of corners that
             curl would move; False if the sheet is assumed to be flat.
     """
@@ -531,10 +546,10 @@ class WeightedCorners:
     object_points_m: Array
     image_points_px: Array
     sigma_px: Array
-    whitening: Array
-    whitened_corner_shift_per_error: Array
+    whitening_matrix: Array
+    whitened_shift_per_error_sigma: Array
     K: Array
-    curl_lift_m: Array
+    lift_per_curl_sigma_m: Array
     allows_for_curl: bool = False
 
 
@@ -543,10 +558,10 @@ def weigh_corners(
     object_points_m: Array,
     image_points_px: Array,
     K: Array,
-    curl_lift_m: Array,
+    lift_per_curl_sigma_m: Array,
 ) -> WeightedCorners:
     """Compute the weights of the detections' corners. `image_points_px` are the corners in a
-    pinhole camera with matrix K; `curl_lift_m` is the result of `curl_lift`."""
+    pinhole camera with matrix K; `lift_per_curl_sigma_m` is the result of `curl_lift`."""
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
@@ -574,8 +589,8 @@ def weigh_corners(
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
-        if d.rolling_shutter_error_shift_px is not None:
-            error_shifts[rows, 1] = d.rolling_shutter_error_shift_px.ravel()
+        if d.corner_shift_per_readout_sigma_px is not None:
+            error_shifts[rows, 1] = d.corner_shift_per_readout_sigma_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
             # As for a line: half to all of the rows shift alike, and they tilt.
             down = corners[:, 1] - corners[:, 1].mean()
@@ -585,7 +600,7 @@ def weigh_corners(
             error_shifts[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
     return WeightedCorners(
-        object_points_m, image_points_px, sigma_px, W, W.dot(error_shifts), K, curl_lift_m
+        object_points_m, image_points_px, sigma_px, W, W.dot(error_shifts), K, lift_per_curl_sigma_m
     )
 
 
@@ -623,5 +638,5 @@ def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
     `normals` (4, 2) are the lines' unit normals; `sigma_px` is a scalar for all lines, or (4,).
     """
     across = (normals.T / sigma_px).ravel()
-    tilt = across * _TILT_WHITENING_FACTOR
+    tilt = across * _TILT_TO_OFFSET_WHITENING_RATIO
     return np.concatenate([across, across, -tilt, tilt])

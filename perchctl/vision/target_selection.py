@@ -168,15 +168,16 @@ def make_track_measurement(
 
 
 def gear_to_target_shift_per_bias_sigma_m(
-    target_shift_per_bias_sigma_m: Array,
+    target_world_shift_per_bias_sigma_m: Array,
     attitude: VehicleState,
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> Array:
     """Return the change (3, 4) of the vector from the gear to the target, in level axes, for one
-    standard deviation of each bias. It is `target_shift_per_bias_sigma_m` (3, 4), the change of the
-    target's position in the world, minus the effect of the roll and pitch biases on the gear."""
+    standard deviation of each bias. It is `target_world_shift_per_bias_sigma_m` (3, 4), the change
+    of the target's position in the world, minus the effect of the roll and pitch biases on the
+    gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
-    moved = attitude.R_world_level.T.dot(target_shift_per_bias_sigma_m)
+    moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
     moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
     return np.asarray(moved)

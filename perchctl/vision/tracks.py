@@ -93,7 +93,7 @@ def update_tracks(
     if measurements and pose is not None:
         name = next(n for n, each in marker_poses.poses_by_track.items() if each is pose)
         whole = pose.source == "joint" or (
-            len(marker_poses.poses) > 1 and not marker_poses.do_markers_contradict
+            len(marker_poses.poses_by_source) > 1 and not marker_poses.do_markers_contradict
         )
         frame_pose = FramePose(
             t_s,
@@ -147,8 +147,8 @@ def update_tracks(
 #
 # A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
 # lacks, so a rival is most likely the target from a different viewpoint. The lock then changes
-# after `MIN_RIVAL_ONLY_S` in which only the rival was seen, if the rival has both markers or the
-# lock never had. A rival that was seen before the target was lost is a second target and waits
+# after `MIN_ONLY_RIVAL_SEEN_S` in which only the rival was seen, if the rival has both markers or
+# the lock never had. A rival that was seen before the target was lost is a second target and waits
 # `REACQUIRE_S`.
 #
 # While a rival is seen and the target is not, the target's predicted position may be wrong, and its
@@ -165,7 +165,7 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
-MIN_RIVAL_ONLY_S = 0.3
+MIN_ONLY_RIVAL_SEEN_S = 0.3
 """Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
 has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
 LOCK_TIMEOUT_S = 10.0
@@ -183,7 +183,9 @@ _MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
 _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
 _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-_MIN_ROTATION_TO_REPORT_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
+_MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(
+    15.0
+)  # a larger rotation is mentioned in the message
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # largest share of the squared innovation that the better of two explanations may leave
@@ -335,8 +337,8 @@ def update_lock(
         pose=frame_pose.pose,
         is_in_world_frame=frame_pose.is_in_world_frame,
         accepted_frame_count=1 if before is None else before.accepted_frame_count + 1,
-        has_both_markers=frame_pose.has_both_markers
-        or (before is not None and before.has_both_markers),
+        has_shown_both_markers=frame_pose.has_both_markers
+        or (before is not None and before.has_shown_both_markers),
         track_before_last_pose=None if before is None else before.track,
     )
 
@@ -379,9 +381,9 @@ def _compute_innovation(
     residual[0] = wrap_rad(float(residual[0]))
     # A bias shifts measurement and prediction alike.
     error_shifts = (
-        wanted.shift_per_bias_sigma[MEASURED]
-        if measurement.shift_per_bias_sigma is None
-        else measurement.shift_per_bias_sigma - wanted.shift_per_bias_sigma[MEASURED]
+        wanted.state_shift_per_bias_sigma[MEASURED]
+        if measurement.yaw_xyz_shift_per_bias_sigma is None
+        else measurement.yaw_xyz_shift_per_bias_sigma - wanted.state_shift_per_bias_sigma[MEASURED]
     )
     R = filter_setup.R if measurement.R is None else measurement.R
     S = (
@@ -419,11 +421,13 @@ def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
     return np.array([_MIN_UNMODELLED_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: Array) -> bool:
+def _matches_last_view(
+    lock: TargetLock, frame_pose: FramePose, world_innovation_yaw_xyz: Array
+) -> bool:
     """True if the state estimate has jumped: the target is where the vehicle last saw it, but not
     where the world frame predicts it. The pose relative to the gear has then changed much less than
-    `world_residual` (4,), which is measured minus predicted (yaw, x, y, z) in the world, rad and
-    m."""
+    `world_innovation_yaw_xyz` (4,), which is measured minus predicted (yaw, x, y, z) in the world,
+    rad and m."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
@@ -433,26 +437,30 @@ def _matches_last_view(lock: TargetLock, frame_pose: FramePose, world_residual: 
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unmodelled_yaw_xyz_sigma(range_m)
-    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, world_residual))
+    seen, jumped = (
+        float(((o / unclaimed) ** 2).sum()) for o in (residual, world_innovation_yaw_xyz)
+    )
     calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _MAX_GATE_CHI2
     return calm and seen < _MAX_COST_RATIO_TO_ALTERNATIVE * jumped
 
 
 def _matches_previous_track(
-    lock: TargetLock, frame_pose: FramePose, residual: Array, filter_setup: FilterSetup
+    lock: TargetLock, frame_pose: FramePose, innovation_yaw_xyz: Array, filter_setup: FilterSetup
 ) -> bool:
     """True if the pose fits the track before the last accepted pose much better than it fits the
     current track. The last accepted pose was then most likely wrong: at a low frame rate, a single
     wrong pose can pass the gate and corrupt the velocity of a track from a camera without a
-    vehicle. `residual` (4,) is measured minus predicted (yaw, x, y, z) for the current track, rad
-    and m."""
+    vehicle. `innovation_yaw_xyz` (4,) is measured minus predicted (yaw, x, y, z) for the current
+    track, rad and m."""
     if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
     innovation, unclaimed = (
         _compute_innovation(lock.track_before_last_pose, frame_pose, filter_setup),
         _unmodelled_yaw_xyz_sigma(_range_m(frame_pose)),
     )
-    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (innovation.yaw_xyz, residual))
+    before, now = (
+        float(((o / unclaimed) ** 2).sum()) for o in (innovation.yaw_xyz, innovation_yaw_xyz)
+    )
     return (
         innovation.squared_mahalanobis <= _MAX_GATE_CHI2
         and before < _MAX_COST_RATIO_TO_ALTERNATIVE * now
@@ -486,7 +494,7 @@ def _update_rival(
     )
     has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(innovation.S[3, 3])
     where = f"{innovation.distance_m:.2f} m away from it"
-    if turned_rad > _MIN_ROTATION_TO_REPORT_RAD:
+    if turned_rad > _MIN_RIVAL_ROTATION_TO_REPORT_RAD:
         where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
     if has_different_range:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
@@ -494,7 +502,7 @@ def _update_rival(
     return RivalTrack(
         track=start_track(frame_pose.measurement, frame_pose.t_s, filter_setup),
         is_in_world_frame=frame_pose.is_in_world_frame,
-        first_seen_s=frame_pose.t_s,
+        first_seen_at_s=frame_pose.t_s,
         seen_frame_count=1,
         frames_with_both_markers=int(frame_pose.has_both_markers),
         has_different_range=has_different_range,
@@ -515,9 +523,9 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
         or not frame_pose.has_both_markers
     ):
         return False
-    if not lock.has_both_markers:
+    if not lock.has_shown_both_markers:
         return True
-    unseen_s = frame_pose.t_s - max(rival.first_seen_s, lock.track.t_s)
+    unseen_s = frame_pose.t_s - max(rival.first_seen_at_s, lock.track.t_s)
     # A target outside the image may still be at its position.
     return (
         (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
@@ -530,13 +538,13 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     """True if the rival is most likely the target itself, displaced from the track because the
     camera moved during lost frames. Since the target was last seen, only the rival has been seen
-    for `MIN_RIVAL_ONLY_S`, in enough frames and with as many markers as the target."""
+    for `MIN_ONLY_RIVAL_SEEN_S`, in enough frames and with as many markers as the target."""
     if (
-        rival.first_seen_s < lock.track.t_s
-        or frame_pose.t_s - rival.first_seen_s < MIN_RIVAL_ONLY_S
+        rival.first_seen_at_s < lock.track.t_s
+        or frame_pose.t_s - rival.first_seen_at_s < MIN_ONLY_RIVAL_SEEN_S
     ):
         return False
-    if not lock.has_both_markers:
+    if not lock.has_shown_both_markers:
         return rival.seen_frame_count >= MIN_ESTABLISHED_TRACK_FRAMES
     return (
         frame_pose.has_both_markers

@@ -61,7 +61,7 @@ class CameraModel:
         return self.size_px, self.model, K, dist
 
 
-MAX_SKEW_PX = 0.3
+MAX_CAMERA_MATRIX_SKEW_PX = 0.3
 """Largest skew, px. A skew of s px moves a pixel laterally by s y/z: with this value, 0.2 px at the
 lower edge of the example camera, or 0.5 mm at 1 m. Larger: an error that no other check detects is
 accepted."""
@@ -73,11 +73,11 @@ def check_camera_matrix(K: Array) -> None:
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
-        if abs(K[0, 1]) > MAX_SKEW_PX:
+        if abs(K[0, 1]) > MAX_CAMERA_MATRIX_SKEW_PX:
             raise InvalidValue(
                 f"the camera matrix has a skew of {K[0, 1]:g} px (row 1, column 2), but at most "
-                f"{MAX_SKEW_PX:g} px is allowed: calibrate without skew (OpenCV's CALIB_FIX_SKEW, "
-                f"--fisheye-fix-skew of ROS)"
+                f"{MAX_CAMERA_MATRIX_SKEW_PX:g} px is allowed: calibrate without skew (OpenCV's "
+                f"CALIB_FIX_SKEW, --fisheye-fix-skew of ROS)"
             )
         return
     if (K[:2, 2] == 0.0).all() and K[0, 1] == 0.0 and K[2, 2] == 1.0:
@@ -150,8 +150,9 @@ class Detection:
             they come from OpenCV or from the other marker.
         remaining_edge_shift_sigma_px: standard deviation of the remaining common outward shift of
             all edges after its correction.
-        rolling_shutter_error_shift_px: change (4, 2) of the corners for one standard deviation of
-            the readout-time error, which is common to both markers; None if there is no such error.
+        corner_shift_per_readout_sigma_px: change (4, 2) of the corners for one standard deviation
+            of the readout-time error, which is common to both markers; None if there is no such
+            error.
         cov_px2: covariance (8, 8) of corners that were inferred from a visible part of the marker
             and may lie outside the image, in pixels of a pinhole camera, ordered x0, y0, x1, y1,
             ...
@@ -168,7 +169,7 @@ class Detection:
         0.0  # standard deviation of the common outward shift of all edges
     )
     # (4, 2): change of the corners for one standard deviation of an error common to all of them
-    rolling_shutter_error_shift_px: Array | None = None
+    corner_shift_per_readout_sigma_px: Array | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = (
         0.0  # standard deviation due to the jitter of rows in analogue video
@@ -255,7 +256,7 @@ class MarkerPose:
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
         rms_reprojection_px: RMS distance of the projected from the measured corners.
-        chi2: squared errors of the corners over their variances, per degree of freedom.
+        chi2_per_dof: squared errors of the corners over their variances, per degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
         shift_per_print_error_sigma_m: shift of `e_m` for one standard deviation of the print's size
             error and of the sheet's curl, (3, 2). These errors are included in `sigma_m` and
@@ -272,7 +273,7 @@ class MarkerPose:
     sigma_m: Array
     sigma_yaw_rad: float
     rms_reprojection_px: float
-    chi2: float = 0.0
+    chi2_per_dof: float = 0.0
     xyz_yaw_cov: Array | None = None
     shift_per_print_error_sigma_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
     rvec_tvec_cov: Array | None = None
@@ -284,21 +285,21 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
     in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. Column k of `shift_per_bias_sigma` (8, 4) is the change of the state for one standard
-    deviation of bias k: the vehicle's roll and pitch, the print's size and curl. `unseen_frames`
-    counts the frames since the last measurement.
+    motion. Column k of `state_shift_per_bias_sigma` (8, 4) is the change of the state for one
+    standard deviation of bias k: the vehicle's roll and pitch, the print's size and curl.
+    `unseen_frames` counts the frames since the last measurement.
     """
 
     t_s: float
     x: Array
     P: Array
     unseen_frames: int = 0
-    shift_per_bias_sigma: Array = field(default_factory=lambda: np.zeros((8, 4)))
+    state_shift_per_bias_sigma: Array = field(default_factory=lambda: np.zeros((8, 4)))
 
     @property
     def state_cov_with_biases(self) -> Array:
         """Covariance (8, 8) of the state, including the biases."""
-        return self.P + self.shift_per_bias_sigma @ self.shift_per_bias_sigma.T
+        return self.P + self.state_shift_per_bias_sigma @ self.state_shift_per_bias_sigma.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,23 +309,24 @@ class TargetEstimate:
 
     Attributes:
         t_s: time of the estimate: the frame's, or later by prediction.
-        measured_s, small_measured_s: time (on the clock of `t_s`) of the exposure of the last frame
-            that measured the target, and of the last one that measured its small marker.
+        last_measured_at_s, small_marker_last_measured_at_s: time (on the clock of `t_s`) of the
+            exposure of the last frame that measured the target, and of the last one that measured
+            its small marker.
         stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
-        measured: True if the newest frame contains a detection of the target.
+        is_measured_in_newest_frame: True if the newest frame contains a detection of the target.
         tracked: True if the target was measured at most `kalman.n_max` frames ago. If False, the
             estimate is the target's last position.
-        unseen: number of frames since the last detection.
+        unseen_frames: number of frames since the last detection.
         e_m: vector from the gear to the target in the level frame, (3,).
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`. While only a
             rival is seen, which may be the target, sigma_m also covers the rival's position.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: the filter's velocity, in level axes, (3,): of `e_m` (`kalman.frame: level`)
             or of the target in the world (`kalman.frame: world`).
-        measured_offset_m, measured_offset_sigma_m: vector from the gear to the target at
-            `measured_s`, in axes of the state estimate's world, (3,), and the larger standard
-            deviation of its x and y; None and infinite without an attitude. Unlike `e_m`, it does
-            not depend on how far the vehicle has moved since.
+        measured_gear_to_target_world_m, measured_gear_to_target_sigma_m: vector from the gear to
+            the target at `last_measured_at_s`, in axes of the state estimate's world, (3,), and the
+            larger standard deviation of its x and y; None and infinite without an attitude. Unlike
+            `e_m`, it does not depend on how far the vehicle has moved since.
         world_m, world_yaw_rad: position (3,) and heading of the target in the world frame of the
             vehicle's state estimate; None without an attitude.
         world_velocity_mps: velocity (3,) of the target in that frame, which is the frame's drift;
@@ -332,12 +334,12 @@ class TargetEstimate:
     """
 
     t_s: float
-    measured_s: float
-    small_measured_s: float
+    last_measured_at_s: float
+    small_marker_last_measured_at_s: float
     stage: VisibleMarkers
-    measured: bool
+    is_measured_in_newest_frame: bool
     tracked: bool
-    unseen: int
+    unseen_frames: int
     e_m: GearToTargetInLevel
     e_yaw_rad: float
     velocity_mps: Array
@@ -346,8 +348,8 @@ class TargetEstimate:
     world_m: Array | None = None
     world_yaw_rad: float | None = None
     world_velocity_mps: Array | None = None
-    measured_offset_m: Array | None = None
-    measured_offset_sigma_m: float = math.inf
+    measured_gear_to_target_world_m: Array | None = None
+    measured_gear_to_target_sigma_m: float = math.inf
 
 
 class MotionErrors(NamedTuple):
@@ -380,7 +382,7 @@ class TargetLock:
     pose: MarkerPose
     is_in_world_frame: bool
     accepted_frame_count: int
-    has_both_markers: bool
+    has_shown_both_markers: bool
     track_before_last_pose: MarkerTrack | None = None
 
 
@@ -392,7 +394,7 @@ class RivalTrack:
     Attributes:
         track: state of the rival's filter.
         is_in_world_frame: True if the track is in the world frame, False if in the level frame.
-        first_seen_s: time of the rival's first frame.
+        first_seen_at_s: time of the rival's first frame.
         seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and of
             those that showed both of its markers.
         has_different_range: True if the rival's range differs significantly from the target's.
@@ -401,7 +403,7 @@ class RivalTrack:
 
     track: MarkerTrack
     is_in_world_frame: bool
-    first_seen_s: float
+    first_seen_at_s: float
     seen_frame_count: int
     frames_with_both_markers: int
     has_different_range: bool
@@ -413,20 +415,20 @@ class MarkerPoses:
     """The poses estimated from one frame.
 
     Attributes:
-        poses: all poses, by ``joint``, ``large``, ``small``, in this order.
+        poses_by_source: all poses, by ``joint``, ``large``, ``small``, in this order.
         poses_by_track: the poses that update a track, by the track's name.
         do_markers_contradict: True if the two markers contradict each other.
     """
 
-    poses: dict[str, MarkerPose] = field(default_factory=dict)
+    poses_by_source: dict[str, MarkerPose] = field(default_factory=dict)
     poses_by_track: dict[str, MarkerPose] = field(default_factory=dict)
     do_markers_contradict: bool = False
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
         """The pose with the smallest standard deviation, from `poses_by_track` if it is not empty,
-        otherwise from `poses`; None if there are no poses."""
-        poses = self.poses_by_track or self.poses
+        otherwise from `poses_by_source`; None if there are no poses."""
+        poses = self.poses_by_track or self.poses_by_source
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
@@ -437,7 +439,7 @@ class FieldState:
     Attributes:
         picture_kind: kind of the last frame that was checked for combing.
         frames_since_combing_check: number of frames since that check.
-        top_field_first_votes: sum of the votes on the order of the fields: positive if the top
+        top_field_first_vote_sum: sum of the votes on the order of the fields: positive if the top
             field seems to be first, negative if the bottom field does.
         is_top_field_first: order of the fields; None until the votes decide.
         frame_periods_s: the last periods between frames.
@@ -447,7 +449,7 @@ class FieldState:
 
     picture_kind: PictureKind | None = None
     frames_since_combing_check: int = 0
-    top_field_first_votes: float = 0.0
+    top_field_first_vote_sum: float = 0.0
     is_top_field_first: bool | None = None
     frame_periods_s: tuple[float, ...] = ()
     last_frame_t_s: float | None = None
@@ -492,17 +494,18 @@ class PipelineOutput:
 
 
 @dataclass(frozen=True)
-class CameraErrors:
+class CameraCalibrationErrors:
     """Errors of the camera latency and mounting in the profile, estimated in flight, each with its
     standard deviation.
 
-    `delay_s` is the latency beyond the profile's. `mount_rotation_xyz_rad` are the small rotations
-    of the mounting about body x, y and z relative to the profile's. `mount_rotation_sigma_xyz_rad`
-    includes the bias of the attitude estimate, which shifts the target in the same way as a roll or
-    pitch error of the mounting.
+    `latency_above_profile_s` is the latency beyond the profile's.
+    `mount_rotation_from_profile_xyz_rad` are the small rotations of the mounting about body x, y
+    and z relative to the profile's. `mount_rotation_sigma_xyz_rad` includes the bias of the
+    attitude estimate, which shifts the target in the same way as a roll or pitch error of the
+    mounting.
     """
 
-    delay_s: float
-    delay_sigma_s: float
-    mount_rotation_xyz_rad: tuple[float, float, float]
+    latency_above_profile_s: float
+    latency_sigma_s: float
+    mount_rotation_from_profile_xyz_rad: tuple[float, float, float]
     mount_rotation_sigma_xyz_rad: tuple[float, float, float]

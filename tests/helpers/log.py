@@ -26,7 +26,7 @@ from perchctl.record import LogWatcher
 from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
 from perchctl.vehicle import Command, Idle, PositionSetpoint, StopMotors, Telemetry
-from perchctl.vision import CameraErrors, MarkerPose, PipelineOutput, TargetEstimate
+from perchctl.vision import CameraCalibrationErrors, MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, VisibleMarkers
 from tests.helpers import mission
 from tests.helpers.mission import state_with
@@ -63,9 +63,9 @@ def target(
     return mission.target_at(
         t_s,
         (0.6, -0.4, 2.2),
-        measured_s=t_s if measured else t_s - 0.13,
-        measured=measured,
-        unseen=0 if measured else 4,
+        last_measured_at_s=t_s if measured else t_s - 0.13,
+        is_measured_in_newest_frame=measured,
+        unseen_frames=0 if measured else 4,
         stage=stage,
         e_m=np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)]),
         e_yaw_rad=2.0 * decay,
@@ -129,7 +129,7 @@ def tick(
     state: PlannerState,
     output: PipelineOutput | None = None,
     target: TargetEstimate | None = None,
-    consistency: CameraErrors | None = None,
+    consistency: CameraCalibrationErrors | None = None,
     delay_used_s: float = 0.0,
     outside: ExternalPositionStatus | None = None,
 ) -> Tick:

@@ -89,12 +89,12 @@ def target_at(
     gear_m = np.array(body_m) + PROFILE.vehicle.gear_body_m
     pose = TargetEstimate(
         t_s=t_s,
-        measured_s=t_s,
-        small_measured_s=t_s,
+        last_measured_at_s=t_s,
+        small_marker_last_measured_at_s=t_s,
         stage=VisibleMarkers.BOTH,
-        measured=True,
+        is_measured_in_newest_frame=True,
         tracked=True,
-        unseen=0,
+        unseen_frames=0,
         e_m=np.array(world_m) - gear_m,
         e_yaw_rad=0.0,
         velocity_mps=np.zeros(3),
@@ -103,8 +103,8 @@ def target_at(
         world_m=np.array(world_m),
         world_yaw_rad=0.0,
         world_velocity_mps=np.zeros(3),
-        measured_offset_m=np.array(world_m) - gear_m,
-        measured_offset_sigma_m=1e-3,
+        measured_gear_to_target_world_m=np.array(world_m) - gear_m,
+        measured_gear_to_target_sigma_m=1e-3,
     )
     return replace(pose, **changes)  # type: ignore[arg-type]
 

@@ -14,7 +14,7 @@ from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.phase import VehicleDiagnosis
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
-from perchctl.vision import CameraErrors
+from perchctl.vision import CameraCalibrationErrors
 from tests.helpers.mission import BY_TARGET, observation, remembering, state_in, telemetry
 from tests.mission.rig import BEGIN_S, Look, fly
 
@@ -24,10 +24,10 @@ def _seen(
     sigma_s: float = 0.003,
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sigma_deg: float = 0.4,
-) -> CameraErrors:
+) -> CameraCalibrationErrors:
     x, y, z = (math.radians(t) for t in turn_deg)
     sigma_rad = math.radians(sigma_deg)
-    return CameraErrors(delay_s, sigma_s, (x, y, z), (sigma_rad, sigma_rad, sigma_rad))
+    return CameraCalibrationErrors(delay_s, sigma_s, (x, y, z), (sigma_rad, sigma_rad, sigma_rad))
 
 
 CAMERA = CameraConfig(latency_s=0.06)
@@ -49,10 +49,12 @@ CAMERA = CameraConfig(latency_s=0.06)
     ],
 )
 def test_only_what_is_surely_beyond_its_gate_is_an_advice(
-    seen: CameraErrors, camera: CameraConfig, words: str
+    seen: CameraCalibrationErrors, camera: CameraConfig, words: str
 ) -> None:
     found = CameraFindings.from_camera_errors(seen, camera)
-    assert found.measured_latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
+    assert found.measured_latency_s == pytest.approx(
+        camera.start_latency_s + seen.latency_above_profile_s
+    )
     assert bool(found.advice) is bool(words)
     assert words in "".join(found.advice)
     # The scenario's camera is nobody's: it says nothing of the profile.

@@ -87,7 +87,9 @@ def test_the_time_starts_anew_once_the_vehicle_has_left_its_place() -> None:
 
 
 def test_a_hover_is_completed_only_while_the_target_is_seen() -> None:
-    remembered = target_at(BEGIN_S, measured=False, tracked=False, measured_s=BEGIN_S - 1.0)
+    remembered = target_at(
+        BEGIN_S, is_measured_in_newest_frame=False, tracked=False, last_measured_at_s=BEGIN_S - 1.0
+    )
     late = remembering(state_in(Phase.HOVER), hover_errors=HoverErrors(BEGIN_S - DURATION_S - 1.0))
     assert fly(late, at(obs={"target": remembered}), 0.1, HOVERING).state.phase is Phase.HOVER
     assert fly(late, at(), 0.1, HOVERING).state.outcome is Outcome.HOVERED

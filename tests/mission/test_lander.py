@@ -687,7 +687,9 @@ def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
                 behind_s=bit["behind_s"],
             )  # fmt: skip
             seen = bit["target"] == "seen"
-            target = target_at(t_s, body_m=tel.position_m, measured=seen, tracked=seen)
+            target = target_at(
+                t_s, body_m=tel.position_m, is_measured_in_newest_frame=seen, tracked=seen
+            )
             yield felt(
                 observation(
                     t_s, telemetry=tel, target=None if bit["target"] == "none" else target,

@@ -179,7 +179,9 @@ class Hovering(Motors):
                 self._shown.append((t_s, self.x_m))
             shown_s, shown_m = self._shown[0]
             offset_m = np.array([-shown_m, 0.0, 0.0]) if self._pictures else None
-            target = replace(target, measured_s=shown_s, measured_offset_m=offset_m)
+            target = replace(
+                target, last_measured_at_s=shown_s, measured_gear_to_target_world_m=offset_m
+            )
         return observation(t_s, telemetry=oldest, target=target)
 
     def obey(self, state: PlannerState, command: Command) -> None:
@@ -244,7 +246,9 @@ def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:
 
     def look(t_s: float) -> Observation:
         sample = telemetry(t_s, Z_M)
-        seen = target_at(BEGIN_S, body_m=sample.position_m, measured=False, tracked=False)
+        seen = target_at(
+            BEGIN_S, body_m=sample.position_m, is_measured_in_newest_frame=False, tracked=False
+        )
         return observation(
             t_s, telemetry=sample, target=replace(seen, t_s=t_s), has_new_frame=False
         )
@@ -272,7 +276,9 @@ def test_the_pictures_tell_whether_the_vehicle_has_settled(
         target = target_at(
             t_s,
             body_m=(-estimate_m, 0.0, z_m),
-            measured_offset_m=np.array([picture_m, 0.0, PROFILE.planner.ascend.standoff_m]),
+            measured_gear_to_target_world_m=np.array(
+                [picture_m, 0.0, PROFILE.planner.ascend.standoff_m]
+            ),
         )
         return observation(t_s, telemetry=sample, target=target)
 
@@ -306,7 +312,9 @@ def test_a_gear_beside_the_body_turns_with_the_vehicle(heading_rad: float, ahead
     def setpoint(measured_offset_m: np.ndarray | None) -> PositionSetpoint:
         def look(t_s: float) -> Observation:
             sample = telemetry(t_s, Z_M, yaw_rad=heading_rad)
-            target = target_at(t_s, body_m=(0.0, 0.0, Z_M), measured_offset_m=measured_offset_m)
+            target = target_at(
+                t_s, body_m=(0.0, 0.0, Z_M), measured_gear_to_target_world_m=measured_offset_m
+            )
             return observation(t_s, telemetry=sample, target=target)
 
         command = fly(ascending(), look, 0.5, profile=profile, one_phase=True).command

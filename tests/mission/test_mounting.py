@@ -185,7 +185,13 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
     below = target_at(BEGIN_S, (0.0, 0.0, -0.2))
 
     def look(t_s: float) -> Observation:
-        return at(obs={"target": replace(below, measured_s=t_s, small_measured_s=t_s)})(t_s)
+        return at(
+            obs={
+                "target": replace(
+                    below, last_measured_at_s=t_s, small_marker_last_measured_at_s=t_s
+                )
+            }
+        )(t_s)
 
     state = fly(state_in(Phase.ALIGN), look, 0.58).state
     assert state.row_name == "mounting"

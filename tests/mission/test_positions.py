@@ -322,9 +322,12 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         body_m = (sum(steps_m[:done]), 0.0, HANG_Z_M)
         exposed_s = min(t_s - 10.06, seen_s)
         target = target_at(
-            t_s, body_m=body_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
+            t_s,
+            body_m=body_m,
+            is_measured_in_newest_frame=exposed_s < seen_s,
+            last_measured_at_s=10.0 + exposed_s,
         )
-        obs = {"target": target, "has_new_frame": target.measured}
+        obs = {"target": target, "has_new_frame": target.is_measured_in_newest_frame}
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
@@ -356,9 +359,9 @@ def test_an_image_of_the_contact_shows_where_the_gear_is(
         target = target_at(
             t_s,
             body_m=(0.012, 0.0, HANG_Z_M),
-            measured_s=exposed_s,
-            measured_offset_m=np.array([-0.003, 0.002, below_m]),
-            measured_offset_sigma_m=5e-4,
+            last_measured_at_s=exposed_s,
+            measured_gear_to_target_world_m=np.array([-0.003, 0.002, below_m]),
+            measured_gear_to_target_sigma_m=5e-4,
         )
         changes = {
             "position_m": (0.012, 0.0, HANG_Z_M),

@@ -105,8 +105,8 @@ def unseen(z_m: float = 1.0, sigma_m: float = 1e-3, **tel: Any) -> Look:
     """The target is where it was, but no longer tracked."""
 
     remembered = target_at(
-        BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, tracked=False, measured_s=BEGIN_S - 1.0,
-        sigma_m=np.full(3, sigma_m),
+        BEGIN_S, body_m=(0.0, 0.0, z_m), is_measured_in_newest_frame=False, tracked=False,
+        last_measured_at_s=BEGIN_S - 1.0, sigma_m=np.full(3, sigma_m),
     )  # fmt: skip
     return at(z_m, obs={"target": remembered}, **tel)
 

@@ -292,8 +292,9 @@ def pressed_past_the_sight(
         i = round((t_s - BEGIN_S) / TICK_S) - 1
         z_m = HANG_Z_M - 0.045 - 0.1 * TICK_S * i
         target = target_at(
-            t_s, (lateral_offset_m, 0.0, CEILING_M), (0.0, 0.0, z_m), measured=not i,
-            measured_s=BEGIN_S + TICK_S, sigma_m=np.full(3, sigma_m),
+            t_s, (lateral_offset_m, 0.0, CEILING_M), (0.0, 0.0, z_m),
+            is_measured_in_newest_frame=not i, last_measured_at_s=BEGIN_S + TICK_S,
+            sigma_m=np.full(3, sigma_m),
         )  # fmt: skip
         return at(
             z_m,

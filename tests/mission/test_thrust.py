@@ -224,7 +224,7 @@ class Follows(Motors):
 @pytest.mark.parametrize("phase", [Phase.SEARCH, Phase.ASCEND, Phase.PERCH])
 def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     """SEARCH looks for a target that it knows from below it."""
-    below = target_at(BEGIN_S, (0.0, 0.0, -1.0), tracked=False, measured=False)
+    below = target_at(BEGIN_S, (0.0, 0.0, -1.0), tracked=False, is_measured_in_newest_frame=False)
     it = Follows(1.0, target=below)
     fly(state_in(phase), it, 8.0)
     assert min(it.sent_m) >= MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M

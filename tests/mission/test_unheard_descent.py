@@ -152,7 +152,10 @@ def come_down(
         x_m, z_m = past[-1 - round(PICTURES_LATE_S / TICK_S)]
         now = seen(TICK_S * i)
         target = target_at(
-            t_s, body_m=(x_m, 0.0, z_m), measured_s=t_s - PICTURES_LATE_S, measured=now
+            t_s,
+            body_m=(x_m, 0.0, z_m),
+            last_measured_at_s=t_s - PICTURES_LATE_S,
+            is_measured_in_newest_frame=now,
         )
         obs = observation(
             t_s, telemetry=heard, target=target, external_position_age_s=1.1 + TICK_S * i

@@ -271,7 +271,9 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
 ) -> None:
     """Its own landing ended up there, motors off."""
     z_m = HANG_Z_M - distance_below_m
-    target = target_at(BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
+    target = target_at(
+        BEGIN_S, body_m=(0.0, 0.0, z_m), is_measured_in_newest_frame=False, last_measured_at_s=-20.0
+    )
     begin = landing(z_m, stop_or_land_command_count=3, last_stop_or_land_command_at_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
     assert state.phase is ends
@@ -303,7 +305,12 @@ class InAHand(Motors):
         )
         unseen_s = max(0.0, t_s - self.seen_until_s)
         if unseen_s:
-            target = replace(target, measured=False, tracked=False, measured_s=self.seen_until_s)
+            target = replace(
+                target,
+                is_measured_in_newest_frame=False,
+                tracked=False,
+                last_measured_at_s=self.seen_until_s,
+            )
         tel = telemetry(t_s, thrust=self.thrust, position_m=at_m)
         return observation(t_s, telemetry=tel, target=target, external_position_age_s=unseen_s)
 
@@ -374,8 +381,8 @@ class BacksOff(Motors):
     def look(self, t_s: float, state: PlannerState) -> Observation:
         body_m = (self.lateral_offset_m + 0.02 * max(0.0, t_s - 10.5), 0.0, HANG_Z_M)
         target = target_at(
-            t_s, body_m=body_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
-            measured_s=10.0, measured_offset_m=None,
+            t_s, body_m=body_m, sigma_m=np.full(3, self.sigma_m), is_measured_in_newest_frame=False,
+            tracked=False, last_measured_at_s=10.0, measured_gear_to_target_world_m=None,
         )  # fmt: skip
         return at(obs={"target": target}, position_m=body_m, thrust=self.thrust)(t_s)
 

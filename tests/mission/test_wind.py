@@ -170,7 +170,7 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
         if not unseen_s:
             return obs
         assert obs.target is not None
-        late = replace(obs.target, measured_s=lost_s, measured=False)
+        late = replace(obs.target, last_measured_at_s=lost_s, is_measured_in_newest_frame=False)
         return replace(obs, target=late, has_new_frame=False)
 
     flight = fly(state_in(Phase.PERCH, z_m=1.9), look, 1.2, BY_TARGET, feels=True, one_phase=True)

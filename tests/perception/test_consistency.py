@@ -19,7 +19,13 @@ from perchctl.perception.online_calibration import (
     solve_consistency,
 )
 from perchctl.profile import Profile
-from perchctl.vision import CameraErrors, CameraModel, MarkerPose, PoseSetup, VehicleState
+from perchctl.vision import (
+    CameraCalibrationErrors,
+    CameraModel,
+    MarkerPose,
+    PoseSetup,
+    VehicleState,
+)
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -121,7 +127,7 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
     return sums
 
 
-def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> CameraErrors:
+def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> CameraCalibrationErrors:
     sums = _fly(truth, np.random.default_rng(seed), told_s)
     found = solve_consistency(sums, ATTITUDE_SIGMA_RAD)
     assert found is not None
@@ -134,9 +140,9 @@ def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> CameraErrors:
 )
 def test_the_delay_is_found(delay_s: float) -> None:
     found = _seen(Truth(delay_s=delay_s))
-    again = _seen(Truth(delay_s=delay_s), told_s=found.delay_s)
-    assert again.delay_s == pytest.approx(delay_s, abs=0.004)
-    assert again.delay_sigma_s < 0.006
+    again = _seen(Truth(delay_s=delay_s), told_s=found.latency_above_profile_s)
+    assert again.latency_above_profile_s == pytest.approx(delay_s, abs=0.004)
+    assert again.latency_sigma_s < 0.006
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -145,7 +151,10 @@ def test_each_turn_is_found_about_its_own_axis(axis: int) -> None:
     turn[axis] = math.radians(5.0)
     found = _seen(Truth(turn_rad=(turn[0], turn[1], turn[2])))
     for truth, seen, sigma in zip(
-        turn, found.mount_rotation_xyz_rad, found.mount_rotation_sigma_xyz_rad, strict=True
+        turn,
+        found.mount_rotation_from_profile_xyz_rad,
+        found.mount_rotation_sigma_xyz_rad,
+        strict=True,
     ):
         assert abs(seen - truth) < 3.0 * sigma
         assert sigma < math.radians(1.5)
@@ -166,19 +175,27 @@ def test_what_is_claimed_is_what_is_so() -> None:
             drift_mps=tuple(rng.normal(0.0, 0.01, 2)),
         )
         found = _seen(truth, seed, told_s=delay_s + rng.uniform(-0.01, 0.01))
-        off = np.array([found.delay_s - delay_s, *(np.array(found.mount_rotation_xyz_rad) - turn)])
-        ratios.append((off / [found.delay_sigma_s, *found.mount_rotation_sigma_xyz_rad]) ** 2)
+        off = np.array(
+            [
+                found.latency_above_profile_s - delay_s,
+                *(np.array(found.mount_rotation_from_profile_xyz_rad) - turn),
+            ]
+        )
+        ratios.append((off / [found.latency_sigma_s, *found.mount_rotation_sigma_xyz_rad]) ** 2)
     mean = np.mean(ratios, axis=0)
     assert ((mean > 0.5) & (mean < 2.0)).all(), mean
 
 
 def test_a_vehicle_at_rest_tells_nothing() -> None:
     found = _seen(Truth(delay_s=0.05, turn_rad=(0.1, 0.1, 0.5), rests=True))
-    assert found.delay_sigma_s > 0.05
+    assert found.latency_sigma_s > 0.05
     assert min(found.mount_rotation_sigma_xyz_rad) > math.radians(3.0)
 
 
 def test_a_world_that_jumps_spoils_nothing() -> None:
     found = _seen(Truth(delay_s=0.02, jump_m=0.3))
-    assert found.delay_s == pytest.approx(0.02, abs=0.006)
-    assert abs(found.mount_rotation_xyz_rad[2]) < 3.0 * found.mount_rotation_sigma_xyz_rad[2]
+    assert found.latency_above_profile_s == pytest.approx(0.02, abs=0.006)
+    assert (
+        abs(found.mount_rotation_from_profile_xyz_rad[2])
+        < 3.0 * found.mount_rotation_sigma_xyz_rad[2]
+    )

@@ -23,7 +23,7 @@ from perchctl.perception.online_calibration import (
     update_calibration,
 )
 from perchctl.profile import USED_LATENCY_S, CameraConfig
-from perchctl.vision import CameraErrors, CameraModel, MarkerPose, PoseSetup
+from perchctl.vision import CameraCalibrationErrors, CameraModel, MarkerPose, PoseSetup
 from tests.helpers.mission import PROFILE, context_at, observation, state_in, telemetry
 
 FRAME_S = 1 / 30
@@ -39,8 +39,8 @@ POSE = MarkerPose(
 )  # fmt: skip
 
 
-def _seen(delay_s: float, sigma_s: float) -> CameraErrors:
-    return CameraErrors(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
+def _seen(delay_s: float, sigma_s: float) -> CameraCalibrationErrors:
+    return CameraCalibrationErrors(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
 
 
 def _frames(
@@ -80,7 +80,7 @@ def test_a_sure_latency_is_taken_over_slowly() -> None:
     ids=["unsure", "unknown", "no number", "too little", "too much"],
 )
 def test_only_a_sure_latency_is_used_and_within_bounds(
-    newest: CameraErrors | None, used_s: float
+    newest: CameraCalibrationErrors | None, used_s: float
 ) -> None:
     start = OnlineCalibration(newest=newest, applied_delay_s=0.01)
     assert _frames(start, 600).applied_delay_s == pytest.approx(used_s)
@@ -126,7 +126,7 @@ def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:
     old = observation(10.02)
     assert old.target is not None
     limit_s = PROFILE.planner.ascend.fresh_s + PROFILE.camera.start_latency_s
-    target = replace(old.target, measured_s=10.02 - limit_s - 0.03)
+    target = replace(old.target, last_measured_at_s=10.02 - limit_s - 0.03)
     stale = replace(old, target=target)
     assert not context_at(state, stale).belief.target.is_fresh
     assert context_at(

@@ -78,8 +78,9 @@ def test_an_observation_comes_back(
         position_variance_m2=None,
     )  # fmt: skip
     target = replace(
-        synthetic.target(1.0, 1.0), e_m=np.array(e_m), sigma_yaw_rad=number, measured_s=-math.inf,
-        world_m=None if world_m is None else np.array(world_m), small_measured_s=math.nan,
+        synthetic.target(1.0, 1.0), e_m=np.array(e_m), sigma_yaw_rad=number,
+        last_measured_at_s=-math.inf, world_m=None if world_m is None else np.array(world_m),
+        small_marker_last_measured_at_s=math.nan,
     )  # fmt: skip
     obs = Observation(
         number, telemetry, target, True, math.inf,

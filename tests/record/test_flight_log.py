@@ -37,7 +37,7 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
-from perchctl.vision import CameraErrors
+from perchctl.vision import CameraCalibrationErrors
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held, state_with
 
@@ -116,7 +116,9 @@ def test_every_field_is_filled_by_something() -> None:
             state,
             output=frame,
             target=pose,
-            consistency=CameraErrors(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
+            consistency=CameraCalibrationErrors(
+                0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)
+            ),
             delay_used_s=0.005,
             outside=ExternalPositionStatus(0.012, "hidden", 7, 99.0, place),
         )

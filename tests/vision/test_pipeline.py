@@ -114,7 +114,7 @@ def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: 
     limit_m, limit_rad = (0.002, 0.01) if frame == "world" else (0.012, 0.03)
     for k, output in enumerate(outputs):
         e, yaw = true_e(fly(k))
-        assert output.target.measured
+        assert output.target.is_measured_in_newest_frame
         assert output.target.stage is VisibleMarkers.BOTH
         assert np.abs(output.target.e_m - e).max() < limit_m
         assert abs(wrap_rad(output.target.e_yaw_rad - yaw)) < limit_rad
@@ -136,8 +136,8 @@ def test_while_unseen_the_target_coasts_in_the_world_and_is_then_given_up(
     outputs = run(setup, 4 + n_max + 3, lost=lambda k: k >= 4)
     for n in range(1, n_max + 1):
         target = outputs[3 + n].target
-        assert not target.measured
-        assert target.unseen == n
+        assert not target.is_measured_in_newest_frame
+        assert target.unseen_frames == n
         assert target.stage is VisibleMarkers.NONE
         e, yaw = true_e(fly(3 + n))  # the vehicle flies on: e follows
         assert np.abs(target.e_m - e).max() < 0.01
@@ -219,7 +219,7 @@ def test_the_estimate_follows_the_vehicle(
     assert np.abs(target.e_m - e_m).max() < 0.003
     assert abs(wrap_rad(target.e_yaw_rad - e_yaw_rad)) < 0.01
     assert target.t_s == now.t_s
-    assert target.measured_s == attitude.t_s
+    assert target.last_measured_at_s == attitude.t_s
 
 
 @pytest.mark.parametrize("frame", ["world", "level"])
@@ -232,8 +232,8 @@ def test_a_lost_target_is_remembered_in_the_world(build: Build, frame: str) -> N
         state, output = step(state, Frame(k, attitude.t_s, image), attitude, setup)
     assert output.target is None
     target = estimate(state, attitude.t_s + 5.0, attitude, setup)
-    assert (target.tracked, target.measured) == (False, False)
-    assert target.measured_s == last.t_s
+    assert (target.tracked, target.is_measured_in_newest_frame) == (False, False)
+    assert target.last_measured_at_s == last.t_s
     assert target.stage is VisibleMarkers.NONE
     limit_m = 0.01 if frame == "world" else 0.15  # level: the vehicle's own way while it coasts
     assert np.abs(target.e_m - true_e(attitude)[0]).max() < limit_m
@@ -264,11 +264,11 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     for name in ("large", "small"):
         seen = later.detections.get(name)
         assert np.abs(expected[name] - seen.corners_px).max() < 1.0
-    assert np.allclose(near.tvec, later.poses["joint"].tvec_m, atol=0.002)
+    assert np.allclose(near.tvec_m, later.poses["joint"].tvec_m, atol=0.002)
     corners, unmoved = expected_corners(sight, now.t_s, None, setup.pose_setup)
     assert corners is None
-    assert np.array_equal(unmoved.tvec, sight.pose.tvec_m)
-    assert np.array_equal(unmoved.rvec, sight.pose.rvec_rad)
+    assert np.array_equal(unmoved.tvec_m, sight.pose.tvec_m)
+    assert np.array_equal(unmoved.rvec_rad, sight.pose.rvec_rad)
     assert expected_corners(None, now.t_s, now, setup.pose_setup) == (None, None)
     assert expected_corners(sight, then.t_s + 5.0, now, setup.pose_setup) == (None, None)
 

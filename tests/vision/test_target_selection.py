@@ -101,7 +101,7 @@ def flight(neighbour: Neighbour = ALIKE, **target: object) -> Flight:
 def place(output: Output) -> tuple[float, float] | None:
     """Where the target is that this frame measured."""
     target = output.target
-    if target is None or not target.measured:
+    if target is None or not target.is_measured_in_newest_frame:
         return None
     return float(target.world_m[0]), float(target.world_m[1])
 

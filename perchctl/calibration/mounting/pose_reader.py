@@ -18,7 +18,7 @@ from perchctl.vision import (
     PipelineOutput,
     make_camera_only_profile,
     make_pipeline,
-    target_covariance_cam,
+    target_rotation_translation_cov_cam,
 )
 
 
@@ -64,7 +64,9 @@ def _best_pose(output: PipelineOutput, t_s: float) -> TargetPose | None:
     if pose is None or pose.rvec_tvec_cov is None or not np.isfinite(pose.rvec_tvec_cov).all():
         return None
     R = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0], dtype=np.float64)
-    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, target_covariance_cam(pose))
+    return TargetPose(
+        t_s, R @ R_MARKER_TARGET, pose.tvec_m, target_rotation_translation_cov_cam(pose)
+    )
 
 
 def _uncertainty(pose: MarkerPose) -> float:

@@ -142,19 +142,19 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     target = b.obs.target
     if (
         target is None
-        or target.measured_offset_m is None
+        or target.measured_gear_to_target_world_m is None
         or b.obs.camera_imu_mismatch is not None
         or b.mounting.is_camera_mounting_wrong
         or not _is_in_contact_with_target(b)
     ):
         return None
-    x_m, y_m, z_m = target.measured_offset_m.tolist()
-    before_touch_s = max(0.0, b.imu.climb_steady_since_s - target.measured_s)
+    x_m, y_m, z_m = target.measured_gear_to_target_world_m.tolist()
+    before_touch_s = max(0.0, b.imu.climb_steady_since_s - target.last_measured_at_s)
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
     sigma_m = math.hypot(
-        target.measured_offset_sigma_m,
+        target.measured_gear_to_target_sigma_m,
         GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M,
         LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS * before_touch_s,
     )

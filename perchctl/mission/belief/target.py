@@ -81,7 +81,7 @@ class TargetBelief:
         if target.world_m is not None:
             goal_z_m = float(target.world_m[2]) - profile.vehicle.gear_body_m[2]
         limit_s = profile.planner.ascend.fresh_s + camera_latency_s
-        age_s = t_s - target.measured_s
+        age_s = t_s - target.last_measured_at_s
         return cls(
             world_position_m=target.world_m,
             world_yaw_rad=target.world_yaw_rad,
@@ -92,7 +92,7 @@ class TargetBelief:
             age_s=age_s,
             is_tracked=target.tracked,
             is_fresh=target.tracked and age_s <= limit_s,
-            is_small_marker_fresh=t_s - target.small_measured_s <= limit_s,
+            is_small_marker_fresh=t_s - target.small_marker_last_measured_at_s <= limit_s,
         )
 
 
@@ -126,7 +126,7 @@ class VisualMotion:
     def with_detection(self, target: TargetEstimate) -> VisualMotion:
         """Return the motion after a frame that measured the target."""
         x_m, y_m, z_m = (float(v) for v in target.e_m)
-        e_m, t_s = (x_m, y_m, z_m), target.measured_s
+        e_m, t_s = (x_m, y_m, z_m), target.last_measured_at_s
         dt_s = t_s - self.t_s
         if dt_s <= 0.0:
             return self

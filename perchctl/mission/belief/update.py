@@ -162,13 +162,15 @@ def _update_target(b: Belief) -> Belief:
     """Return the belief with the target's position, the scatter of its recent measured positions,
     and the vehicle's velocity from pictures, after a frame that measured the target."""
     target = b.obs.target
-    if not b.obs.has_new_frame or target is None or not target.measured:
+    if not b.obs.has_new_frame or target is None or not target.is_measured_in_newest_frame:
         return b
     b = replace(b, visual_motion=b.visual_motion.with_detection(target))
-    if target.measured_offset_m is not None and math.isfinite(target.measured_offset_sigma_m):
-        x_m, y_m, _ = target.measured_offset_m.tolist()
+    if target.measured_gear_to_target_world_m is not None and math.isfinite(
+        target.measured_gear_to_target_sigma_m
+    ):
+        x_m, y_m, _ = target.measured_gear_to_target_world_m.tolist()
         filtered = b.lateral_offset_filter.with_picture_measurement(
-            target.measured_s, (x_m, y_m), target.measured_offset_sigma_m
+            target.last_measured_at_s, (x_m, y_m), target.measured_gear_to_target_sigma_m
         )
         b = replace(b, lateral_offset_filter=filtered)
     if target.world_m is None:
@@ -380,7 +382,7 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     obs, target = b.obs, b.obs.target
     if target is None:
         return new
-    seen = obs.has_new_frame and target.measured
+    seen = obs.has_new_frame and target.is_measured_in_newest_frame
     if not seen and not (b.is_position_valid and not b.is_target_position_source):
         return new
     yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
@@ -390,14 +392,16 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     if (
         not seen
         and b.position_last_stale_at_s is not None
-        and b.position_last_stale_at_s >= target.measured_s
+        and b.position_last_stale_at_s >= target.last_measured_at_s
     ):
         gear_to_target_world_xy_m, sigma_m = (
             new.gear_to_target_world_xy_m,
             new.gear_to_target_sigma_m,
         )
-    new = add_sighting(new, target.measured_s, gear_to_target_world_xy_m, float(ez), sigma_m)
-    if seen and target.measured_s > new.last_unexplained_position_step_at_s:
+    new = add_sighting(
+        new, target.last_measured_at_s, gear_to_target_world_xy_m, float(ez), sigma_m
+    )
+    if seen and target.last_measured_at_s > new.last_unexplained_position_step_at_s:
         new = replace(new, unexplained_position_step_sum_xy_m=(0.0, 0.0))
     return new
 
@@ -519,7 +523,9 @@ def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
 
 def _update_mounting(b: Belief) -> MountingMonitor:
     obs, target = b.obs, b.obs.target
-    measured = target is not None and target.measured and target.world_m is not None
+    measured = (
+        target is not None and target.is_measured_in_newest_frame and target.world_m is not None
+    )
     if not (
         obs.has_new_frame
         and measured

@@ -39,7 +39,11 @@ from perchctl.vision.markers.edge_fit import (
     CLIPPED_GREY,
     MIN_CLIPPED_FRACTION,
 )
-from perchctl.vision.markers.pattern import MIN_MARKER_SIDE_PX, MarkerPattern, correlate_pattern
+from perchctl.vision.markers.pattern import (
+    MIN_MARKER_SIDE_PX,
+    MarkerPattern,
+    correlate_pattern_rotations,
+)
 from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
@@ -82,10 +86,13 @@ def find_expected_blurred(
         if mean_side_px(corners) < MIN_MARKER_SIDE_PX:
             continue
         start = _align_by_correlation(image, corners, patterns[name])
-        if correlate_pattern(image, start, patterns[name])[0] < _MIN_EXPECTED_MARKER_CORRELATION:
+        if (
+            correlate_pattern_rotations(image, start, patterns[name])[0]
+            < _MIN_EXPECTED_MARKER_CORRELATION
+        ):
             continue
         for blur_px in blurs_px:
-            seen = align_marker(detector_input, name, start, blur_px=blur_px)
+            seen = align_marker(detector_input, name, start, initial_blur_sigma_px=blur_px)
             if seen is not None:
                 return {name: seen}
     return {}
@@ -99,7 +106,7 @@ def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorne
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _rank_quads(image, quads, setup.patterns):
-        seen = align_marker(detector_input, name, corners_px, blur_px=_FIRST_BLUR_PX)
+        seen = align_marker(detector_input, name, corners_px, initial_blur_sigma_px=_FIRST_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
@@ -115,7 +122,9 @@ def _rank_quads(
         return []
     found: list[tuple[float, MarkerName, Array]] = []
     for name in MARKERS:
-        like = np.array([correlate_pattern(image, quad, patterns[name]) for quad in quads])
+        like = np.array(
+            [correlate_pattern_rotations(image, quad, patterns[name]) for quad in quads]
+        )
         for i in np.flatnonzero(like.max(axis=1) > _MIN_QUAD_CORRELATION):
             roll = int(like[i].argmax())
             found.append((float(like[i, roll]), name, np.roll(quads[i], roll, axis=0)))
@@ -177,7 +186,7 @@ def _render_template(
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
     cell = np.clip(cell, 0, n - 1)
     white = np.where(inside, pattern.drawing.cell_whiteness[cell[..., 1], cell[..., 0]], 1.0)
-    if pattern.drawing.small_cell_whiteness is not None:
+    if pattern.drawing.small_marker_cell_whiteness is not None:
         white[
             np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
         ] = _CENTRE_GREY
@@ -196,9 +205,9 @@ _CORNER_SIGMA_PER_BLUR = 0.012  # share of the blur: no image equals its drawing
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
 _MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
-_MAX_BIT_FLIP_FRACTION, _MAX_BIT_FLIP_FRACTION_SIGMA = 0.4, 0.35
+_MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06  # share of the side
-_MIN_MAX_MOTION_FROM_START_PX = 3.0
+_ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # ratio of the mean sides
 _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
 
@@ -208,30 +217,32 @@ def align_marker(
     name: MarkerName,
     start_corners_px: Array,
     max_motion_from_start_sides: float = 0.6,
-    blur_px: float = 1.5,
+    initial_blur_sigma_px: float = 1.5,
     max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
     must_exclude_other_codewords: bool = True,
 ) -> RefinedCorners | None:
     """Fit a marker's drawing to the image and return its corners; None unless the image matches
     the drawing.
 
-    The fit starts at `start_corners_px` (4, 2) with the initial blur `blur_px` (standard
-    deviation). Both limits are in side lengths: `max_motion_from_start_sides` for the distance of
-    the fitted corners from the start, and `max_corner_sigma_sides` for their standard deviation.
-    `must_exclude_other_codewords` requires that the image excludes every other codeword
+    The fit starts at `start_corners_px` (4, 2) with the initial blur `initial_blur_sigma_px`
+    (standard deviation). Both limits are in side lengths: `max_motion_from_start_sides` for the
+    distance of the fitted corners from the start, and `max_corner_sigma_sides` for their standard
+    deviation. `must_exclude_other_codewords` requires that the image excludes every other codeword
     (`excludes_other_codewords`); set it to False if the other marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
         return None
     image, drawing = detector_input.image, detector_input.setup.patterns[name].drawing
-    alignment = align_drawing(image, start_corners_px, drawing, detector_input.camera, blur_px)
+    alignment = align_drawing(
+        image, start_corners_px, drawing, detector_input.camera, initial_blur_sigma_px
+    )
     if (
         alignment is None
         or not is_alignment_confirmed(alignment, max_corner_sigma_sides)
         or (must_exclude_other_codewords and not excludes_other_codewords(alignment))
-        or alignment.motion_from_start_px
-        > max(max_motion_from_start_sides * side_px, _MIN_MAX_MOTION_FROM_START_PX)
+        or alignment.largest_motion_from_start_px
+        > max(max_motion_from_start_sides * side_px, _ALWAYS_ALLOWED_MOTION_FROM_START_PX)
     ):
         return None
     # The square must remain a square of about the same size and orientation.
@@ -247,7 +258,7 @@ def align_marker(
         return None
     sigma_px = math.hypot(
         max(alignment.sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
-        _CORNER_SIGMA_PER_BLUR * alignment.blur_px,
+        _CORNER_SIGMA_PER_BLUR * alignment.blur_sigma_px,
     )
     (left, top), (right, bottom) = (
         alignment.corners_px.min(axis=0),
@@ -271,8 +282,10 @@ def is_alignment_confirmed(
     return (
         alignment.pattern_correlation > _MIN_INNER_CORRELATION
         and alignment.fit_correlation > _MIN_CORRELATION
-        and _MIN_PATTERN_CONTRAST < alignment.pattern_to_border_contrast < _MAX_PATTERN_CONTRAST
-        and alignment.max_cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
+        and _MIN_PATTERN_CONTRAST
+        < alignment.pattern_to_border_contrast_ratio
+        < _MAX_PATTERN_CONTRAST
+        and alignment.largest_cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
         and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
@@ -280,8 +293,8 @@ def is_alignment_confirmed(
 def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
     """True if flipping any single bit of the codeword would fit the image clearly worse. In tests,
     `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; each of these had a
-    `bit_flip_fraction` above 0.5."""
+    `worst_cell_flip_fraction` above 0.5."""
     return (
-        alignment.bit_flip_fraction < _MAX_BIT_FLIP_FRACTION
-        and alignment.bit_flip_fraction_sigma < _MAX_BIT_FLIP_FRACTION_SIGMA
+        alignment.worst_cell_flip_fraction < _MAX_CELL_FLIP_FRACTION
+        and alignment.largest_cell_flip_fraction_sigma < _MAX_CELL_FLIP_FRACTION_SIGMA
     )

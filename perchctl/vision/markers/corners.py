@@ -54,7 +54,7 @@ def apply_homography(H: Array, points: Array) -> Array:
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
-def projected_corners_jacobian(homography: Array) -> Array:
+def corners_by_increment_jacobian(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
     respect to the `homography_increment` of `increment_homography`."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
@@ -103,14 +103,16 @@ def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float 
     return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())
 
 
-def scale_square(corners_px: Array, side_ratio: float, camera: CameraModel | None = None) -> Array:
+def scale_square(
+    corners_px: Array, new_to_given_side_ratio: float, camera: CameraModel | None = None
+) -> Array:
     """Return the corners (4, 2) px of a square with the same centre and plane as the given one,
-    whose side is `side_ratio` times the given side; without a camera, lens distortion is
-    ignored."""
+    whose side is `new_to_given_side_ratio` times the given side; without a camera, lens distortion
+    is ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_centred_square(straight),
-        (_CENTRED_SQUARE_F32 * side_ratio).astype(np.float64),
+        (_CENTRED_SQUARE_F32 * new_to_given_side_ratio).astype(np.float64),
     )
     return found if camera is None else distort_to_px(found, camera)
 
@@ -150,23 +152,24 @@ class RefinedCorners:
         corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
         are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
             they come from OpenCV or from the other marker, which is less accurate.
-        corrected_edge_shift: how far white has grown over black at all edges of the image
+        removed_edge_shift: how far white has grown over black at all edges of the image
             (blooming, gamma), measured on this frame's markers or in an earlier frame. The corners
             are corrected for it. None: unknown, not corrected.
         remaining_edge_shift_sigma_px: standard deviation of the remaining growth after the
             correction.
-        blur_px, sharpest_side_blur_px: largest and smallest blur of a side.
+        blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: largest and smallest blur of a
+            side.
     """
 
     corners_px: Array
     sigma_px: float
     are_corners_fitted: bool
     remaining_edge_shift_sigma_px: float = 0.0
-    blur_px: float = 0.0
-    corrected_edge_shift: EdgeShift | None = None
+    blurriest_side_blur_sigma_px: float = 0.0
+    removed_edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = 0.0
-    sharpest_side_blur_px: float = math.inf
+    sharpest_side_blur_sigma_px: float = math.inf
 
 
 def refine_subpix(

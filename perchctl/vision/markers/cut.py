@@ -47,19 +47,19 @@ from perchctl.vision.markers.detector import (
     is_any_part_hidden,
     make_detector_setup,
 )
-from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS, sample_profiles
+from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS_HALF_LENGTHS, sample_profiles
 from perchctl.vision.markers.pattern import MarkerDrawing, MarkerPattern, render_cells
 from perchctl.vision.markers.photometric_fit import fit_correlation, make_sampling_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
-MAX_TRUNCATED_FIT_AGE_S = 0.5
+MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S = 0.5
 """Largest time since the target was last measured, s; after it, a visible part of the target is no
 evidence."""
-_MAX_CORNER_TO_IMAGE_EDGE_PX = (
+_UNCERTAIN_TRUNCATION_MARGIN_PX = (
     40  # from the edge of the image, where a marker may just have been cut
 )
 # cell of the small marker; if it is smaller, the large marker is in view
-_MIN_SMALL_CELL_PX = 8.0
+_MIN_SMALL_MARKER_CELL_PX = 8.0
 _MIN_COARSE_CORRELATION = 0.6  # correlation required at the moved prediction
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # correlation at which no other size is tried
 _RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
@@ -98,7 +98,7 @@ def is_target_truncated(
     whole = [
         corners
         for corners in expected_corners_px.values()
-        if is_inside_image(corners, shape, _MAX_CORNER_TO_IMAGE_EDGE_PX)
+        if is_inside_image(corners, shape, _UNCERTAIN_TRUNCATION_MARGIN_PX)
     ]
     return bool(expected_corners_px) and all(is_any_part_hidden(hidden_mask, c) for c in whole)
 
@@ -109,7 +109,7 @@ def can_complete_marker_be_in_view(
     """True if at least one expected marker, with corners (4, 2) px, may be completely in the
     image."""
     return any(
-        is_inside_image(corners, shape, -_MAX_CORNER_TO_IMAGE_EDGE_PX)
+        is_inside_image(corners, shape, -_UNCERTAIN_TRUNCATION_MARGIN_PX)
         for corners in expected_corners_px.values()
     )
 
@@ -128,7 +128,7 @@ def fit_truncated_markers(
     drawing = patterns["large"].drawing
     small_to_large_side_ratio, centre = (
         drawing.small_to_large_side_ratio,
-        drawing.small_cell_whiteness,
+        drawing.small_marker_cell_whiteness,
     )
     start = _initial_pose(expected_corners_px, small_to_large_side_ratio, camera)
     if start is None or centre is None:
@@ -139,7 +139,7 @@ def fit_truncated_markers(
         / len(centre)
         * camera.K[0, 0]
         / start.t_cam_drawing_half_sides[2]
-        < _MIN_SMALL_CELL_PX
+        < _MIN_SMALL_MARKER_CELL_PX
     ):
         return {}
     covered = (
@@ -155,7 +155,7 @@ def fit_truncated_markers(
     like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
     if like < _MIN_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
         return {}
-    name = _select_measured_marker(pose_fit)
+    name = _select_marker_to_report(pose_fit)
     corners = _project_marker_corners(
         pose_fit, small_to_large_side_ratio if name == "small" else 1.0, camera
     )
@@ -174,7 +174,7 @@ def shows_enough_of_target(
         return False
     side_to_large_side_ratio = (
         patterns["large"].drawing.small_to_large_side_ratio
-        if _select_measured_marker(pose_fit) == "small"
+        if _select_marker_to_report(pose_fit) == "small"
         else 1.0
     )
     return _project_marker_corners(pose_fit, side_to_large_side_ratio, camera) is not None
@@ -189,15 +189,17 @@ def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> Target
     large, small = patterns["large"], patterns["small"]
     return make_outline(
         large.drawing,
-        large.border_cells.print_tolerance_cells,
-        small.border_cells.print_tolerance_cells,
+        large.cells_along_border.print_tolerance_cells,
+        small.cells_along_border.print_tolerance_cells,
     )
 
 
-def _select_measured_marker(pose_fit: PoseFit) -> MarkerName:
+def _select_marker_to_report(pose_fit: PoseFit) -> MarkerName:
     """Return the marker to report: the small one if enough of its edge points were found, otherwise
     the large one."""
-    return "small" if pose_fit.small_marker_point_count >= _MIN_SMALL_MARKER_POINTS else "large"
+    return (
+        "small" if pose_fit.found_small_marker_point_count >= _MIN_SMALL_MARKER_POINTS else "large"
+    )
 
 
 def _initial_pose(
@@ -300,10 +302,10 @@ def _project_marker_corners(
 FloatImage = NDArray[np.float32]
 
 _LATTICE_COLUMNS = 80  # across the image, approximately
-_SAMPLES_PER_NODE = 2  # samples per node in both directions
+_SAMPLES_PER_NODE_AND_AXIS = 2  # samples per node in both directions
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
 _POINTS_PER_IMAGE_SIDE = 40
-_VALID_RADIUS_FACTOR = 1.02
+_VALID_TO_IMAGE_RADIUS_RATIO = 1.02
 _SEARCH_RANGE_NODES = 6  # nodes to each side
 _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
@@ -319,7 +321,7 @@ class CoarseLattice:
         valid_radius_normalised: distance from the optical axis up to which the lens model is used;
             further out, it may map two directions to the same pixel.
         map_x_px, map_y_px: maps for cv2.remap: the position of each sample in the reduced image.
-        reduced_size_px: width and height of the reduced image.
+        reduced_image_size_px: width and height of the reduced image.
         is_in_image: True for nodes inside the image, (rows, columns).
     """
 
@@ -328,7 +330,7 @@ class CoarseLattice:
     valid_radius_normalised: float
     map_x_px: FloatImage
     map_y_px: FloatImage
-    reduced_size_px: tuple[int, int]
+    reduced_image_size_px: tuple[int, int]
     is_in_image: NDArray[np.bool_]
 
 
@@ -353,12 +355,13 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     rays = np.clip(
         np.nan_to_num(rays, nan=0.0), -_MAX_VIEW_RADIUS_NORMALISED, _MAX_VIEW_RADIUS_NORMALISED
     )
-    reach = _VALID_RADIUS_FACTOR * float(np.hypot(*rays.T).max())
+    reach = _VALID_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
     step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
         rays.min(axis=0)[k]
-        + step * ((np.arange(_SAMPLES_PER_NODE * nodes[k]) + 0.5) / _SAMPLES_PER_NODE)
+        + step
+        * ((np.arange(_SAMPLES_PER_NODE_AND_AXIS * nodes[k]) + 0.5) / _SAMPLES_PER_NODE_AND_AXIS)
         for k in (0, 1)
     ]
     x, y = np.meshgrid(*fine)
@@ -366,10 +369,10 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
     inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
     at = np.where(inside[:, None], at, -1e3)
-    every = max(round(w / (_SAMPLES_PER_NODE * _LATTICE_COLUMNS)), 1)
+    every = max(round(w / (_SAMPLES_PER_NODE_AND_AXIS * _LATTICE_COLUMNS)), 1)
     size = (max(w // every, 1), max(h // every, 1))
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
-    shape = (int(nodes[1]), _SAMPLES_PER_NODE, int(nodes[0]), _SAMPLES_PER_NODE)
+    shape = (int(nodes[1]), _SAMPLES_PER_NODE_AND_AXIS, int(nodes[0]), _SAMPLES_PER_NODE_AND_AXIS)
     flat = x.shape
     return CoarseLattice(
         first_node_normalised=rays.min(axis=0) + step / 2.0,
@@ -377,7 +380,7 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
         valid_radius_normalised=reach,
         map_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
         map_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
-        reduced_size_px=size,
+        reduced_image_size_px=size,
         is_in_image=inside.reshape(shape).all(axis=(1, 3)),
     )
 
@@ -396,7 +399,7 @@ def make_coarse_image(
 
 
 def _sample_at_nodes(image: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice) -> FloatImage:
-    small = cv2.resize(image, lattice.reduced_size_px, interpolation=cv2.INTER_AREA).astype(
+    small = cv2.resize(image, lattice.reduced_image_size_px, interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
     fine_image = cv2.remap(small, lattice.map_x_px, lattice.map_y_px, cv2.INTER_LINEAR)
@@ -404,18 +407,21 @@ def _sample_at_nodes(image: NDArray[np.uint8] | FloatImage, lattice: CoarseLatti
 
 
 def _downsample(fine_image: FloatImage) -> FloatImage:
-    rows, columns = (n // _SAMPLES_PER_NODE for n in fine_image.shape)
+    rows, columns = (n // _SAMPLES_PER_NODE_AND_AXIS for n in fine_image.shape)
     return np.asarray(
         cv2.resize(fine_image, (columns, rows), interpolation=cv2.INTER_AREA), np.float32
     )
 
 
 def render_drawing(
-    H: Array, texture: DrawingTexture, lattice: CoarseLattice, margin_nodes: int = 0
+    H_normalised_drawing: Array,
+    texture: DrawingTexture,
+    lattice: CoarseLattice,
+    margin_nodes: int = 0,
 ) -> FloatImage:
     """Return the whiteness, 0 to 1, of the drawing projected by H (3, 3), at the lattice's nodes
     and at `margin_nodes` more nodes on each side."""
-    step = lattice.node_spacing_normalised / _SAMPLES_PER_NODE
+    step = lattice.node_spacing_normalised / _SAMPLES_PER_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
         - 0.5 * (lattice.node_spacing_normalised - step)
@@ -425,11 +431,11 @@ def render_drawing(
         [[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step], [0.0, 0.0, 1.0]]
     )
     white, T = texture
-    M = G @ H @ np.linalg.inv(T)
+    M = G @ H_normalised_drawing @ np.linalg.inv(T)
     rows, columns = lattice.is_in_image.shape
     size = (
-        _SAMPLES_PER_NODE * (columns + 2 * margin_nodes),
-        _SAMPLES_PER_NODE * (rows + 2 * margin_nodes),
+        _SAMPLES_PER_NODE_AND_AXIS * (columns + 2 * margin_nodes),
+        _SAMPLES_PER_NODE_AND_AXIS * (rows + 2 * margin_nodes),
     )
     fine = cv2.warpPerspective(
         white,
@@ -451,7 +457,7 @@ class DrawingMatch(NamedTuple):
 
 
 def correlate_drawing(
-    H: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
+    H_normalised_drawing: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
     """Compare the coarse image with the drawing projected by H (3, 3). Contrast and offset are
     those that fit best."""
@@ -461,12 +467,16 @@ def correlate_drawing(
         [columns, rows], axis=1
     ).astype(np.float64)
     on = (
-        np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1)
+        np.abs(
+            apply_homography(np.asarray(np.linalg.inv(H_normalised_drawing), np.float64), at)
+        ).max(axis=1)
         < PAPER_REACH_LARGE_HALF_SIDES
     )
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return DrawingMatch(0.0, 0.0)
-    white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
+    white = render_drawing(H_normalised_drawing, texture, lattice)[rows[on], columns[on]].astype(
+        np.float64
+    )
     grey = coarse_image.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
@@ -490,8 +500,8 @@ class TargetOutline:
     """Points along the edges of the target's drawing.
 
     Attributes:
-        points_half_sides, normal: points (n, 2), in half sides of the large marker from the
-            target's centre, and unit normals (n, 2) from black to white.
+        points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
+            from the target's centre, and unit normals (n, 2) from black to white.
         line_index: index (n,) of the straight line that contains the point.
         print_sigma_half_sides: standard deviation (n,) of that line's print error.
         cell_width_half_sides: width (n,) of the adjacent cell.
@@ -499,7 +509,7 @@ class TargetOutline:
     """
 
     points_half_sides: Array
-    normal: Array
+    drawing_normal_to_white: Array
     line_index: NDArray[np.intp]
     print_sigma_half_sides: Array
     cell_width_half_sides: Array
@@ -527,9 +537,11 @@ def make_outline(
         if np.abs(edge.points_half_sides).max(axis=1).min() > hidden
     ]
     large = len(edges)
-    if drawing.small_cell_whiteness is not None:
+    if drawing.small_marker_cell_whiteness is not None:
         edges += _iterate_cell_edges(
-            drawing.small_cell_whiteness, drawing.small_to_large_side_ratio, _POINTS_PER_SMALL_CELL
+            drawing.small_marker_cell_whiteness,
+            drawing.small_to_large_side_ratio,
+            _POINTS_PER_SMALL_CELL,
         )
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
@@ -538,7 +550,7 @@ def make_outline(
     small = np.repeat(np.arange(len(edges)) >= large, points_per_edge)
     return TargetOutline(
         points_half_sides=np.concatenate(at),
-        normal=np.repeat(normals, points_per_edge, axis=0),
+        drawing_normal_to_white=np.repeat(normals, points_per_edge, axis=0),
         line_index=np.repeat([numbers[name] for name in names], points_per_edge),
         print_sigma_half_sides=np.where(
             small, small_print_tolerance_cells, large_print_tolerance_cells
@@ -568,7 +580,7 @@ class _CellEdge(NamedTuple):
     key that is equal for edges on one straight line, and the width of the cell."""
 
     points_half_sides: Array
-    normal: tuple[float, float]
+    drawing_normal_to_white: tuple[float, float]
     line_key: tuple[float, int, int]
     cell_width_half_sides: float
 
@@ -616,7 +628,7 @@ _MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35  # grey levels; share of 
 _MIN_EDGE_POINTS = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 _ROBUST_VARIANCE_FACTOR = 1.3  # compensates for the smaller squared residuals under robust weights
-_LINE_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
+_WHOLE_LINE_OFFSET_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
 _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     math.radians(2.0),
@@ -664,7 +676,7 @@ class PoseFit:
             along (half sides of the large marker) the camera's x, y, z.
         visible_point_count: number of edge points in the image.
         found_point_count: number of these points at which an edge was found.
-        small_marker_point_count: number of found points on the small marker.
+        found_small_marker_point_count: number of found points on the small marker.
         rms_residual_px: RMS distance of the found edges from the drawing's.
     """
 
@@ -672,7 +684,7 @@ class PoseFit:
     rotation_translation_cov: Array
     visible_point_count: int
     found_point_count: int
-    small_marker_point_count: int
+    found_small_marker_point_count: int
     rms_residual_px: float
 
 
@@ -681,18 +693,19 @@ class _EdgePoints:
     """Edge points of an outline that are in the image.
 
     Attributes:
-        points_px, normal: points (n, 2) px, and unit normals (n, 2) from black to white.
+        points_px, image_normal_to_white: points (n, 2) px, and unit normals (n, 2) from black to
+            white.
         J: derivative (n, 7) of each point's motion along its normal with respect to rotation (rad),
             translation (half sides) and the shift of all edges (px, white over black).
         px_per_half_side: scale (n,) across the edge.
-        outline_index: index (n,) of the point in the outline.
+        outline_point_index: index (n,) of the point in the outline.
     """
 
     points_px: Array
-    normal: Array
+    image_normal_to_white: Array
     J: Array
     px_per_half_side: Array
-    outline_index: NDArray[np.intp]
+    outline_point_index: NDArray[np.intp]
 
 
 class _GaussNewtonStep(NamedTuple):
@@ -700,10 +713,10 @@ class _GaussNewtonStep(NamedTuple):
     (half sides) and edge shift (px); the inverse (7, 7) of the normal matrix, the weights (n,) of
     the points, and the variance of one point."""
 
-    pose_and_shift_change: Array
+    pose_and_edge_shift_change: Array
     inverse_normal_matrix: Array
     weight: Array
-    variance_px2: float
+    point_variance_px2: float
 
 
 def fit_pose(
@@ -715,33 +728,41 @@ def fit_pose(
 ) -> PoseFit | None:
     """Fit the pose at which the projected edges of the drawing match the edges in the image; None
     if the fit fails."""
-    pose, pose_and_shift_change_from_start, fit_step, moved_px = start, np.zeros(7), None, math.inf
-    for profile_reach_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
+    pose, pose_and_edge_shift_change_from_start, fit_step, moved_px = (
+        start,
+        np.zeros(7),
+        None,
+        math.inf,
+    )
+    for max_profile_half_length_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
         edge_points = _edge_points_in_view(
-            pose, outline, profile_reach_px, image.shape, camera, hidden_mask_u8
+            pose, outline, max_profile_half_length_px, image.shape, camera, hidden_mask_u8
         )
-        if len(edge_points.outline_index) < _MIN_EDGE_POINTS:
+        if len(edge_points.outline_point_index) < _MIN_EDGE_POINTS:
             return None
         reach_cells_px = (
             _PROFILE_REACH_CELLS
-            * outline.cell_width_half_sides[edge_points.outline_index]
+            * outline.cell_width_half_sides[edge_points.outline_point_index]
             * edge_points.px_per_half_side
         )
-        profile_half_lengths_px = np.minimum(profile_reach_px, reach_cells_px)
-        edge_offset_px, is_edge_found = _measure_offsets(
+        profile_half_lengths_px = np.minimum(max_profile_half_length_px, reach_cells_px)
+        edge_offset_to_white_px, is_edge_found = _measure_offsets(
             image, edge_points, profile_half_lengths_px
         )
         if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
             return None
         fit_step = _solve_gauss_newton_step(
-            edge_points, edge_offset_px, is_edge_found, pose_and_shift_change_from_start
+            edge_points,
+            edge_offset_to_white_px,
+            is_edge_found,
+            pose_and_edge_shift_change_from_start,
         )
         if fit_step is None:
             return None
-        step = fit_step.pose_and_shift_change[:6]
+        step = fit_step.pose_and_edge_shift_change[:6]
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
         pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_drawing_half_sides + step[3:])
-        pose_and_shift_change_from_start[:6] += step
+        pose_and_edge_shift_change_from_start[:6] += step
         moved_px = float(np.abs(edge_points.J[:, :6] @ step).max())
         if moved_px < _CONVERGED_FIT_PX:
             break
@@ -760,7 +781,7 @@ def predict_fit_accuracy(
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )
-    n = len(edge_points.outline_index)
+    n = len(edge_points.outline_point_index)
     if n < _MIN_EDGE_POINTS:
         return None
     fit_step = _solve_gauss_newton_step(
@@ -772,7 +793,7 @@ def predict_fit_accuracy(
 def _edge_points_in_view(
     pose: RigidPose,
     outline: TargetOutline,
-    profile_reach_px: float,
+    max_profile_half_length_px: float,
     shape: tuple[int, ...],
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None,
@@ -789,7 +810,7 @@ def _edge_points_in_view(
         ahead & (np.hypot(*x.T) < make_coarse_lattice(camera).valid_radius_normalised)
     )
     at = distort_to_px(x[near], camera)
-    room = profile_reach_px + 1.0
+    room = max_profile_half_length_px + 1.0
     inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
     near, at = near[inside], at[inside]
     X, x = X[near], x[near]
@@ -808,7 +829,7 @@ def _edge_points_in_view(
     P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]
     P[:, :, 2] = -x / X[:, 2:]
     A = D @ P
-    across = outline.normal[near]
+    across = outline.drawing_normal_to_white[near]
     along = np.stack([-across[:, 1], across[:, 0]], axis=1)
     tangent = np.einsum("nij,nj->ni", A, along @ pose.R_cam_drawing[:, :2].T)
     towards = np.einsum("nij,nj->ni", A, across @ pose.R_cam_drawing[:, :2].T)
@@ -821,7 +842,9 @@ def _edge_points_in_view(
     free = np.ones(len(near), dtype=np.bool_)
     if hidden_mask_u8 is not None:
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            x_px, y_px = np.rint(at + fraction * profile_reach_px * normal).astype(np.intp).T
+            x_px, y_px = (
+                np.rint(at + fraction * max_profile_half_length_px * normal).astype(np.intp).T
+            )
             free &= hidden_mask_u8[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
     return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
@@ -836,33 +859,35 @@ def _measure_offsets(
     grey = sample_profiles(
         image,
         edge_points.points_px[:, None],
-        edge_points.normal[:, None],
+        edge_points.image_normal_to_white[:, None],
         profile_half_lengths_px,
     )[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
-    u = profile_half_lengths_px[:, None] * GRADIENT_POSITIONS.astype(np.float64)
+    u = profile_half_lengths_px[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS.astype(np.float64)
     mass = gradient * np.exp(-0.5 * (u / (0.5 * profile_half_lengths_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
     least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
     is_edge_found = (contrast > least) & (total > 0.25 * least)
-    edge_offset_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
-    return np.clip(edge_offset_px, -profile_half_lengths_px, profile_half_lengths_px), is_edge_found
+    edge_offset_to_white_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
+    return np.clip(
+        edge_offset_to_white_px, -profile_half_lengths_px, profile_half_lengths_px
+    ), is_edge_found
 
 
 def _solve_gauss_newton_step(
     edge_points: _EdgePoints,
-    edge_offset_px: Array,
+    edge_offset_to_white_px: Array,
     is_edge_found: NDArray[np.bool_],
-    pose_and_shift_change_from_start: Array,
+    pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one robust Gauss-Newton step; None if too few edges were found. `edge_offset_px` (n,)
-    is the result of `_measure_offsets`. A prior pulls `pose_and_shift_change_from_start` (7,), the
-    sum of the previous steps, towards zero."""
+    """Return one robust Gauss-Newton step; None if too few edges were found.
+    `edge_offset_to_white_px` (n,) is the result of `_measure_offsets`. A prior pulls
+    `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps, towards zero."""
     J, weight = edge_points.J, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
-        error = edge_offset_px - J @ step
+        error = edge_offset_to_white_px - J @ step
         size = np.abs(error)
         scale = max(1.4826 * float(np.median(size[is_edge_found])), _MIN_TUKEY_SCALE_PX)
         weight = (
@@ -875,8 +900,8 @@ def _solve_gauss_newton_step(
         N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (
-            J.T @ (weight * edge_offset_px) / variance
-            - _PREDICTION_INFORMATION * pose_and_shift_change_from_start
+            J.T @ (weight * edge_offset_to_white_px) / variance
+            - _PREDICTION_INFORMATION * pose_and_edge_shift_change_from_start
         )
     return _GaussNewtonStep(step, inverse, weight, variance)
 
@@ -885,10 +910,11 @@ def _make_pose_fit(
     pose: RigidPose, fit_step: _GaussNewtonStep, edge_points: _EdgePoints, outline: TargetOutline
 ) -> PoseFit:
     J, (_, inverse, w, variance) = edge_points.J, fit_step
-    line = outline.line_index[edge_points.outline_index]
+    line = outline.line_index[edge_points.outline_point_index]
     common_px = np.hypot(
-        outline.print_sigma_half_sides[edge_points.outline_index] * edge_points.px_per_half_side,
-        _LINE_SIGMA_PX,
+        outline.print_sigma_half_sides[edge_points.outline_point_index]
+        * edge_points.px_per_half_side,
+        _WHOLE_LINE_OFFSET_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
@@ -900,8 +926,8 @@ def _make_pose_fit(
         rotation_translation_cov=cov[:6, :6],
         visible_point_count=len(shown),
         found_point_count=int(np.count_nonzero(shown)),
-        small_marker_point_count=int(
-            np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_index])
+        found_small_marker_point_count=int(
+            np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_point_index])
         ),
         rms_residual_px=math.sqrt(variance),
     )

@@ -34,7 +34,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
 )
 from perchctl.vision.markers.cut import (
-    MAX_TRUNCATED_FIT_AGE_S,
+    MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S,
     can_complete_marker_be_in_view,
     fit_truncated_markers,
     is_target_truncated,
@@ -94,8 +94,9 @@ class DetectionPrior:
         search_mode: the kinds of search for this frame.
         initial_blur_frame_counter: frame counter; its parity selects a small or a large initial
             blur for the fits to blurred markers (see `find_expected_blurred`).
-        was_target_seen_recently: a marker was found at most `MAX_TRUNCATED_FIT_AGE_S` before this
-            frame; always False if edge fits are disabled.
+        was_target_seen_recently: a marker was found at most
+            `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
+            are disabled.
         was_target_truncated: `was_target_seen_recently` is True, and every marker was truncated or
             hidden in the last image with a detection.
         previous_edge_shift: how far white has grown over black (blooming), measured in a recent
@@ -130,18 +131,18 @@ class CornerMethod:
 
     Attributes:
         name: heading in ``docs/corners.md``.
-        requirements: what the method needs, in words.
+        requirements_text: what the method needs, in words.
         cost_text: typical time for an image of 640x480 on one core.
-        condition: when the method runs, in words (`should_run`).
+        run_condition_text: when the method runs, in words (`should_run`).
         should_run: function that returns True if the method should be tried on the image, given
             the prior and the findings so far.
         find: function that returns the findings that replace the previous ones.
     """
 
     name: str
-    requirements: str
+    requirements_text: str
     cost_text: str
-    condition: str
+    run_condition_text: str
     should_run: Callable[[DetectorInput, DetectionPrior, CornerResults], bool]
     find: Callable[[DetectorInput, DetectionPrior, CornerResults], CornerResults]
 
@@ -296,61 +297,62 @@ def _search_blurred(
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
-        requirements="an expected marker, whole, with cells of 2.5 px and straight sides",
+        requirements_text="an expected marker, whole, with cells of 2.5 px and straight sides",
         cost_text="0.7 ms",
-        condition="the target is expected; after a loss, in three of four images",
+        run_condition_text="the target is expected; after a loss, in three of four images",
         should_run=_is_target_expected,
         find=_fit_edges,
     ),
     CornerMethod(
         name="Half-size search",
-        requirements="both markers expected, those in view with sides above 60 px",
+        requirements_text="both markers expected, those in view with sides above 60 px",
         cost_text="5 ms, with the measurement of what it finds",
-        condition="the edge fit was tried and found no marker",
+        run_condition_text="the edge fit was tried and found no marker",
         should_run=_has_edge_fit_found_nothing,
         find=_search_half_size,
     ),
     CornerMethod(
         name="Partial-view fit",
-        requirements="an expected marker with cells of 4 px, 60 % of its cells and four of its "
-        "edges",
+        requirements_text="an expected marker with cells of 4 px, 60 % of its cells and four of "
+        "its edges",
         cost_text="3 ms for each marker",
-        condition="the edge fit was tried, and a marker is missing; "
+        run_condition_text="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
         should_run=_has_half_size_search_found_nothing,
         find=_fit_visible_part,
     ),
     CornerMethod(
         name="Photometric fit",
-        requirements="a whole marker with sides of 7 px, and corners to within 0.3 sides",
+        requirements_text="a whole marker with sides of 7 px, and corners to within 0.3 sides",
         cost_text="1.3 ms for each marker",
-        condition="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
-        "than 6 px or than six times the blur; not if the half-size search found one",
+        run_condition_text="the edge fit was tried, and no marker's edges suffice: its cells are "
+        "smaller than 6 px or than six times the blur; not if the half-size search found one",
         should_run=_needs_photometric_fit,
         find=_fit_drawing,
     ),
     CornerMethod(
         name="Cut-view fit",
-        requirements="a measurement at most 0.5 s old, and small-marker cells of 8 px",
+        requirements_text="a measurement at most 0.5 s old, and small-marker cells of 8 px",
         cost_text="7 ms",
-        condition="nothing was found, and each expected marker may be cut by the image or hidden",
+        run_condition_text="nothing was found, and each expected marker may be cut by the image "
+        "or hidden",
         should_run=_can_be_truncated,
         find=_fit_truncated_target,
     ),
     CornerMethod(
         name="Search",
-        requirements="a marker whose bits can be read",
+        requirements_text="a marker whose bits can be read",
         cost_text="4 to 9 ms, with the measurement of what it finds",
-        condition="nothing was found, unless the target was cut and still is; or an expected "
-        "marker with sides above 13 px is missing; after a loss, in three of four images",
+        run_condition_text="nothing was found, unless the target was cut and still is; or an "
+        "expected marker with sides above 13 px is missing; after a loss, in three of four images",
         should_run=_should_search,
         find=_search,
     ),
     CornerMethod(
         name="Blurred search",
-        requirements="a whole marker with sides of 7 px that resembles its drawing",
+        requirements_text="a whole marker with sides of 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
-        condition="nothing was found; after a loss, in one of four images",
+        run_condition_text="nothing was found; after a loss, in one of four images",
         should_run=_can_be_blurred,
         find=_search_blurred,
     ),
@@ -426,7 +428,10 @@ def make_detection_prior(
         initial_blur_frame_counter = (frames_without_markers + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
-    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_TRUNCATED_FIT_AGE_S
+    was_recent = (
+        previous is not None
+        and 0.0 < frame.t_s - previous.t_s <= MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S
+    )
     was_recent = was_recent and setup.is_line_fit_enabled and bool(last)
     previous_edge_shift = None if previous is None else previous.edge_shift
     if previous_edge_shift is not None:
@@ -454,11 +459,11 @@ def make_detection_prior(
 def _detect(
     frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: DetectionPrior
 ) -> Detections:
-    hidden_mask = make_hidden_mask(frame, setup.hidden_mask)
+    hidden_mask = make_hidden_mask(frame, setup.static_hidden_mask)
     image = frame.image if hidden_mask is None else fill_hidden_pixels(frame.image, hidden_mask)
     found = find_corners(DetectorInput(image, hidden_mask, setup, camera), prior)
     found_corners = found.corners
-    shifts = (r.corrected_edge_shift for r in found_corners.values())
+    shifts = (r.removed_edge_shift for r in found_corners.values())
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
@@ -517,7 +522,7 @@ def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) ->
     lines = fit_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
     found_corners = {
         name: lines.get(name)
-        or refine_subpix(image, corners, setup.patterns[name].border_cells.cells_per_side)
+        or refine_subpix(image, corners, setup.patterns[name].cells_along_border.cells_per_side)
         for name, corners in raw.items()
     }
     if not setup.is_line_fit_enabled:
@@ -568,7 +573,7 @@ def _make_detection(
         r.remaining_edge_shift_sigma_px,
         cov_px2=r.cov_px2,
         row_jitter_sigma_px=r.row_jitter_sigma_px,
-        horizontal_side_extra_sigma_px=interpolated_edge_sigma_px(r.sharpest_side_blur_px)
+        horizontal_side_extra_sigma_px=interpolated_edge_sigma_px(r.sharpest_side_blur_sigma_px)
         if interpolated
         else 0.0,
     )
@@ -621,7 +626,7 @@ _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
 _MAX_ALIGN_MOTION_SIDES = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
 _MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12  # share of the side
-_DEFAULT_BLUR_PX = 1.5  # initial guess if the blur is unknown
+_DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5  # initial guess if the blur is unknown
 _SAMPLING_BLUR_SIGMA_PX = 0.37
 """Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
 drawing, px."""
@@ -631,9 +636,10 @@ _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large
 def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
     """True if the corners come from an edge fit that is as accurate as a photometric fit: with
     cells of at least 6 px and 6 times the blur."""
-    cell_size_px = mean_side_px(corners.corners_px) / pattern.border_cells.cells_per_side
+    cell_size_px = mean_side_px(corners.corners_px) / pattern.cells_along_border.cells_per_side
     return corners.are_corners_fitted and cell_size_px >= max(
-        _MIN_ACCURATE_LINE_FIT_CELL_PX, _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO * corners.blur_px
+        _MIN_ACCURATE_LINE_FIT_CELL_PX,
+        _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO * corners.blurriest_side_blur_sigma_px,
     )
 
 
@@ -667,7 +673,7 @@ def refine_photometrically(
         max_corner_sigma_sides = (
             _MAX_SINGLE_MARKER_SIGMA_SIDES if is_single else _MAX_SECOND_MARKER_SIGMA_SIDES
         )
-        blur_px = _blur_px(better.get(name))
+        blur_px = _initial_blur_sigma_px(better.get(name))
         exact = align_marker(
             detector_input,
             name,
@@ -686,14 +692,19 @@ def refine_photometrically(
     return better
 
 
-def _blur_px(corners: RefinedCorners | None) -> float:
+def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     """Return the initial blur, px (standard deviation), for a photometric fit: the blur of the
-    sides if lines were fitted to them, otherwise `_DEFAULT_BLUR_PX`, which is also the upper
-    limit."""
-    if corners is None or not corners.are_corners_fitted or corners.blur_px <= 0.0:
-        return _DEFAULT_BLUR_PX
+    sides if lines were fitted to them, otherwise `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also
+    the upper limit."""
+    if (
+        corners is None
+        or not corners.are_corners_fitted
+        or corners.blurriest_side_blur_sigma_px <= 0.0
+    ):
+        return _DEFAULT_INITIAL_BLUR_SIGMA_PX
     return min(
-        math.sqrt(max(corners.blur_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX
+        math.sqrt(max(corners.blurriest_side_blur_sigma_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)),
+        _DEFAULT_INITIAL_BLUR_SIGMA_PX,
     )
 
 
@@ -717,7 +728,7 @@ def _initial_corners_px(
 
 
 _MIN_LINE_FIT_CELL_PX = 2.5  # least cell size for line fits
-_MAX_CENTRE_OFFSET_SIDES = 0.12  # share of the small marker's side
+_MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES = 0.12  # share of the small marker's side
 
 
 def fit_lines(
@@ -734,7 +745,7 @@ def fit_lines(
     """
     if not start_corners_px:
         return {}
-    rims = [detector_input.setup.patterns[name].border_cells for name in start_corners_px]
+    rims = [detector_input.setup.patterns[name].cells_along_border for name in start_corners_px]
     raw = np.array(list(start_corners_px.values()))
     fitted = refine_corners_by_lines(
         detector_input.image, raw, rims, detector_input.camera, known_edge_shift
@@ -765,7 +776,7 @@ def refine_expected_markers(
         if name in expected_corners_px
         and is_inside_image(expected_corners_px[name], image.shape, IMAGE_MARGIN_PX)
         and side_lengths_px(expected_corners_px[name]).min()
-        > _MIN_LINE_FIT_CELL_PX * patterns[name].border_cells.cells_per_side
+        > _MIN_LINE_FIT_CELL_PX * patterns[name].cells_along_border.cells_per_side
     }
     return {
         name: found
@@ -827,7 +838,9 @@ def find_large_marker_around_small(
     def is_centred(large: RefinedCorners) -> bool:
         centre = detector_input.derive_corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
-        return off_px <= max(_MAX_CENTRE_OFFSET_SIDES * mean_side_px(small.corners_px), 1.0)
+        return off_px <= max(
+            _MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES * mean_side_px(small.corners_px), 1.0
+        )
 
     if is_inside_image(start, image.shape, IMAGE_MARGIN_PX):
         # The small marker only gives an approximate position, so the fit is repeated from its first

@@ -19,7 +19,7 @@ from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_d
 from perchctl.vision.markers.corners import scale_square
 from perchctl.vision.markers.pattern import (
     MarkerPattern,
-    make_border_cells,
+    make_cells_along_border,
     make_marker_drawing,
     make_marker_pattern,
 )
@@ -54,14 +54,14 @@ class DetectorSetup:
         small_to_large_side_ratio: side of the small marker over that of the large one.
         is_line_fit_enabled: if False, markers are only detected by OpenCV and refined by
             `refine_subpix`, without edge fits and photometric fits.
-        hidden_mask: True for pixels that the vehicle covers, (h, w).
+        static_hidden_mask: True for pixels that the vehicle covers, (h, w).
     """
 
     large_and_small_aruco_dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, MarkerPattern]
     small_to_large_side_ratio: float
     is_line_fit_enabled: bool
-    hidden_mask: HiddenMask | None = None
+    static_hidden_mask: HiddenMask | None = None
 
 
 def make_detector_setup(
@@ -78,13 +78,13 @@ def make_detector_setup(
         ),
         patterns={
             "large": make_marker_pattern(
-                make_border_cells(
+                make_cells_along_border(
                     large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
                 ),
                 make_marker_drawing(large_bits, small_bits, small_to_large_side_ratio),
             ),
             "small": make_marker_pattern(
-                make_border_cells(
+                make_cells_along_border(
                     small_bits, _PRINT_EDGE_SIGMA_M * (len(small_bits) + 2) / target.small.side_m
                 ),
                 make_marker_drawing(small_bits),
@@ -92,7 +92,7 @@ def make_detector_setup(
         },
         small_to_large_side_ratio=small_to_large_side_ratio,
         is_line_fit_enabled=config.refinement == "line",
-        hidden_mask=static_hidden_mask,
+        static_hidden_mask=static_hidden_mask,
     )
 
 
@@ -151,7 +151,7 @@ HiddenMask = NDArray[np.bool_]
 WHITE_BORDER_REACH_HALF_SIDES = 1.25
 """Half sides from a marker's centre within which any object disturbs the measurement of its
 sides."""
-_MASK_SPREAD_ROWS = 7  # rows of a field's image to which a covered row contributes
+_HIDDEN_MASK_DILATION_ROWS = 7  # rows of a field's image to which a covered row contributes
 # reduction factor, and standard deviation of the fill in the reduced image
 _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
 _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
@@ -163,7 +163,9 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
-        cv2.dilate(static_hidden_mask.astype(np.uint8), np.ones((_MASK_SPREAD_ROWS, 1), np.uint8))
+        cv2.dilate(
+            static_hidden_mask.astype(np.uint8), np.ones((_HIDDEN_MASK_DILATION_ROWS, 1), np.uint8)
+        )
         > 0
     )
 

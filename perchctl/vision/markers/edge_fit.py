@@ -52,7 +52,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.pattern import BorderCells
+from perchctl.vision.markers.pattern import CellsAlongBorder
 from perchctl.vision.types import CameraModel, EdgeShift
 
 # --- Grey profiles across the sides of markers ---
@@ -64,10 +64,16 @@ Floats = NDArray[np.float32]
 
 # positions along a side, between its margins
 SIDE_POSITIONS: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
-_PROFILE_OFFSETS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(np.float32)
-_PROFILE_BASIS: Floats = np.stack([np.ones_like(_PROFILE_OFFSETS), _PROFILE_OFFSETS])
+_SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(
+    np.float32
+)
+_PROFILE_BASIS: Floats = np.stack(
+    [np.ones_like(_SAMPLE_POSITIONS_HALF_LENGTHS), _SAMPLE_POSITIONS_HALF_LENGTHS]
+)
 # positions of the gradients
-GRADIENT_POSITIONS: Floats = (_PROFILE_OFFSETS[1:] + _PROFILE_OFFSETS[:-1]) * np.float32(0.5)
+GRADIENT_POSITIONS_HALF_LENGTHS: Floats = (
+    _SAMPLE_POSITIONS_HALF_LENGTHS[1:] + _SAMPLE_POSITIONS_HALF_LENGTHS[:-1]
+) * np.float32(0.5)
 # Values and slopes at the profiles from a polynomial through the nodes.
 _SIDE_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE_VANDERMONDE: Array = np.linalg.inv(_SIDE_NODES[:, None] ** np.arange(5.0))
@@ -80,7 +86,7 @@ _NODES_TO_SLOPES: Array = (
 _ROTATE_90_LEFT = np.array(-1j)
 
 
-def profile_positions(lengths_px: Array) -> Array:
+def profile_fractions_along_side(lengths_px: Array) -> Array:
     """Return the positions (rows, n), as fractions of each side, at which profiles (short scan
     lines across the edge) cross the sides with lengths `lengths_px` (rows,). The profiles keep a
     margin from the corners, where the next side blurs the edge."""
@@ -91,7 +97,7 @@ def profile_positions(lengths_px: Array) -> Array:
 def make_side_profiles(
     side_starts_normalised: Array,
     side_ends_normalised: Array,
-    positions_along_side: Array,
+    fractions_along_side: Array,
     camera: CameraModel,
 ) -> tuple[Array, Array]:
     """Return the points, px, at which the profiles cross the sides, and the unit normals at these
@@ -99,9 +105,9 @@ def make_side_profiles(
     image, which is outwards for a marker with clockwise corners.
 
     `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the normalised ends of the sides;
-    `positions_along_side` (rows, n) come from `profile_positions`. The image of a side through the
-    lens is a smooth curve, so it is computed at five points and interpolated."""
-    first, last = positions_along_side[:, :1], positions_along_side[:, -1:]
+    `fractions_along_side` (rows, n) come from `profile_fractions_along_side`. The image of a side
+    through the lens is a smooth curve, so it is computed at five points and interpolated."""
+    first, last = fractions_along_side[:, :1], fractions_along_side[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
     points = (
         side_starts_normalised[:, None]
@@ -116,11 +122,14 @@ def make_side_profiles(
 
 
 def sample_profiles(
-    image: NDArray[np.uint8], origin: Array, normal: Array, profile_half_length_px: Array
+    image: NDArray[np.uint8],
+    profile_centre_px: Array,
+    profile_direction: Array,
+    profile_half_length_px: Array,
 ) -> Floats:
     """Return the grey values along the profiles, (rows, n, steps + 1), from -profile_half_length_px
-    to +profile_half_length_px (rows,) about `origin` along `normal`: interpolated bilinearly.
-    Outside the image, the border pixels are repeated.
+    to +profile_half_length_px (rows,) about `profile_centre_px` along `profile_direction`:
+    interpolated bilinearly. Outside the image, the border pixels are repeated.
 
     The image is converted to float because OpenCV 5 interpolates float images at the exact
     position. For 8-bit images, OpenCV rounds positions to 1/32 px, which would be as large as the
@@ -128,21 +137,27 @@ def sample_profiles(
     """
     h, w = image.shape
     reach = float(profile_half_length_px.max()) + 2.0
-    flat = origin.reshape(-1, 2)
+    flat = profile_centre_px.reshape(-1, 2)
     (x0, y0), (x1, y1) = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
     left, top = min(max(int(x0 - reach), 0), w - 2), min(max(int(y0 - reach), 0), h - 2)
     right, bottom = min(int(x1 + reach) + 1, w), min(int(y1 + reach) + 1, h)
     right, bottom = max(right, left + 2), max(bottom, top + 2)
     patch = image[top:bottom, left:right].astype(np.float32)
-    rows, n = origin.shape[:2]
+    rows, n = profile_centre_px.shape[:2]
     lines = np.empty((2, rows, n, 2), dtype=np.float32)  # x and y: origin, and direction
-    np.subtract(origin[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
-    np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
+    np.subtract(profile_centre_px[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
+    np.subtract(profile_centre_px[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
     np.multiply(
-        normal[..., 0], profile_half_length_px[:, None], out=lines[0, ..., 1], casting="same_kind"
+        profile_direction[..., 0],
+        profile_half_length_px[:, None],
+        out=lines[0, ..., 1],
+        casting="same_kind",
     )
     np.multiply(
-        normal[..., 1], profile_half_length_px[:, None], out=lines[1, ..., 1], casting="same_kind"
+        profile_direction[..., 1],
+        profile_half_length_px[:, None],
+        out=lines[1, ..., 1],
+        casting="same_kind",
     )
     x, y = (lines.reshape(-1, 2) @ _PROFILE_BASIS).reshape(2, rows, n * (SAMPLES_PER_PROFILE + 1))
     profile_greys = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -170,11 +185,11 @@ MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
 # a wide edge that is off centre extends beyond its profile
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # of 7 px: an edge 6 px off the centre extended beyond the profile and moved by up to 0.3 px
-_MAX_EDGE_OFFSET_PX = 4.0
+_MAX_EDGE_OFFSET_WITHOUT_REFIT_PX = 4.0
 _MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = (
     2.0  # ratio of variances of the sides that shows jittering rows
 )
-_MIN_SIDE_SLANT_VARIANCE = 0.05  # of the sides' orientations (0 to 1), to separate them
+_MIN_SIDE_ORIENTATION_VARIANCE = 0.05  # of the sides' orientations (0 to 1), to separate them
 _MIN_FLANK_CONTRAST_GREY = 6.0  # grey levels between the flanks
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
@@ -194,42 +209,44 @@ _MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
 def refine_corners_by_lines(
     image: NDArray[np.uint8],
     raw_corners_px: Array,
-    border_cells: Sequence[BorderCells],
+    cells_along_border: Sequence[CellsAlongBorder],
     camera: CameraModel,
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers with corners (m, 4, 2) px and intersect them to get
     refined corners. The entry of a marker is None if not all four sides were found.
 
-    `border_cells` are the cells inside each marker's border. The common shift of all edges is
+    `cells_along_border` are the cells inside each marker's border. The common shift of all edges is
     measured unless the caller passes `known_edge_shift`. If a marker's edges are wide or near the
     ends of the profiles, the fit is repeated with the profiles centred on the edges.
     """
-    found = _refine_lines_once(image, raw_corners_px, border_cells, camera, known_edge_shift)
+    found = _refine_lines_once(image, raw_corners_px, cells_along_border, camera, known_edge_shift)
     centred = raw_corners_px.copy()
     for i, each in enumerate(found):
         if each is None:
             continue
         off_px = float(np.abs(each.corners_px - raw_corners_px[i]).max())
         if off_px > (
-            _MAX_WIDE_EDGE_OFFSET_PX if each.blur_px > _MIN_WIDE_BLUR_PX else _MAX_EDGE_OFFSET_PX
+            _MAX_WIDE_EDGE_OFFSET_PX
+            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_BLUR_PX
+            else _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX
         ):
             centred[i] = each.corners_px
     if (centred == raw_corners_px).all():
         return found
-    again = _refine_lines_once(image, centred, border_cells, camera, known_edge_shift)
+    again = _refine_lines_once(image, centred, cells_along_border, camera, known_edge_shift)
     return [second or first for first, second in zip(found, again, strict=True)]
 
 
 def _refine_lines_once(
     image: NDArray[np.uint8],
     raw_corners_px: Array,
-    border_cells: Sequence[BorderCells],
+    cells_along_border: Sequence[CellsAlongBorder],
     camera: CameraModel,
     known_edge_shift: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
     found: list[RefinedCorners | None] = [None] * len(raw_corners_px)
-    markers = prepare_marker_sides(raw_corners_px, border_cells, camera)
+    markers = prepare_marker_sides(raw_corners_px, cells_along_border, camera)
     if markers is None:
         return found
     outer_edges, inner_edges = measure_edges(
@@ -242,25 +259,25 @@ def _refine_lines_once(
     is_white_clipped = glaring.reshape(-1, 4) @ _WEIGHTS_OF_MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light.
-        return _refine_lines_once(image, raw_corners_px, border_cells, camera, None)
-    line_coefficients, rms_residual_px = _fit_lines(markers, outer_edges)
+        return _refine_lines_once(image, raw_corners_px, cells_along_border, camera, None)
+    line_nx_ny_c, rms_residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
     if shift is None:
-        corners = _intersect_adjacent_sides(line_coefficients)
+        corners = _intersect_adjacent_sides(line_nx_ny_c)
         if not is_finite(corners):
             return found
         shift = _measure_edge_shift(
-            markers, outer_edges, inner_edges, line_coefficients, rms_residual_px, corners
+            markers, outer_edges, inner_edges, line_nx_ny_c, rms_residual_px, corners
         )
     applied = shift or EdgeShift(
         0.0, edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean()))
     )
     if applied.white_growth_px != 0.0:
-        line_coefficients = line_coefficients.copy()
-        line_coefficients[:, 2] += _outward_signs(markers, line_coefficients) * (
+        line_nx_ny_c = line_nx_ny_c.copy()
+        line_nx_ny_c[:, 2] += _line_normal_outward_signs(markers, line_nx_ny_c) * (
             applied.white_growth_px / markers.px_per_normalised
         )
-    corners = _intersect_adjacent_sides(line_coefficients)
+    corners = _intersect_adjacent_sides(line_nx_ny_c)
     if not is_finite(corners):
         return found
     corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
@@ -272,8 +289,8 @@ def _refine_lines_once(
     line_end_variances_px2 = (
         4.0 * _ROBUST_LINE_VARIANCE_FACTOR * rms_residual_px * rms_residual_px / independent
     ).tolist()
-    blurs_px, side_normals_x = outer_edges.blur_px.tolist(), line_coefficients[:, 0].tolist()
-    for i, rim in enumerate(border_cells):
+    blurs_px, side_normals_x = outer_edges.blur_sigma_px.tolist(), line_nx_ny_c[:, 0].tolist()
+    for i, rim in enumerate(cells_along_border):
         if not accepted[i]:
             continue
         four = slice(4 * i, 4 * i + 4)
@@ -290,10 +307,10 @@ def _refine_lines_once(
             ),
             are_corners_fitted=True,
             remaining_edge_shift_sigma_px=applied.sigma_px,
-            blur_px=max(blurs),
-            corrected_edge_shift=shift,
+            blurriest_side_blur_sigma_px=max(blurs),
+            removed_edge_shift=shift,
             row_jitter_sigma_px=_row_jitter_sigma_px(side_normals_x[four], ends),
-            sharpest_side_blur_px=min(blurs),
+            sharpest_side_blur_sigma_px=min(blurs),
         )
     return found
 
@@ -314,19 +331,19 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
-    line_coefficients = np.empty((len(w), 3))
-    line_coefficients[:, 0], line_coefficients[:, 1], line_coefficients[:, 2] = (
+    line_nx_ny_c = np.empty((len(w), 3))
+    line_nx_ny_c[:, 0], line_nx_ny_c[:, 1], line_nx_ny_c[:, 2] = (
         nx,
         ny,
         nx * cx + ny * cy,
     )
-    return line_coefficients, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
+    return line_nx_ny_c, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
 
 
-def _intersect_adjacent_sides(line_coefficients: Array) -> Array:
+def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
     """Return the intersections of side i - 1 and side i of each marker, (m, 4, 2), normalised.
-    `line_coefficients` (4m, 3) as from `_fit_lines`."""
-    sides = line_coefficients.reshape(-1, 4, 3)
+    `line_nx_ny_c` (4m, 3) as from `_fit_lines`."""
+    sides = line_nx_ny_c.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
     bx, by, bc = sides[..., 0], sides[..., 1], sides[..., 2]
@@ -352,7 +369,7 @@ def _measure_edge_shift(
     markers: MarkerSides,
     outer_edges: EdgeData,
     inner_edges: EdgeData | None,
-    line_coefficients: Array,
+    line_nx_ny_c: Array,
     rms_residual_px: Array,
     corners_normalised: Array,
 ) -> EdgeShift | None:
@@ -371,7 +388,7 @@ def _measure_edge_shift(
         edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean())),
     )
     rim, depth_px, cell_size_px = (
-        markers.border_cells[k],
+        markers.cells_along_border[k],
         markers.cell_width_across_side_px[k],
         float(markers.cell_size_px[k]),
     )
@@ -381,7 +398,7 @@ def _measure_edge_shift(
     )
     far = np.matmul(own, SIDE_OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
-    w = inner_edges.weight * (inner_edges.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
+    w = inner_edges.weight * (inner_edges.blur_sigma_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
     w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
     mass = w.sum(axis=1)
     some = mass > _MIN_SIDE_WEIGHT_SUM
@@ -392,7 +409,7 @@ def _measure_edge_shift(
         8.0
         * r
         / (3.0 * rim.cells_per_side)
-        * _side_bow_px(markers, outer_edges, line_coefficients, rms_residual_px)
+        * _side_bow_px(markers, outer_edges, line_nx_ny_c, rms_residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -417,16 +434,18 @@ def _measure_edge_shift(
 
 
 def _side_bow_px(
-    markers: MarkerSides, outer_edges: EdgeData, line_coefficients: Array, rms_residual_px: Array
+    markers: MarkerSides, outer_edges: EdgeData, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
     """Return the bow of the widest marker's sides, px: by how much their ends are further out than
     their middles. 0 if it is not significant."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = (
-        np.matmul(outer_edges.points_normalised[four], line_coefficients[four, :2, None])[..., 0]
-        - line_coefficients[four, 2:]
+        np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
+        - line_nx_ny_c[four, 2:]
     )
-    scale = _outward_signs(markers, line_coefficients)[four] * markers.px_per_normalised[four]
+    scale = (
+        _line_normal_outward_signs(markers, line_nx_ny_c)[four] * markers.px_per_normalised[four]
+    )
     mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
     bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
     mean_px = float(bow_px @ _WEIGHTS_OF_MEAN_OF_FOUR)
@@ -434,13 +453,11 @@ def _side_bow_px(
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
 
-def _outward_signs(markers: MarkerSides, line_coefficients: Array) -> Array:
+def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners_normalised
     out = (corners - (_WEIGHTS_OF_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
-    return np.asarray(
-        np.sign(line_coefficients[:, 0] * out[:, 0] + line_coefficients[:, 1] * out[:, 1])
-    )
+    return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
 
 
 def _are_sides_accepted(
@@ -455,7 +472,7 @@ def _are_sides_accepted(
         inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE
     )
     lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
-        outer_edges.blur_px < 0.9 * outer_edges.window_half_length_px
+        outer_edges.blur_sigma_px < 0.9 * outer_edges.window_half_length_px
     )
     displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
@@ -465,19 +482,19 @@ def _are_sides_accepted(
 
 def _corner_sigma_px(
     cell_size_px: float,
-    blur_px: float,
+    blur_sigma_px: float,
     line_end_variance_px2: float,
     is_white_clipped: bool,
     print_tolerance_cells: float,
 ) -> float:
-    blur_px = max(blur_px, 1e-3)
+    blur_sigma_px = max(blur_sigma_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = (
         _NEIGHBOUR_BEND
-        * blur_px
-        * math.exp(-cell_size_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
+        * blur_sigma_px
+        * math.exp(-cell_size_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_sigma_px))
     )
-    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_px**3
+    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_sigma_px**3
     clipped_px = CLIPPED_CORNER_SIGMA_PX if is_white_clipped else 0.0
     # Printed edges deviate from their nominal positions.
     print_px = print_tolerance_cells * cell_size_px
@@ -497,7 +514,7 @@ def _row_jitter_sigma_px(
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
-    if aspect <= _MIN_SIDE_SLANT_VARIANCE:
+    if aspect <= _MIN_SIDE_ORIENTATION_VARIANCE:
         return 0.0
     both = zip(line_end_variances_px2, upright, strict=True)
     slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
@@ -523,7 +540,7 @@ class MarkerSides:
 
     Attributes:
         raw_corners_px: corners (m, 4, 2) in the image.
-        border_cells: the cells inside each marker's border.
+        cells_along_border: the cells inside each marker's border.
         corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
         side_lengths_px: lengths (m, 4).
         cell_width_across_side_px: width (m, 4) of the border across each side.
@@ -534,7 +551,7 @@ class MarkerSides:
     """
 
     raw_corners_px: Array
-    border_cells: Sequence[BorderCells]
+    cells_along_border: Sequence[CellsAlongBorder]
     corners_normalised: Array
     side_lengths_px: Array
     cell_width_across_side_px: Array
@@ -553,23 +570,23 @@ class EdgeData:
         window_half_length_px: half length of the window around the edge, (rows,).
         points_normalised: edge points in normalised image coordinates, (rows, n, 2).
         weight: weight of each point, 0 for outliers, (rows, n).
-        blur_px: standard deviation of the blur, (rows,).
+        blur_sigma_px: standard deviation of the blur, (rows,).
     """
 
     profile_greys: Floats
     window_half_length_px: Array
     points_normalised: Array
     weight: Array
-    blur_px: Array
+    blur_sigma_px: Array
 
 
 def prepare_marker_sides(
-    raw_corners_px: Array, border_cells: Sequence[BorderCells], camera: CameraModel
+    raw_corners_px: Array, cells_along_border: Sequence[CellsAlongBorder], camera: CameraModel
 ) -> MarkerSides | None:
     """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
     quadrilateral."""
     sides_px = side_lengths_px(raw_corners_px)
-    cells = np.array([rim.cells_per_side for rim in border_cells], dtype=np.float64)
+    cells = np.array([rim.cells_per_side for rim in cells_along_border], dtype=np.float64)
     corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
         raw_corners_px.shape
     )
@@ -582,7 +599,7 @@ def prepare_marker_sides(
     cell_size_px = sides_px @ _WEIGHTS_OF_MEAN_OF_FOUR / cells
     return MarkerSides(
         raw_corners_px=raw_corners_px,
-        border_cells=border_cells,
+        cells_along_border=cells_along_border,
         corners_normalised=corners,
         side_lengths_px=sides_px,
         # The inner row is one cell further in, along the neighbouring sides.
@@ -607,7 +624,7 @@ def measure_edges(
     )
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest_marker_index
-    rim = markers.border_cells[widest]
+    rim = markers.cells_along_border[widest]
     with_inner_edges = (
         with_inner_edges and float(markers.cell_size_px[widest]) > _MIN_EDGE_SHIFT_CELL_PX
     )
@@ -624,7 +641,7 @@ def measure_edges(
     sign = markers.winding_sign[of]
     if with_inner_edges:
         sign[-4:] *= -1.0
-    s = profile_positions(lengths_px.ravel())
+    s = profile_fractions_along_side(lengths_px.ravel())
     ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
@@ -632,7 +649,7 @@ def measure_edges(
         each[of] for each in window_and_profile_half_lengths_px(markers.cell_size_px)
     )
     profile_greys = sample_profiles(image, origin, normal, profile_half_length_px)
-    around = find_neighbour_edges(s, markers.border_cells, rim, depth_px.ravel())
+    around = find_neighbour_edges(s, markers.cells_along_border, rim, depth_px.ravel())
     offset_px, weight, blur_px = locate_edges(
         profile_greys, profile_half_length_px, window_half_length_px, around
     )
@@ -663,45 +680,45 @@ def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Arra
 
 
 def find_neighbour_edges(
-    positions_along_side: Array,
-    border_cells: Sequence[BorderCells],
-    inner_border_cells: BorderCells,
+    fractions_along_side: Array,
+    cells_along_border: Sequence[CellsAlongBorder],
+    cells_along_inner_edges: CellsAlongBorder,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
     """Return which parallel edges, one cell further in or out, blur into the measured edges.
-    `positions_along_side` (rows, n) are fractions of a side.
+    `fractions_along_side` (rows, n) are fractions of a side.
 
-    The rows are the four outer edges of each marker in `border_cells`, then, if there are four
-    more, the inner edges of the border of the marker with `inner_border_cells`.
+    The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
+    four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
     """
     inner_neighbour_count, outer_neighbour_count = (
-        np.zeros(positions_along_side.shape, np.float32),
-        np.zeros(positions_along_side.shape, np.float32),
+        np.zeros(fractions_along_side.shape, np.float32),
+        np.zeros(fractions_along_side.shape, np.float32),
     )
-    can_be_located = np.ones(positions_along_side.shape, np.bool_)
-    for i, rim in enumerate(border_cells):
+    is_edge_locatable = np.ones(fractions_along_side.shape, np.bool_)
+    for i, rim in enumerate(cells_along_border):
         four = slice(4 * i, 4 * i + 4)
-        inner_neighbour_count[four] = rim.is_cell_inside_border_white[
-            _SIDE_INDICES, (positions_along_side[four] * rim.cells_per_side).astype(np.intp)
+        inner_neighbour_count[four] = rim.is_first_inner_cell_white[
+            _SIDE_INDICES, (fractions_along_side[four] * rim.cells_per_side).astype(np.intp)
         ]
-    if len(positions_along_side) > 4 * len(border_cells):
-        at = 1.0 + positions_along_side[-4:] * (
-            inner_border_cells.cells_per_side - 2
+    if len(fractions_along_side) > 4 * len(cells_along_border):
+        at = 1.0 + fractions_along_side[-4:] * (
+            cells_along_inner_edges.cells_per_side - 2
         )  # in cells from the border's corner
         # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
-        free = inner_border_cells.are_two_cells_inside_border_white[
+        free = cells_along_inner_edges.are_first_two_inner_cells_white[
             _SIDE_INDICES, (at - 0.3).astype(np.intp)
         ]
         free = (
             free
-            * inner_border_cells.are_two_cells_inside_border_white[
+            * cells_along_inner_edges.are_first_two_inner_cells_white[
                 _SIDE_INDICES, (at + 0.3).astype(np.intp)
             ]
         )
-        can_be_located[-4:] = free > 0.0
+        is_edge_locatable[-4:] = free > 0.0
         outer_neighbour_count[-4:] = 1.0
     return NeighbourEdges(
-        neighbour_distance_px, inner_neighbour_count, outer_neighbour_count, can_be_located
+        neighbour_distance_px, inner_neighbour_count, outer_neighbour_count, is_edge_locatable
     )
 
 
@@ -717,11 +734,11 @@ _MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9  # share of the gradient that neighbourin
 # second moment of an edge: px^2, and in units of the window's variance
 _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
-_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
+_WIDE_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
 _SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
-_MIN_FRACTION_OF_MEAN_GRADIENT = (
+_MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = (
     0.3  # a profile is usable if its gradient is at least this share of the row's mean
 )
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # minimum cutoff, so that ordinary noise is not rejected
@@ -754,13 +771,13 @@ class NeighbourEdges:
             (rows,).
         inner_neighbour_count, outer_neighbour_count: number, 0 or 1, of edges with the same
             contrast one cell further in, and one cell further out, at each profile, (rows, n).
-        can_be_located: False if no edge can be found on the profile, (rows, n).
+        is_edge_locatable: False if no edge can be found on the profile, (rows, n).
     """
 
     neighbour_distance_px: Array
     inner_neighbour_count: Floats
     outer_neighbour_count: Floats
-    can_be_located: NDArray[np.bool_]
+    is_edge_locatable: NDArray[np.bool_]
 
 
 def locate_edges(
@@ -782,13 +799,15 @@ def locate_edges(
         profile_greys, profile_half_length_px, window_half_length_px, neighbours
     )
     edge_offsets_px, is_usable = profiles.locate_in_wide_window()
-    blur_px2 = np.ones(len(window_half_length_px), dtype=np.float32)
+    blur_variance_px2 = np.ones(len(window_half_length_px), dtype=np.float32)
     line = weight = _fit_line_to_half_midmeans(edge_offsets_px, is_usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
         if k == 1 and moved_px < _MAX_WIDE_WINDOW_ERROR_PX:
             continue
-        edge_offsets_px, is_usable, blur_px2 = profiles.locate_in_narrow_window(line, blur_px2)
+        edge_offsets_px, is_usable, blur_variance_px2 = profiles.locate_in_narrow_window(
+            line, blur_variance_px2
+        )
         centre, weight = _fit_robust_line(
             edge_offsets_px, is_usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
         )
@@ -798,7 +817,7 @@ def locate_edges(
     return (
         edge_offsets_px.astype(np.float64),
         weight.astype(np.float64),
-        np.sqrt(blur_px2).astype(np.float64),
+        np.sqrt(blur_variance_px2).astype(np.float64),
     )
 
 
@@ -814,7 +833,7 @@ class _EdgeProfiles:
     ) -> None:
         self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
         self.u = (
-            profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS
+            profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS
         )  # position, (rows, steps)
         self.near, self.depth = (
             window_half_length_px.astype(np.float32),
@@ -826,16 +845,16 @@ class _EdgeProfiles:
             around.inner_neighbour_count + around.outer_neighbour_count,
             around.outer_neighbour_count - around.inner_neighbour_count,
         )
-        self.can = around.can_be_located.astype(np.float32)
+        self.can = around.is_edge_locatable.astype(np.float32)
         # Factor for the sum over a row's profiles: a share of the mean over the possible ones.
-        self.part = _MIN_FRACTION_OF_MEAN_GRADIENT / np.maximum(
+        self.part = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
             self.can.dot(_PROFILE_ONES_F32), 1.0
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Locate the edge on each profile with a wide window around the middle of the profile.
         Return the edge offsets, px (rows, n), and whether each profile is usable (rows, n)."""
-        spread = self.u * (_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
+        spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
         np.exp(-0.5 * spread, out=window[..., 0])
@@ -846,7 +865,7 @@ class _EdgeProfiles:
         return np.divide(moments[..., 1], np.where(is_usable, total, 1.0)), is_usable
 
     def locate_in_narrow_window(
-        self, line_offsets_px: Floats, blur_px2: Floats
+        self, line_offsets_px: Floats, blur_variance_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Locate the edge on each profile again, with a narrow window around the side's line at
         `line_offsets_px` (rows, n). Return the edge offsets, px (rows, n), whether each profile is
@@ -854,7 +873,8 @@ class _EdgeProfiles:
         relative = self.u[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
-            np.maximum(_WINDOW_VARIANCE_RATIO * blur_px2, _MIN_WINDOW_VARIANCE_PX2), self.most2
+            np.maximum(_WINDOW_VARIANCE_RATIO * blur_variance_px2, _MIN_WINDOW_VARIANCE_PX2),
+            self.most2,
         )
         squared = relative * relative
         mass = squared * (-0.5 / w2)[:, None, None]
@@ -863,7 +883,7 @@ class _EdgeProfiles:
         total = (mass @ _SAMPLE_ONES) * self.can
         is_usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
         # Share, position and spread of a neighbour seen through the window.
-        wide2 = w2 + blur_px2
+        wide2 = w2 + blur_variance_px2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
         share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
@@ -872,7 +892,8 @@ class _EdgeProfiles:
         first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
         second = (
-            mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur_px2 / wide2)[:, None]
+            mass @ _SAMPLE_ONES
+            + total * share * (place * place + w2 * blur_variance_px2 / wide2)[:, None]
         )
         moment = (second * is_usable).dot(_PROFILE_ONES_F32)
         moment /= np.maximum((total * is_usable).dot(_PROFILE_ONES_F32), 1e-9)

@@ -35,11 +35,11 @@ from perchctl.vision.markers.corners import (
     SIDE_OUTWARD_NORMALS,
     RefinedCorners,
     apply_homography,
+    corners_by_increment_jacobian,
     homography_from_centred_square,
     increment_homography,
     is_inside_image,
     mean_side_px,
-    projected_corners_jacobian,
     side_lengths_px,
     signed_double_area,
 )
@@ -54,7 +54,7 @@ from perchctl.vision.markers.edge_fit import (
     find_neighbour_edges,
     locate_edges,
     make_side_profiles,
-    profile_positions,
+    profile_fractions_along_side,
     sample_profiles,
     window_and_profile_half_lengths_px,
 )
@@ -66,7 +66,7 @@ from perchctl.vision.markers.pattern import (
 )
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side carries no information
+MIN_PARTIAL_FIT_CELL_PX = 4.0  # with smaller cells, a part of a side carries no information
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9  # share of the window
@@ -99,8 +99,8 @@ def fit_partly_visible_marker(
     """
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
-        not mean_side_px(start_corners_px) / pattern.border_cells.cells_per_side
-        >= MIN_PARTIAL_CELL_PX
+        not mean_side_px(start_corners_px) / pattern.cells_along_border.cells_per_side
+        >= MIN_PARTIAL_FIT_CELL_PX
     ):
         return None
     # Wherever the fit converges, enough cells must be in the image.
@@ -114,9 +114,9 @@ def fit_partly_visible_marker(
     start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
-    H = homography_from_centred_square(start)
+    H_pinhole_marker = homography_from_centred_square(start)
     for k in range(_PARTIAL_FIT_ITERATIONS):
-        visible_edges = find_visible_edges(detector_input, H, pattern)
+        visible_edges = find_visible_edges(detector_input, H_pinhole_marker, pattern)
         if visible_edges is None:
             return None
         A, N, g = _linearize_edges(
@@ -127,7 +127,7 @@ def fit_partly_visible_marker(
         p = step[:8]
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_HOMOGRAPHY_INCREMENT):
             return None
-        H = increment_homography(H, p)
+        H_pinhole_marker = increment_homography(H_pinhole_marker, p)
         if (
             k > 0
             and float(np.abs(p[:6]).max() * visible_edges.px_per_half_side.mean())
@@ -135,10 +135,10 @@ def fit_partly_visible_marker(
         ):
             break
     assert visible_edges is not None
-    residual_px = visible_edges.edge_offset_px - (step @ A).reshape(
-        visible_edges.edge_offset_px.shape
+    residual_px = visible_edges.outward_edge_offset_px - (step @ A).reshape(
+        visible_edges.outward_edge_offset_px.shape
     )
-    found = _make_refined_corners(H, visible_edges, residual_px, N, pattern, camera)
+    found = _make_refined_corners(H_pinhole_marker, visible_edges, residual_px, N, pattern, camera)
     if found is None or not _has_matching_visible_cells(
         detector_input, found.corners_px, pattern, identified_by
     ):
@@ -148,7 +148,7 @@ def fit_partly_visible_marker(
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
     """True if no part of the marker is hidden or outside the image."""
-    margin_px = IMAGE_MARGIN_PX + corners.blur_px
+    margin_px = IMAGE_MARGIN_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
     ) and not is_any_part_hidden(detector_input.hidden_mask, corners.corners_px)
@@ -174,18 +174,18 @@ def _linearize_edges(
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the observed edge with the shift.
-    A[8] = np.where(visible_edges.centre_distance_half_sides < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(visible_edges.edge_to_centre_half_sides < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles closer to each other than a pixel measure the same edge.
     worth = np.minimum(
         1.0,
         2.0
         * visible_edges.px_per_half_side
-        * visible_edges.centre_distance_half_sides
+        * visible_edges.edge_to_centre_half_sides
         / PROFILES_PER_SIDE,
     )
     weighted = A * (visible_edges.weight * worth[:, None]).ravel()
-    N, g = weighted.dot(A.T), weighted.dot(visible_edges.edge_offset_px.ravel())
+    N, g = weighted.dot(A.T), weighted.dot(visible_edges.outward_edge_offset_px.ravel())
     # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
     certain = (0.1 / edge_shift_prior.sigma_px) ** 2
     N[8, 8] += certain
@@ -195,23 +195,23 @@ def _linearize_edges(
 
 
 def _make_refined_corners(
-    H: Array,
+    H_pinhole_marker: Array,
     visible_edges: VisibleEdges,
     residual_px: Array,
     normal_matrix: Array,
     pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the marker's corners, projected by H (3, 3), with their covariance; None if they are
-    too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit, and
-    `normal_matrix` (9, 9) is that of the last step."""
+    """Return the marker's corners, projected by `H_pinhole_marker` (3, 3), with their covariance;
+    None if they are too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit,
+    and `normal_matrix` (9, 9) is that of the last step."""
     w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
     if (
         not used.any()
         or (
-            visible_edges.blur_per_window_half_length[used] > _MAX_BLUR_PER_WINDOW_HALF_LENGTH
+            visible_edges.blur_sigma_per_window_half_length[used] > _MAX_BLUR_PER_WINDOW_HALF_LENGTH
         ).any()
     ):
         return None
@@ -222,17 +222,20 @@ def _make_refined_corners(
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
     noise2 = max(_ROBUST_VARIANCE_FACTOR * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
-    pinhole = apply_homography(H, CENTRED_SQUARE)
+    pinhole = apply_homography(H_pinhole_marker, CENTRED_SQUARE)
     corners_px = distort_to_px(
         apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera
     )
     side_px = mean_side_px(pinhole)
-    cell_size_px = side_px / pattern.border_cells.cells_per_side
+    cell_size_px = side_px / pattern.cells_along_border.cells_per_side
     # The square alone; `remaining_edge_shift_sigma_px` covers the uncertainty of the shift of all
     # edges.
-    J = projected_corners_jacobian(H)
+    J = corners_by_increment_jacobian(H_pinhole_marker)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
-    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.border_cells.print_tolerance_cells * cell_size_px) ** 2
+    floor2 = (
+        MIN_LINE_SIGMA_PX**2
+        + (pattern.cells_along_border.print_tolerance_cells * cell_size_px) ** 2
+    )
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_size_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
     if not (vaguest_px < _MAX_CORNER_SIGMA_SIDES * side_px and np.isfinite(corners_px).all()):
@@ -331,11 +334,14 @@ def _project_sample_points_px(
 
 
 def _is_point_in_image(
-    points_px: Array, shape: tuple[int, ...], margin_px: float
+    points_px: Array, shape: tuple[int, ...], max_distance_outside_px: float
 ) -> NDArray[np.bool_]:
-    """Return for each point (n, 2) whether it is in the image, or at most `margin_px` outside."""
+    """Return for each point (n, 2) whether it is in the image, or at most `max_distance_outside_px`
+    outside."""
     h, w = shape[:2]
-    inside = (points_px >= -margin_px) & (points_px <= (w - 1 + margin_px, h - 1 + margin_px))
+    inside = (points_px >= -max_distance_outside_px) & (
+        points_px <= (w - 1 + max_distance_outside_px, h - 1 + max_distance_outside_px)
+    )
     return np.asarray(inside.all(axis=1))
 
 
@@ -384,37 +390,37 @@ class VisibleEdges:
 
     Attributes:
         points_half_sides: measured points (rows, n, 2), in half sides from the marker's centre.
-        edge_offset_px: distance (rows, n) of each measured point from the model's edge,
+        outward_edge_offset_px: distance (rows, n) of each measured point from the model's edge,
             positive out of the marker.
         weight: weight (rows, n) of each profile.
         side_index: index of the edge's side, 0 to 3, (rows,).
-        centre_distance_half_sides: distance of the edge from the marker's centre: 1 for a side,
+        edge_to_centre_half_sides: distance of the edge from the marker's centre: 1 for a side,
             less for an inner edge of the border, (rows,).
         px_per_half_side: scale across the edge, (rows,).
-        blur_per_window_half_length: standard deviation of the blur over the half length of the
-            window, (rows,).
+        blur_sigma_per_window_half_length: standard deviation of the blur over the half length of
+            the window, (rows,).
         white_grey: grey level of white paper.
     """
 
     points_half_sides: Array
-    edge_offset_px: Array
+    outward_edge_offset_px: Array
     weight: Array
     side_index: NDArray[np.intp]
-    centre_distance_half_sides: Array
+    edge_to_centre_half_sides: Array
     px_per_half_side: Array
-    blur_per_window_half_length: Array
+    blur_sigma_per_window_half_length: Array
     white_grey: float
 
 
 def find_visible_edges(
-    detector_input: DetectorInput, H: Array, pattern: MarkerPattern
+    detector_input: DetectorInput, H_pinhole_marker: Array, pattern: MarkerPattern
 ) -> VisibleEdges | None:
-    """Measure the edges of the marker that H (3, 3) projects to pixels; None if too few are
-    visible."""
+    """Measure the edges of the marker that `H_pinhole_marker` (3, 3) projects to pixels; None if
+    too few are visible."""
     camera, cells, corners = (
         detector_input.camera,
-        pattern.border_cells.cells_per_side,
-        apply_homography(H, CENTRED_SQUARE),
+        pattern.cells_along_border.cells_per_side,
+        apply_homography(H_pinhole_marker, CENTRED_SQUARE),
     )
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -423,10 +429,10 @@ def find_visible_edges(
     rings = (1.0, 1.0 - 2.0 / cells) if cell_size_px > _MIN_INNER_EDGE_CELL_PX else (1.0,)
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
-    to_rays: Array = np.linalg.inv(camera.K) @ H
+    to_rays: Array = np.linalg.inv(camera.K) @ H_pinhole_marker
     starts = np.stack([apply_homography(to_rays, r * CENTRED_SQUARE) for r in rings])
     scale_px = (0.25 * (sides_px[PREVIOUS_CORNER] + sides_px[NEXT_CORNER]))[side]
-    s = profile_positions(sides_px[side] * at)
+    s = profile_fractions_along_side(sides_px[side] * at)
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _OUT_OF_RANGE_PX).all():
@@ -438,8 +444,10 @@ def find_visible_edges(
         np.full(len(at), cell_size_px)
     )
     depth_px = 2.0 * scale_px / cells
-    around = find_neighbour_edges(s, [pattern.border_cells], pattern.border_cells, depth_px)
-    is_unobstructed = around.can_be_located & _is_profile_in_view(
+    around = find_neighbour_edges(
+        s, [pattern.cells_along_border], pattern.cells_along_border, depth_px
+    )
+    is_unobstructed = around.is_edge_locatable & _is_profile_in_view(
         detector_input, origin, normal, window_half_length_px
     )
     kept = np.flatnonzero(np.count_nonzero(is_unobstructed, axis=1) >= _MIN_SIDE_WEIGHT_SUM)
@@ -467,41 +475,44 @@ def find_visible_edges(
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT_SUM] = 0.0
     found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
-    own = apply_homography(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(
-        origin.shape
-    )
+    own = apply_homography(
+        np.asarray(np.linalg.inv(H_pinhole_marker)), pinhole_px(found, camera)
+    ).reshape(origin.shape)
     if not np.isfinite(own).all():
         return None
     far = np.einsum("rni,ri->rn", own, SIDE_OUTWARD_NORMALS[side]) - at[:, None]
     return VisibleEdges(
         points_half_sides=own,
-        edge_offset_px=far * scale_px[:, None],
+        outward_edge_offset_px=far * scale_px[:, None],
         weight=weight,
         side_index=side,
-        centre_distance_half_sides=at,
+        edge_to_centre_half_sides=at,
         px_per_half_side=scale_px,
-        blur_per_window_half_length=blur_px / window_half_length_px,
+        blur_sigma_per_window_half_length=blur_px / window_half_length_px,
         white_grey=white,
     )
 
 
 def _is_profile_in_view(
-    detector_input: DetectorInput, origin: Array, normal: Array, window_half_length_px: Array
+    detector_input: DetectorInput,
+    profile_centre_px: Array,
+    profile_direction: Array,
+    window_half_length_px: Array,
 ) -> NDArray[np.bool_]:
     hidden_mask, (h, w) = detector_input.hidden_mask, detector_input.image.shape
     # A profile is in the image if both of its ends are.
     reach, last = (
-        window_half_length_px[:, None, None] * np.abs(normal),
+        window_half_length_px[:, None, None] * np.abs(profile_direction),
         (w - 1 - IMAGE_MARGIN_PX, h - 1 - IMAGE_MARGIN_PX),
     )
-    x_and_y = (origin - reach >= IMAGE_MARGIN_PX) & (origin + reach <= last)
+    x_and_y = (profile_centre_px - reach >= IMAGE_MARGIN_PX) & (profile_centre_px + reach <= last)
     seen = x_and_y[..., 0] & x_and_y[..., 1]
     if hidden_mask is not None and seen.any():
         at = (
-            origin[:, :, None]
+            profile_centre_px[:, :, None]
             + window_half_length_px[:, None, None, None]
             * _WINDOW_SAMPLE_OFFSETS
-            * normal[:, :, None]
+            * profile_direction[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
         seen &= ~hidden_mask[pixel[..., 1], pixel[..., 0]].any(axis=2)

@@ -33,25 +33,25 @@ _SAMPLE_OFFSETS_CELLS: Array = np.array(
 
 
 @dataclass(frozen=True, eq=False)
-class BorderCells:
+class CellsAlongBorder:
     """The row of cells just inside a marker's black border, along each of its four sides. Side k
     runs from corner k to corner k + 1.
 
     Attributes:
-        is_cell_inside_border_white: 1 for a white cell, 0 for a black one, as factors in sums, (4,
+        is_first_inner_cell_white: 1 for a white cell, 0 for a black one, as factors in sums, (4,
             n). The first and last cells of a side belong to the border.
-        are_two_cells_inside_border_white: 1 if this cell and the next one further in are white, (4,
+        are_first_two_inner_cells_white: 1 if this cell and the next one further in are white, (4,
             n).
         print_tolerance_cells: standard deviation of a printed edge's position, in cells.
     """
 
-    is_cell_inside_border_white: Array
-    are_two_cells_inside_border_white: Array
+    is_first_inner_cell_white: Array
+    are_first_two_inner_cells_white: Array
     print_tolerance_cells: float = 0.0
 
     @property
     def cells_per_side(self) -> int:
-        return int(self.is_cell_inside_border_white.shape[1])
+        return int(self.is_first_inner_cell_white.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class MarkerPattern:
     """The appearance of a marker.
 
     Attributes:
-        border_cells: cells inside the border.
+        cells_along_border: cells inside the border.
         drawing: all cells.
         sample_points_half_sides: points (n, 2) at which cells are read, in the marker's coordinates
             (see `perchctl.vision.markers.corners`).
@@ -72,7 +72,7 @@ class MarkerPattern:
         is_cell_inside_border: True for a cell within the border, (cells,).
     """
 
-    border_cells: BorderCells
+    cells_along_border: CellsAlongBorder
     drawing: MarkerDrawing
     sample_points_half_sides: Array
     sample_cell_index: NDArray[np.intp]
@@ -82,7 +82,9 @@ class MarkerPattern:
     is_cell_inside_border: NDArray[np.bool_]
 
 
-def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0) -> BorderCells:
+def make_cells_along_border(
+    bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0
+) -> CellsAlongBorder:
     """Return the cells inside the border of a marker with inner bits (n, n), 1 = white: the cells
     whose blur may reach the edges of the border."""
     n = len(bits)
@@ -97,10 +99,12 @@ def make_border_cells(bits: NDArray[np.uint8], print_tolerance_cells: float = 0.
 
     white = np.pad(ring(0), ((0, 0), (1, 1)))
     second = np.pad(ring(1), ((0, 0), (1, 1)))
-    return BorderCells(white, white * second, print_tolerance_cells)
+    return CellsAlongBorder(white, white * second, print_tolerance_cells)
 
 
-def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> MarkerPattern:
+def make_marker_pattern(
+    cells_along_border: CellsAlongBorder, drawing: MarkerDrawing
+) -> MarkerPattern:
     """Return a marker's pattern, with sample points in all cells that are not covered by a small
     marker in the centre."""
     n = len(drawing.cell_whiteness)
@@ -122,7 +126,7 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
     own = np.searchsorted(kept, owner[free]).astype(np.intp)
     return MarkerPattern(
-        border_cells=border_cells,
+        cells_along_border=cells_along_border,
         drawing=drawing,
         sample_points_half_sides=np.ascontiguousarray(sample_points_half_sides[free]),
         sample_cell_index=own,
@@ -135,7 +139,7 @@ def make_marker_pattern(border_cells: BorderCells, drawing: MarkerDrawing) -> Ma
 
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
     """True if every cell in the image clearly has the colour of the pattern."""
-    means = _cell_means(image, corners_px, pattern)
+    means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
     white, black = means[pattern.is_cell_white], means[~pattern.is_cell_white]
@@ -156,7 +160,7 @@ def has_mostly_matching_cells(
 ) -> bool:
     """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells in the image have the colour of
     the pattern."""
-    means = _cell_means(image, corners_px, pattern)
+    means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
     high, low = np.median(means[pattern.is_cell_white]), np.median(means[~pattern.is_cell_white])
@@ -168,10 +172,14 @@ def is_correlated_with_pattern(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
     """True if the grey values in the cells correlate clearly with the pattern."""
-    return float(correlate_pattern(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
+    return (
+        float(correlate_pattern_rotations(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
+    )
 
 
-def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> Array:
+def correlate_pattern_rotations(
+    image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
+) -> Array:
     """Return the correlation (4,) of the grey values in the cells with the pattern, for the four
     rotations of the marker (corners (4, 2) rolled by 0 to 3); 0 if there is no contrast."""
     grey = _read_sample_greys(image, corners_px, pattern)
@@ -185,7 +193,7 @@ def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Mark
     return np.asarray(pattern.rotated_sample_templates @ grey / spread)
 
 
-def _cell_means(
+def _mean_grey_per_cell(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array | None:
     grey = _read_sample_greys(image, corners_px, pattern)
@@ -235,12 +243,12 @@ class MarkerDrawing:
     """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
 
     The drawing of the large marker also contains the small marker: its cells,
-    `small_cell_whiteness`; its side over that of the large marker, `small_to_large_side_ratio`; and
-    half the side of the paper in the marker's coordinates, `paper_reach_half_sides` (None:
-    infinite)."""
+    `small_marker_cell_whiteness`; its side over that of the large marker,
+    `small_to_large_side_ratio`; and half the side of the paper in the marker's coordinates,
+    `paper_reach_half_sides` (None: infinite)."""
 
     cell_whiteness: Array
-    small_cell_whiteness: Array | None = None
+    small_marker_cell_whiteness: Array | None = None
     small_to_large_side_ratio: float = 0.0
     paper_reach_half_sides: float | None = None
 
@@ -271,26 +279,26 @@ def make_marker_drawing(
 
 def _cell_coverage(
     node_positions_half_sides: Array,
-    half_node_spacing: float,
-    n_cells: int,
-    square_half_side: float,
+    node_reach_half_sides: float,
+    cells_per_side: int,
+    square_reach_half_sides: float,
 ) -> Array:
     """Return the fraction of each node's interval (half the spacing to each side) that each cell
     covers, (nodes, cells), along one axis. Nodes and cells are in half sides from the marker's
-    centre; the cells fill a square from -square_half_side to square_half_side."""
-    edges = square_half_side * np.linspace(-1.0, 1.0, n_cells + 1)
+    centre; the cells fill a square from -square_reach_half_sides to square_reach_half_sides."""
+    edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
     low, high = (
-        node_positions_half_sides[:, None] - half_node_spacing,
-        node_positions_half_sides[:, None] + half_node_spacing,
+        node_positions_half_sides[:, None] - node_reach_half_sides,
+        node_positions_half_sides[:, None] + node_reach_half_sides,
     )
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
-    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node_spacing))
+    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * node_reach_half_sides))
 
 
-def _add_margin_nodes(node_positions_half_sides: Array, half_node_spacing: float) -> Array:
+def _add_margin_nodes(node_positions_half_sides: Array, node_reach_half_sides: float) -> Array:
     """Return the node positions along one axis with `BLUR_MARGIN_NODES` additional nodes at both
     ends."""
-    more = 2.0 * half_node_spacing * np.arange(1, BLUR_MARGIN_NODES + 1)
+    more = 2.0 * node_reach_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
         [
             node_positions_half_sides[0] - more[::-1],
@@ -309,16 +317,16 @@ def render_whiteness_and_off_paper_fraction(
     Returns the whiteness of each node, 0 to 1, as the first array. If the paper ends inside the
     compared square, a second array contains the fraction of each node beyond the paper.
     """
-    half_node_spacing = drawing.photometric_fit_reach_half_sides / nodes_per_side
-    node_positions_half_sides: Array = half_node_spacing * (
+    node_reach_half_sides = drawing.photometric_fit_reach_half_sides / nodes_per_side
+    node_positions_half_sides: Array = node_reach_half_sides * (
         2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
     )
-    paper = render_cells(drawing, node_positions_half_sides, half_node_spacing)
+    paper = render_cells(drawing, node_positions_half_sides, node_reach_half_sides)
     if drawing.paper_reach_half_sides is None:
         return (paper,)
     on = _cell_coverage(
-        _add_margin_nodes(node_positions_half_sides, half_node_spacing),
-        half_node_spacing,
+        _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
+        node_reach_half_sides,
         1,
         drawing.paper_reach_half_sides,
     )
@@ -335,36 +343,36 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 
 
 def render_cells(
-    drawing: MarkerDrawing, node_positions_half_sides: Array, half_node_spacing: float
+    drawing: MarkerDrawing, node_positions_half_sides: Array, node_reach_half_sides: float
 ) -> NDArray[np.float32]:
     """Return the whiteness at the nodes of a square grid with the coordinates
     `node_positions_half_sides` along both axes, extended by `BLUR_MARGIN_NODES` nodes on all
     sides."""
-    wide = _add_margin_nodes(node_positions_half_sides, half_node_spacing)
-    C = _cell_coverage(wide, half_node_spacing, len(drawing.cell_whiteness), 1.0)
+    wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
+    C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
-    if drawing.small_cell_whiteness is not None:
+    if drawing.small_marker_cell_whiteness is not None:
         C = _cell_coverage(
             wide,
-            half_node_spacing,
-            len(drawing.small_cell_whiteness),
+            node_reach_half_sides,
+            len(drawing.small_marker_cell_whiteness),
             drawing.small_to_large_side_ratio,
         )
-        black += C @ (1.0 - drawing.small_cell_whiteness) @ C.T
+        black += C @ (1.0 - drawing.small_marker_cell_whiteness) @ C.T
     return (1.0 - black).astype(np.float32)
 
 
 def blurred_cell_coverage(
     drawing: MarkerDrawing,
     node_positions_half_sides: Array,
-    half_node_spacing: float,
+    node_reach_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
     """Return the fraction of each node's width that each row of cells covers, (n, cells), after a
     Gaussian blur of `blur_sigma_nodes`."""
     wide = _cell_coverage(
-        _add_margin_nodes(node_positions_half_sides, half_node_spacing),
-        half_node_spacing,
+        _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
+        node_reach_half_sides,
         len(drawing.cell_whiteness),
         1.0,
     )

@@ -12,7 +12,7 @@ by cell, does not show the marker.
 
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
 the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
-same with that blur; `DrawingAlignment.bit_flip_fraction` says how close one is.
+same with that blur; `DrawingAlignment.worst_cell_flip_fraction` says how close one is.
 
 Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
 grids are (n, n) nodes, stored as rows of n * n.
@@ -35,9 +35,9 @@ from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     apply_homography,
+    corners_by_increment_jacobian,
     homography_from_centred_square,
     increment_homography,
-    projected_corners_jacobian,
 )
 from perchctl.vision.markers.pattern import (
     BLUR_MARGIN_NODES,
@@ -99,27 +99,27 @@ class DrawingAlignment:
         fit_correlation: correlation of the image with the fitted drawing.
         pattern_correlation: correlation of the inner bits with the residual that a plain black
             square of the same size leaves in the image.
-        pattern_to_border_contrast: contrast of the inner bits relative to the border's.
-        max_cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of the
-            fitted drawing, relative to the contrast of black and white.
-        bit_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as drawn)
-            to 1 (flipped bit).
-        bit_flip_fraction_sigma: standard deviation of `bit_flip_fraction` for the least certain
-            cell.
-        blur_px: standard deviation of the blur.
-        motion_from_start_px: largest distance of a corner from its start.
+        pattern_to_border_contrast_ratio: contrast of the inner bits relative to the border's.
+        largest_cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of
+            the fitted drawing, relative to the contrast of black and white.
+        worst_cell_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as
+            drawn) to 1 (flipped bit).
+        largest_cell_flip_fraction_sigma: standard deviation of `worst_cell_flip_fraction` for the
+            least certain cell.
+        blur_sigma_px: standard deviation of the blur.
+        largest_motion_from_start_px: largest distance of a corner from its start.
     """
 
     corners_px: Array
     sigma_px: float
     fit_correlation: float
     pattern_correlation: float
-    pattern_to_border_contrast: float
-    max_cell_deviation_per_contrast: float
-    bit_flip_fraction: float
-    bit_flip_fraction_sigma: float
-    blur_px: float
-    motion_from_start_px: float
+    pattern_to_border_contrast_ratio: float
+    largest_cell_deviation_per_contrast: float
+    worst_cell_flip_fraction: float
+    largest_cell_flip_fraction_sigma: float
+    blur_sigma_px: float
+    largest_motion_from_start_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,10 @@ def align_drawing(
     start_corners_px: Array,
     drawing: MarkerDrawing,
     camera: CameraModel,
-    blur_px: float = 1.0,
+    initial_blur_sigma_px: float = 1.0,
 ) -> DrawingAlignment | None:
-    """Fit the drawing to the image, starting at `start_corners_px` (4, 2) and `blur_px`.
+    """Fit the drawing to the image, starting at `start_corners_px` (4, 2) and
+    `initial_blur_sigma_px`.
 
     Returns None if the marker leaves the image, looks different, or the fit diverges.
     """
@@ -165,9 +166,9 @@ def align_drawing(
         np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
     )
     node_px, cell_size_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
-    grid, H = make_sampling_grid(n, reach), homography_from_centred_square(start)
-    node_lens_shift_px = lens_shift_px(grid, H, camera)
-    patch = _extract_patch(image, grid, H, node_lens_shift_px)
+    grid, H_pinhole_marker = make_sampling_grid(n, reach), homography_from_centred_square(start)
+    node_lens_shift_px = lens_shift_px(grid, H_pinhole_marker, camera)
+    patch = _extract_patch(image, grid, H_pinhole_marker, node_lens_shift_px)
     if patch is None:
         return None
     around, first = patch
@@ -178,20 +179,20 @@ def align_drawing(
     def limit_blur_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_size_px)
 
-    rendered_drawing = drawn(limit_blur_px(blur_px))
-    lens_shift_from_patch_corner_px, since_lens_px, increment_from_start = (
+    rendered_drawing = drawn(limit_blur_px(initial_blur_sigma_px))
+    lens_shift_minus_patch_corner_px, since_lens_px, homography_increment_from_start = (
         node_lens_shift_px - first,
         0.0,
         np.zeros(8),
     )
     for k in range(_MAX_ITERATIONS):
         if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
-            lens_shift_from_patch_corner_px, since_lens_px = (
-                lens_shift_px(grid, H, camera) - first,
+            lens_shift_minus_patch_corner_px, since_lens_px = (
+                lens_shift_px(grid, H_pinhole_marker, camera) - first,
                 0.0,
             )
-        grey = _sample_patch(around, grid, H, lens_shift_from_patch_corner_px)
-        equations = _linearize_greys(grey, rendered_drawing, increment_from_start)
+        grey = _sample_patch(around, grid, H_pinhole_marker, lens_shift_minus_patch_corner_px)
+        equations = _linearize_greys(grey, rendered_drawing, homography_increment_from_start)
         if equations is None:
             return None
         if (
@@ -203,7 +204,10 @@ def align_drawing(
         p = step[_SHAPE_SLICE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT):
             return None
-        H, increment_from_start = increment_homography(H, p), increment_from_start + p
+        H_pinhole_marker, homography_increment_from_start = (
+            increment_homography(H_pinhole_marker, p),
+            homography_increment_from_start + p,
+        )
         motion_px = 0.5 * side_px * float(np.abs(p[:6]).max())
         since_lens_px += motion_px
         sigma2 = rendered_drawing.blur_sigma_nodes**2
@@ -218,18 +222,18 @@ def align_drawing(
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
     contrast_grey, grey_residual = equations.contrast_grey, equations.grey_residual
-    corners_px = distort_px(apply_homography(H, CENTRED_SQUARE).T, camera).T
-    pattern_correlation, pattern_to_border_contrast = _measure_inner_pattern_match(
+    corners_px = distort_px(apply_homography(H_pinhole_marker, CENTRED_SQUARE).T, camera).T
+    pattern_correlation, pattern_to_border_contrast_ratio = _measure_inner_pattern_match(
         rendered_drawing, grey, contrast_grey
     )
     nodes_per_independent_sample = _estimate_nodes_per_independent_sample(
         grey_residual.reshape(n, n)
     )
     inverse_normal_matrix = np.asarray(np.linalg.inv(equations.N))
-    bit_flip_fraction, bit_flip_fraction_sigma = _measure_bit_flip_fraction(
+    worst_cell_flip_fraction, largest_cell_flip_fraction_sigma = _measure_worst_cell_flip_fraction(
         rendered_drawing, equations, inverse_normal_matrix, nodes_per_independent_sample
     )
-    J = projected_corners_jacobian(H)
+    J = corners_by_increment_jacobian(H_pinhole_marker)
     variance = (
         float(
             np.trace(
@@ -245,22 +249,22 @@ def align_drawing(
         sigma_px=math.sqrt(max(variance, 0.0)),
         fit_correlation=fit_correlation(grey, grey_residual),
         pattern_correlation=pattern_correlation,
-        pattern_to_border_contrast=pattern_to_border_contrast,
-        max_cell_deviation_per_contrast=_cell_deviation(
+        pattern_to_border_contrast_ratio=pattern_to_border_contrast_ratio,
+        largest_cell_deviation_per_contrast=_largest_cell_deviation(
             grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
-        bit_flip_fraction=bit_flip_fraction,
-        bit_flip_fraction_sigma=bit_flip_fraction_sigma,
-        blur_px=rendered_drawing.blur_sigma_nodes * node_px,
-        motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
+        worst_cell_flip_fraction=worst_cell_flip_fraction,
+        largest_cell_flip_fraction_sigma=largest_cell_flip_fraction_sigma,
+        blur_sigma_px=rendered_drawing.blur_sigma_nodes * node_px,
+        largest_motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
     )
 
 
 def _linearize_greys(
-    grey: Array, rendered_drawing: RenderedDrawing, increment_from_start: Array
+    grey: Array, rendered_drawing: RenderedDrawing, homography_increment_from_start: Array
 ) -> _NormalEquations | None:
     """Linearise the fit and return its normal equations; None if there is no contrast.
-    `increment_from_start` (8,) is the sum of the increments so far."""
+    `homography_increment_from_start` (8,) is the sum of the increments so far."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
@@ -281,7 +285,7 @@ def _linearize_greys(
     g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _INCREMENT_PRIOR_INFORMATION
-    g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * increment_from_start
+    g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * homography_increment_from_start
     return _NormalEquations(contrast_grey, grey_residual, J, noise, N, g)
 
 
@@ -296,13 +300,14 @@ def fit_correlation(grey: Array, grey_residual: Array) -> float:
     return math.sqrt(max(explained, 0.0))
 
 
-def _measure_bit_flip_fraction(
+def _measure_worst_cell_flip_fraction(
     rendered_drawing: RenderedDrawing,
     equations: _NormalEquations,
     inverse_normal_matrix: Array,
     nodes_per_independent_sample: float,
 ) -> tuple[float, float]:
-    """Return `bit_flip_fraction` and `bit_flip_fraction_sigma` of an `DrawingAlignment`.
+    """Return `worst_cell_flip_fraction` and `largest_cell_flip_fraction_sigma` of an
+    `DrawingAlignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
@@ -357,21 +362,25 @@ def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     return factor
 
 
-def _cell_deviation(relative_residual: Array, grid: SamplingGrid, n_cells: int) -> float:
-    index, count = _assign_nodes_to_cells(grid, n_cells)
-    total = np.bincount(index, weights=relative_residual, minlength=n_cells**2 + 1)[:-1]
+def _largest_cell_deviation(
+    residual_per_contrast: Array, grid: SamplingGrid, cells_per_side: int
+) -> float:
+    index, count = _assign_nodes_to_cells(grid, cells_per_side)
+    total = np.bincount(index, weights=residual_per_contrast, minlength=cells_per_side**2 + 1)[:-1]
     return float(np.abs(total / count).max())
 
 
 @lru_cache(maxsize=32)
-def _assign_nodes_to_cells(grid: SamplingGrid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
+def _assign_nodes_to_cells(
+    grid: SamplingGrid, cells_per_side: int
+) -> tuple[NDArray[np.intp], Array]:
     """Return the index of the cell that contains each node, and the number of nodes in each
     cell."""
-    x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
-    inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
-    own = y.astype(np.intp) * n_cells + x.astype(np.intp)
-    index = np.where(inside, own, n_cells**2)
-    count = np.bincount(index, minlength=n_cells**2 + 1)[:-1]
+    x, y = (grid.node_uv1[:2] + 1.0) * 0.5 * cells_per_side
+    inside = (x >= 0) & (x < cells_per_side) & (y >= 0) & (y < cells_per_side)
+    own = y.astype(np.intp) * cells_per_side + x.astype(np.intp)
+    index = np.where(inside, own, cells_per_side**2)
+    count = np.bincount(index, minlength=cells_per_side**2 + 1)[:-1]
     return index, np.maximum(count, 1.0)
 
 
@@ -384,7 +393,7 @@ def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Arra
     """Return the derivatives (9, n * n) of the drawing's grey values with respect to the
     homography's increment (8) and the variance of the blur, under the illumination with the
     coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
-    contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.uv1
+    contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
     slope = contrast_grey + illumination[GAIN_U] * u + illumination[GAIN_V] * v
@@ -404,19 +413,19 @@ _CHEBYSHEV_NODES = 9  # per side
 @dataclass(frozen=True, eq=False)
 class SamplingGrid:
     """Sampling grid on the marker: n by n nodes at `node_positions_half_sides` (n,) in both
-    directions, in half sides from the marker's centre; `uv1` (3, n * n) is (u, v, 1) of each
+    directions, in half sides from the marker's centre; `node_uv1` (3, n * n) is (u, v, 1) of each
     node."""
 
     nodes_per_side: int
     node_positions_half_sides: Array
-    uv1: Array
+    node_uv1: Array
 
 
 @lru_cache(maxsize=64)
-def make_sampling_grid(nodes_per_side: int, half_side: float) -> SamplingGrid:
-    """Return a grid over the square from -half_side to half_side, with one node in the middle of
-    each of its n by n equal parts."""
-    node_positions_half_sides = half_side * (
+def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> SamplingGrid:
+    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides, with one
+    node in the middle of each of its n by n equal parts."""
+    node_positions_half_sides = grid_reach_half_sides * (
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
     )
     return SamplingGrid(
@@ -430,9 +439,10 @@ def _grid_coordinates(node_positions_half_sides: Array) -> Array:
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
-def project_nodes(H: Array, uv1: Array) -> Array:
-    """Map the marker's coordinates (3, n) by H to pinhole pixels, x and y (2, n)."""
-    q = H.dot(uv1)
+def project_nodes(H_pinhole_marker: Array, node_uv1: Array) -> Array:
+    """Map the marker's coordinates (3, n) by `H_pinhole_marker` to pinhole pixels, x and y,
+    (2, n)."""
+    q = H_pinhole_marker.dot(node_uv1)
     return np.asarray(q[:2] / q[2])
 
 
@@ -445,11 +455,11 @@ def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
     return distort_to_px(rays, camera).T
 
 
-def lens_shift_px(grid: SamplingGrid, H: Array, camera: CameraModel) -> Array:
+def lens_shift_px(grid: SamplingGrid, H_pinhole_marker: Array, camera: CameraModel) -> Array:
     """Return the shift of each node due to lens distortion, px (2, n * n), interpolated from a few
     nodes."""
-    uv1, between = _make_chebyshev_nodes(grid)
-    pin = project_nodes(H, uv1)
+    node_uv1, between = _make_chebyshev_nodes(grid)
+    pin = project_nodes(H_pinhole_marker, node_uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _CHEBYSHEV_NODES, _CHEBYSHEV_NODES)
     return np.asarray((between @ shift @ between.T).reshape(2, -1))
 
@@ -468,12 +478,12 @@ def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
 
 
 def _extract_patch(
-    image: NDArray[np.uint8], grid: SamplingGrid, H: Array, node_lens_shift_px: Array
+    image: NDArray[np.uint8], grid: SamplingGrid, H_pinhole_marker: Array, node_lens_shift_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the part of the image that contains all nodes, and the position (2, 1) of its top-left
     pixel; None if a node is outside the image."""
     h, w = image.shape
-    x, y = project_nodes(H, grid.uv1) + node_lens_shift_px
+    x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_lens_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
@@ -485,12 +495,17 @@ def _extract_patch(
 
 
 def _sample_patch(
-    patch: NDArray[np.float32], grid: SamplingGrid, H: Array, lens_shift_from_patch_corner_px: Array
+    patch: NDArray[np.float32],
+    grid: SamplingGrid,
+    H_pinhole_marker: Array,
+    lens_shift_minus_patch_corner_px: Array,
 ) -> Array:
-    """Return the grey values (n * n,) of the patch at the nodes projected by H and shifted by
-    `lens_shift_from_patch_corner_px` (2, n * n): the lens distortion at each node minus the
-    position of the patch's top-left pixel."""
-    at = (project_nodes(H, grid.uv1) + lens_shift_from_patch_corner_px).astype(np.float32)
+    """Return the grey values (n * n,) of the patch at the nodes projected by `H_pinhole_marker` and
+    shifted by `lens_shift_minus_patch_corner_px` (2, n * n): the lens distortion at each node minus
+    the position of the patch's top-left pixel."""
+    at = (project_nodes(H_pinhole_marker, grid.node_uv1) + lens_shift_minus_patch_corner_px).astype(
+        np.float32
+    )
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
@@ -549,7 +564,7 @@ class RenderedDrawing:
         rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
         (gain) and its slopes, and the bend of the tone curve; the eighth, the grey beyond the
         paper, exists only if the paper ends inside the compared square."""
-        u, v, one = self.grid.uv1
+        u, v, one = self.grid.node_uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])

@@ -39,14 +39,14 @@ SearchMode = Literal[
 ("expected_window"), by fits to a blurred target ("expected_fits"), or by both ("near_expected"). In
 the whole image: by OpenCV, which needs a sharp target ("whole_sharp"), or by fits to a blurred
 target ("whole_blurred"). "all" is everything."""
-_WINDOW_MARGIN_FRACTION = 0.25  # share of the target's size in the image, on each side
+_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25  # share of the target's size in the image, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
-_MAX_WINDOW_FRACTION = 0.8  # share of the image
-_MIN_HALVED_SIDE_PX = 60.0
+_MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8  # share of the image
+_MIN_SIDE_BEFORE_HALVING_PX = 60.0
 """Side above which markers are found in an image of half the size, in a quarter of the time,
 px."""
-_CENTRE_TOLERANCE_SIDES = 0.35  # share of the small marker's side
+_NESTING_TOLERANCE_SMALL_MARKER_SIDES = 0.35  # share of the small marker's side
 
 
 ImageWindow = tuple[slice, slice]
@@ -123,7 +123,7 @@ def search_half_size(
     if (
         len(expected_corners_px) < 2
         or not in_view
-        or min(map(mean_side_px, in_view)) <= _MIN_HALVED_SIDE_PX
+        or min(map(mean_side_px, in_view)) <= _MIN_SIDE_BEFORE_HALVING_PX
     ):
         return None
     window = make_search_window(
@@ -136,7 +136,7 @@ def search_half_size(
         expected_corners_px,
         QUICK_THRESHOLD_WINDOWS_PX,
         measure_own_target_distance_m,
-        is_halved=True,
+        must_halve_image=True,
     )
     return found if len(found.corners_px) >= len(in_view) else None
 
@@ -160,11 +160,14 @@ def make_search_window(
         inside = (whole >= 0).all() and (whole < (w, h)).all()
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = np.maximum(_WINDOW_MARGIN_FRACTION * (high - low).max(), _WINDOW_MARGIN_PX)
+    margin = np.maximum(_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _WINDOW_MARGIN_PX)
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
     width, height = int(right - left), int(bottom - top)
-    if min(width, height) < _MIN_WINDOW_PX or width * height > _MAX_WINDOW_FRACTION * w * h:
+    if (
+        min(width, height) < _MIN_WINDOW_PX
+        or width * height > _MAX_WINDOW_TO_IMAGE_AREA_RATIO * w * h
+    ):
         return None
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
@@ -175,10 +178,10 @@ def _search_once(
     expected_corners_px: Mapping[MarkerName, Array],
     threshold_windows_px: ThresholdWindowRange,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None,
-    is_halved: bool = False,
+    must_halve_image: bool = False,
 ) -> FoundMarkers:
     setup, part = detector_input.setup, detector_input.image[window]
-    if is_halved:
+    if must_halve_image:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), threshold_windows_px)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
@@ -195,7 +198,7 @@ def _search_once(
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
         # The centre of a pixel at half size is between two pixels.
-        candidates[name].append((2.0 * at + 0.5 if is_halved else at) + first)
+        candidates[name].append((2.0 * at + 0.5 if must_halve_image else at) + first)
     targets = len(_pair_markers(candidates, setup.small_to_large_side_ratio))
     chosen = choose_markers(
         candidates,
@@ -281,7 +284,7 @@ def _pair_markers(
     index of the large marker, index of the small marker."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
-        (relative_nesting_error(a, b, small_to_large_side_ratio), i, j)
+        (nesting_error_to_tolerance_ratio(a, b, small_to_large_side_ratio), i, j)
         for i, a in enumerate(large)
         for j, b in enumerate(small)
     ]
@@ -292,7 +295,7 @@ def _pair_markers(
     return list(best.values())
 
 
-def relative_nesting_error(
+def nesting_error_to_tolerance_ratio(
     large_corners_px: Array, small_corners_px: Array, small_to_large_side_ratio: float
 ) -> float:
     """Return the largest distance of the small marker's corners from their expected positions
@@ -300,7 +303,7 @@ def relative_nesting_error(
     most 1. `small_to_large_side_ratio` is the small marker's side over the large one's."""
     mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
-    allowed_px = max(_CENTRE_TOLERANCE_SIDES * side_px, 2.5)
+    allowed_px = max(_NESTING_TOLERANCE_SMALL_MARKER_SIDES * side_px, 2.5)
     return float(np.linalg.norm(mapped - small_corners_px, axis=1).max()) / allowed_px
 
 

@@ -24,7 +24,7 @@ from perchctl.vision import (
 from perchctl.vision.lens import distort_to_px, undistort_px, undistort_to_normalised
 from perchctl.vision.markers.corners import is_inside_image
 from perchctl.vision.markers.cut import (
-    MAX_TRUNCATED_FIT_AGE_S,
+    MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S,
     RigidPose,
     fit_pose,
     fit_truncated_markers,
@@ -104,8 +104,8 @@ def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(search_mode("height", age_s=MAX_TRUNCATED_FIT_AGE_S - 0.01))
-    assert nothing(search_mode("height", age_s=MAX_TRUNCATED_FIT_AGE_S + 0.01))
+    assert not nothing(search_mode("height", age_s=MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S - 0.01))
+    assert nothing(search_mode("height", age_s=MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S + 0.01))
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
@@ -231,7 +231,7 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     x = undistort_to_normalised(distort_to_px(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fit_pose(image, _pose("corner"), outline, CAMERA)
-    assert found.small_marker_point_count == 0
+    assert found.found_small_marker_point_count == 0
     assert (
         fit_truncated_markers(DetectorInput(image, None, SETUP, CAMERA), both(POSES["corner"]))
         == {}
@@ -291,7 +291,7 @@ def errors_m(rows: list[tuple[float, PipelineOutput]], along: str) -> Array:
 )
 def test_an_ascent_is_measured_to_the_end(build: Any, along: str) -> None:
     rows = ascent(build, along, with_attitude=along != "under")
-    assert all(o.target is not None and o.target.measured for _, o in rows)
+    assert all(o.target is not None and o.target.is_measured_in_newest_frame for _, o in rows)
     cut = [(z, o) for z, o in rows if o.detections.small.cov_px2 is not None]
     assert len(cut) >= 2
     assert np.abs(errors_m(cut, along)).max() < 1e-4

@@ -18,7 +18,7 @@ from perchctl.vision.markers.detect import (
     refine_expected_markers,
 )
 from perchctl.vision.markers.detector import DetectorInput, make_detector_setup
-from perchctl.vision.markers.search import relative_nesting_error
+from perchctl.vision.markers.search import nesting_error_to_tolerance_ratio
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
@@ -56,7 +56,7 @@ def test_a_decoy_of_either_marker_is_dropped() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
     assert (
-        relative_nesting_error(
+        nesting_error_to_tolerance_ratio(
             found.large.corners_px, found.small.corners_px, SETUP.small_to_large_side_ratio
         )
         < 0.5

@@ -16,7 +16,7 @@ from perchctl.vision.markers.corners import (
     refine_subpix,
 )
 from perchctl.vision.markers.edge_fit import refine_corners_by_lines
-from perchctl.vision.markers.pattern import has_matching_cells, make_border_cells
+from perchctl.vision.markers.pattern import has_matching_cells, make_cells_along_border
 from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -24,7 +24,7 @@ from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 
 RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
-RIMS = {cells: make_border_cells(bits) for cells, bits in RIMS.items()}
+RIMS = {cells: make_cells_along_border(bits) for cells, bits in RIMS.items()}
 POSES = [
     (0.0, 0.0, 0.24, 0.0, 0.0, 0.0),
     (0.02, -0.01, 0.24, 0.5, 0.05, -0.08),
@@ -127,7 +127,7 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
     biases, raw_biases = [], []
     closed = {
         n: replace(
-            r, are_two_cells_inside_border_white=np.zeros_like(r.are_two_cells_inside_border_white)
+            r, are_first_two_inner_cells_white=np.zeros_like(r.are_first_two_inner_cells_white)
         )
         for n, r in RIMS.items()
     }

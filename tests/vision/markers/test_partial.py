@@ -257,7 +257,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     ]
     whole, rest = (edges.weight.sum() for edges in seen)
     assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
-    setup, found = replace(SETUP, hidden_mask=covered), []
+    setup, found = replace(SETUP, static_hidden_mask=covered), []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
         before: Detections | None = None
@@ -300,13 +300,13 @@ def profile_with(folder: Path, image: Grey | str | None, **camera: object) -> Pr
 def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     drawn = np.zeros((H, W), np.uint8)
     drawn[:40, :70] = 255
-    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector_setup.hidden_mask
+    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector_setup.static_hidden_mask
     assert np.array_equal(mask, drawn > 0)
     turned = make_pipeline(
         profile_with(tmp_path, drawn, mirrored="true"), CAMERA
-    ).detector_setup.hidden_mask
+    ).detector_setup.static_hidden_mask
     assert np.array_equal(turned, drawn[:, ::-1] > 0)
-    assert make_pipeline(Profile(), CAMERA).detector_setup.hidden_mask is None
+    assert make_pipeline(Profile(), CAMERA).detector_setup.static_hidden_mask is None
 
 
 WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
