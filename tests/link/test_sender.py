@@ -320,9 +320,11 @@ def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library
         told.append(each)
         raise OSError("the log's")
 
-    sender = library.sender(guard=EmergencyStop, on_sent=tell)
+    wants = threading.Event()  # not before the loop's command is out, which a stop would replace
+    sender = library.sender(guard=lambda: STOP if wants.is_set() else None, on_sent=tell)
     sender.put(PLACES[0])
     assert sender.drain(LIMIT_S)
+    wants.set()
     until(lambda: len(told) >= 3)
     assert set(library.taken) == {PLACES[0], STOP}
     assert sender.trouble() is None
