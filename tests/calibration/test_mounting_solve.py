@@ -170,7 +170,7 @@ def later(recording: MountingRecording, seconds: float) -> MountingRecording:
     [
         (replace(CARRY, poses=[], mirrored_pictures=200), "the picture is mirrored"),
         (carried_about(CARRY), "fix the target"),
-        (later(CARRY, -0.1), "time stamps 80 ms before"),
+        (later(CARRY, -0.1), "time stamps are 80 ms too early"),
         (later(CARRY, 1000.0), "clock"),
         (PIVOT, "a recording of the pivot, not of the carry"),
     ],
