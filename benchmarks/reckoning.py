@@ -131,7 +131,7 @@ class Filter:
             return
         _, was_m, yaw_rad = then
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        ex, ey, ez = (float(e) for e in pose.e_m)
+        ex, ey, ez = (float(e) for e in pose.gear_to_target_level_m)
         seen_m = -np.array([cos * ex - sin * ey, sin * ex + cos * ey, ez])
         before_m = self.position_m
         sigma_m = math.hypot(POSE_SIGMA_M, TILT_SIGMA_RAD * abs(ez))

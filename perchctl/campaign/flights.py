@@ -221,6 +221,6 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
         raise PerchError(
-            f"unexpected {type(error).__name__} in the flight of seed {seed}: {error} "
+            f"unexpected {type(error).__name__} in the flight with seed {seed}: {error} "
             "(PERCHCTL_DEBUG=1 shows where; please report it)"
         ) from error

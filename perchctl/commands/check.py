@@ -68,7 +68,7 @@ def check(
         bool,
         typer.Option(
             "--cameras",
-            help="Only list the cameras of this computer: number, name and path.",
+            help="Only list this computer's cameras, with number, name and path.",
         ),
     ] = False,
     lift: Annotated[

@@ -85,9 +85,9 @@ def fit(
         )
     else:
         problem = PerchError(
-            f"{output} was not written: on no axis are the weights better than the better "
-            "single marker by more than the interval; take more positions, or add --anyway "
-            "to write them regardless"
+            f"{output} was not written: the weights do not beat the better single marker "
+            "by more than the confidence interval on any axis; record more positions, or add "
+            "--anyway to write them regardless"
         )
         say(str(problem))
     if as_json:

@@ -94,8 +94,9 @@ class AttitudeLink(ReadOnlyLink):
 
     @property
     def motors_running(self) -> bool:
-        """True if the newest packet reports running motors, which it does until 2 s after they
-        stop, or an armed vehicle that does not arm itself, whose propellers spin all the time."""
+        """True if the newest packet reports that the motors are running (it keeps doing so for 2 s
+        after they stop), or that a vehicle without automatic arming is armed: its propellers spin
+        the whole time it is armed."""
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:

@@ -144,8 +144,8 @@ class PlannerState:
 
     @property
     def pause_reason(self) -> str:
-        """Why the mission pauses: the reason of the hold or of a row that waits. Empty if it does
-        not pause."""
+        """Why the mission pauses: the reason for the hold, or for waiting in the phase, which a row
+        of the transition table gives. Empty if it does not pause."""
         return self.hold_reason or self.waiting_reason
 
     @property

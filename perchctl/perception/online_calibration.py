@@ -111,11 +111,11 @@ def apply_latency(
     """Return the calibration with the latency by which the next image's time is to be corrected,
     for `camera.latency_s: measured`; `t_s` as in `update_calibration`.
 
-    If the accelerometer shows that the latency is very different, `correction_s` is given
-    (`VisualInertialWindow.correction_s`) and applied within half a second: the sums would take
-    seconds, during which a vehicle that flies with the target alone oscillates. A certain solution
-    of the sums is more accurate and is approached slowly. Sums that contradict the correction
-    belong to an earlier latency, and are restarted.
+    If the accelerometer shows that the latency is far from the one in use,
+    `VisualInertialWindow.correction_s` is set, and is applied within half a second. The sums would
+    take several seconds to converge, and meanwhile a vehicle that flies by the target alone would
+    oscillate. A certain solution of the sums is more accurate and is approached slowly. Sums that
+    contradict the correction belong to an earlier latency, and are restarted.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
     sure_s = (

@@ -108,7 +108,7 @@ class SimulationConfig(Section):
     cell_slow_ohm: Ohms = key(
         (0.0, 0.0), "additional resistance of an old or cold cell, which builds up within 15 s"
     )
-    cell_charge: Charges = key((0.6, 1.0), "battery charge, as a share of a new cell's")
+    cell_charge: Charges = key((0.6, 1.0), "battery charge, as a fraction of a new cell's capacity")
     cell_knee: Knees = key((0.1, 0.1), "remaining share of charge at which the voltage drops")
     motor_spread: float = key(
         0.07, "relative standard deviation of the motors' strengths", ge=0, le=0.2

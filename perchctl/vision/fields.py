@@ -114,7 +114,9 @@ def interpolated_edge_sigma_px(blur_sigma_px: float) -> float:
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """Return the frame with `picture_kind` set to ``woven`` or ``whole`` if it was None."""
+    """Return the frame with its `picture_kind`: ``woven`` if it is interlaced, so that its odd and
+    even rows were exposed at different times, or ``whole`` if all rows were exposed together. A
+    kind that is already known stays."""
     if frame.picture_kind is not None:
         return frame
     return replace(frame, picture_kind="woven" if is_combed(frame.image) else "whole")

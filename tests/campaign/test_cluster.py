@@ -143,7 +143,9 @@ def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
         assert [flight.seed for flight in flown] == [3, 0, 2]
         assert sorted(flight.seed for flight in told) == [0, 2, 3]
         assert {flight.pid for flight in flown} <= {each.pid for each in workers}
-        with pytest.raises(PerchError, match="unexpected ZeroDivisionError in the flight of seed"):
+        with pytest.raises(
+            PerchError, match="unexpected ZeroDivisionError in the flight with seed"
+        ):
             fly_all(fails_later, [0, 1], pool)
         fly = partial(dies_in_flight, profile, marks, (SEED,))
         (survivor,) = fly_all(fly, [SEED], pool)

@@ -149,7 +149,7 @@ def test_a_second_press_ends_the_program_at_once() -> None:
 @pytest.mark.parametrize(
     ("fly", "words"),
     [
-        (fails_later, "unexpected ZeroDivisionError in the flight of seed 1: no such luck"),
+        (fails_later, "unexpected ZeroDivisionError in the flight with seed 1: no such luck"),
         (is_killed_later, "was killed; "),
     ],
 )

@@ -80,7 +80,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
 @pytest.mark.parametrize("lost_s", [0.0, 0.06])
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
-    """Level, by thrust alone, within a second: long before the estimate itself contradictions."""
+    """Level, by thrust alone, within a second: long before the estimate contradicts itself."""
     felt, state, sent = Felt(), remembering(state_in(phase), failed_attempts=1), []
     for i in range(125):
         t_s = BEGIN_S + 0.01 * (i - 24)

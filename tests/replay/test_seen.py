@@ -71,7 +71,7 @@ def test_they_show_all_that_matters() -> None:
     [
         (edge_fit, "_EDGE_SHIFT_PRIOR_SIGMA_PX"),  # the fit of edges
         pytest.param(edge_fit, "MIN_LINE_SIGMA_PX", marks=pytest.mark.long),
-        pytest.param(pose, "_CLAIMED_SIGMA_DOF", marks=pytest.mark.long),  # the pose
+        pytest.param(pose, "_CORNER_SIGMA_PRIOR_DOF", marks=pytest.mark.long),  # the pose
         (the_filter, "_ACCELERATION_CORRELATION_TIME_S"),
     ],
 )

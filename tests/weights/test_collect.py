@@ -88,7 +88,7 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
 
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
-    """Pictures of two places; the person mistypes, contradictions, stops, and goes on."""
+    """Pictures of two places; the person mistypes, stops, and goes on."""
     profile = load_profile("sim")
     camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = SimulatedStand(profile, camera, 2, 0)

@@ -84,8 +84,8 @@ class CommandHistory:
     def with_frame_shift(
         self, setpoint_in_new_frame: PositionSetpoint | None, shift_m: Vector
     ) -> CommandHistory:
-        """Return the same commands after the world frame of the estimate has moved by `shift_m`.
-        The start position of the maneuver is shifted, and the setpoint becomes
+        """Return the same commands after the estimate's coordinates have jumped by `shift_m` (new =
+        old + shift). `shift_m` is added to the maneuver's start position, and the setpoint becomes
         `setpoint_in_new_frame`."""
         x, y, z = self.maneuver_start_position_m
         return replace(

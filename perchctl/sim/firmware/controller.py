@@ -238,9 +238,9 @@ class Controller:
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out ---
 # In the firmware's order (source: power distribution, motor driver and stabiliser of release
 # 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
-# exceeds the full duty cycle is taken off all four. One motor may therefore be requested to give
-# more than its full thrust, and gives it as long as the battery suffices, so a yaw step at hover
-# costs no height (docs/firmware.md, "Yaw step").
+# exceeds the full duty cycle is taken off all four. A single motor may therefore be commanded
+# above its nominal full thrust, and delivers it as long as the battery voltage allows, so a yaw
+# step in hover loses no height (docs/firmware.md, "Yaw step").
 
 SUPPLY_AT_BOOT_V = 4.2
 SUPPLY_FILTER = 0.01  # weight of each sample, at `SUPPLY_RATE_HZ`

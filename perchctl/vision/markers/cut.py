@@ -302,7 +302,7 @@ def _project_marker_corners(
 FloatImage = NDArray[np.float32]
 
 _LATTICE_COLUMNS = 80  # across the image, approximately
-_SAMPLES_PER_NODE_AND_AXIS = 2  # samples per node in both directions
+_SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2  # samples per node in both directions
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
 _POINTS_PER_IMAGE_SIDE = 40
 _VALID_TO_IMAGE_RADIUS_RATIO = 1.02
@@ -361,7 +361,10 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     fine = [
         rays.min(axis=0)[k]
         + step
-        * ((np.arange(_SAMPLES_PER_NODE_AND_AXIS * nodes[k]) + 0.5) / _SAMPLES_PER_NODE_AND_AXIS)
+        * (
+            (np.arange(_SAMPLES_PER_LATTICE_NODE_AND_AXIS * nodes[k]) + 0.5)
+            / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
+        )
         for k in (0, 1)
     ]
     x, y = np.meshgrid(*fine)
@@ -369,10 +372,15 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
     inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
     at = np.where(inside[:, None], at, -1e3)
-    every = max(round(w / (_SAMPLES_PER_NODE_AND_AXIS * _LATTICE_COLUMNS)), 1)
+    every = max(round(w / (_SAMPLES_PER_LATTICE_NODE_AND_AXIS * _LATTICE_COLUMNS)), 1)
     size = (max(w // every, 1), max(h // every, 1))
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
-    shape = (int(nodes[1]), _SAMPLES_PER_NODE_AND_AXIS, int(nodes[0]), _SAMPLES_PER_NODE_AND_AXIS)
+    shape = (
+        int(nodes[1]),
+        _SAMPLES_PER_LATTICE_NODE_AND_AXIS,
+        int(nodes[0]),
+        _SAMPLES_PER_LATTICE_NODE_AND_AXIS,
+    )
     flat = x.shape
     return CoarseLattice(
         first_node_normalised=rays.min(axis=0) + step / 2.0,
@@ -407,7 +415,7 @@ def _sample_at_nodes(image: NDArray[np.uint8] | FloatImage, lattice: CoarseLatti
 
 
 def _downsample(fine_image: FloatImage) -> FloatImage:
-    rows, columns = (n // _SAMPLES_PER_NODE_AND_AXIS for n in fine_image.shape)
+    rows, columns = (n // _SAMPLES_PER_LATTICE_NODE_AND_AXIS for n in fine_image.shape)
     return np.asarray(
         cv2.resize(fine_image, (columns, rows), interpolation=cv2.INTER_AREA), np.float32
     )
@@ -421,7 +429,7 @@ def render_drawing(
 ) -> FloatImage:
     """Return the whiteness, 0 to 1, of the drawing projected by H (3, 3), at the lattice's nodes
     and at `margin_nodes` more nodes on each side."""
-    step = lattice.node_spacing_normalised / _SAMPLES_PER_NODE_AND_AXIS
+    step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
         - 0.5 * (lattice.node_spacing_normalised - step)
@@ -434,8 +442,8 @@ def render_drawing(
     M = G @ H_normalised_drawing @ np.linalg.inv(T)
     rows, columns = lattice.is_in_image.shape
     size = (
-        _SAMPLES_PER_NODE_AND_AXIS * (columns + 2 * margin_nodes),
-        _SAMPLES_PER_NODE_AND_AXIS * (rows + 2 * margin_nodes),
+        _SAMPLES_PER_LATTICE_NODE_AND_AXIS * (columns + 2 * margin_nodes),
+        _SAMPLES_PER_LATTICE_NODE_AND_AXIS * (rows + 2 * margin_nodes),
     )
     fine = cv2.warpPerspective(
         white,
@@ -491,7 +499,9 @@ PAPER_REACH_LARGE_HALF_SIDES = 1.25  # half sides of the large marker that are c
 _POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # points along a cell's side
 # share of a cell's side near its ends, where the next cell's corner blurs the edge
 _EDGE_END_MARGIN_CELLS = 0.15
-_SMALL_MARKER_REACH_HALF_SIDES = 1.2  # half sides of the central marker, which hides the large one
+_HIDDEN_BY_SMALL_MARKER_ITS_HALF_SIDES = (
+    1.2  # half sides of the central marker, which hides the large one
+)
 _TEXTURE_SIZE_PX = 320
 
 
@@ -530,7 +540,7 @@ def make_outline(
 ) -> TargetOutline:
     """Return the edges of both markers as points. The tolerances are standard deviations of the
     position of a printed edge, in cells."""
-    hidden = _SMALL_MARKER_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
+    hidden = _HIDDEN_BY_SMALL_MARKER_ITS_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
         for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
