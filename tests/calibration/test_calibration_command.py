@@ -132,7 +132,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     whole = (rendered[0] / "board_00.png").read_bytes()
     (tmp_path / "board_99.png").write_bytes(b"no picture")
     unread = "board_99.png: cannot be read as a picture"
-    refused(calibrate(*words), 30, "none of 1 pictures", unread)
+    refused(calibrate(*words), 30, "none of 1 images", unread)
     for path in sorted(rendered[0].iterdir())[:6]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "board_02b.png").write_bytes(whole[: len(whole) // 2])
@@ -152,7 +152,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
         (["images:{board}", "-o", "reported.yaml"], 30, ["reported.html already exists"]),
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
         (["images:sizes"], 30, ["3 of 4 images are 480x360", "board_02.png is 480x300 px"]),
-        (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 pictures"]),
+        (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 images"]),
     ],
 )
 def test_pictures_that_will_not_do_are_refused(
