@@ -48,9 +48,7 @@ class ExpectedOutcome:
 
 
 def _killed_in_landing(facts: Facts) -> float | None:
-    return (
-        facts.killed_s if facts.has_effect(killed) and facts.make_onboard_landing_command else None
-    )
+    return facts.killed_s if facts.has_effect(killed) and facts.was_landing_onboard else None
 
 
 def _let_go_later(facts: Facts) -> float | None:

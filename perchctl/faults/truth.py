@@ -113,7 +113,7 @@ class Facts:
     Attributes:
         effects: the fault's effects, which began at `begin_s`.
         silence_lock_s: when the firmware locked the vehicle because no packet had arrived.
-        make_onboard_landing_command: True if the onboard landing was under way when that silence
+        was_landing_onboard: True if the onboard landing was under way when that silence
             began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle rebooted in the air while its motors turned.
@@ -131,7 +131,7 @@ class Facts:
     effects: tuple[e.Effect, ...] = ()
     begin_s: float | None = None
     silence_lock_s: float | None = None
-    make_onboard_landing_command: bool = False
+    was_landing_onboard: bool = False
     killed_s: float | None = None
     rebooted_s: float | None = None
     stop_s: float | None = None
@@ -181,9 +181,7 @@ class FactsRecorder(Facts):
 
     def _note_silence(self, s: Sample) -> None:
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        self.make_onboard_landing_command = self.make_onboard_landing_command or (
-            long and self._landed_alone
-        )
+        self.was_landing_onboard = self.was_landing_onboard or (long and self._landed_alone)
         locks = s.locked and not (self._before and self._before.locked)
         ordered = self._vehicle.firmware.supervisor.emergency  # locked by a command
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered

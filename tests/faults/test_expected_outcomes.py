@@ -32,13 +32,13 @@ def test_they_name_flags() -> None:
         ("cut by the firmware", Facts(), None),
         (
             "lands alone",
-            Facts((partial(e.killed),), killed_s=6.0, make_onboard_landing_command=True),
+            Facts((partial(e.killed),), killed_s=6.0, was_landing_onboard=True),
             6.0,
         ),
         ("lands alone", Facts((partial(e.killed),), killed_s=6.0), None),
         (
             "lands alone",
-            Facts((partial(e.hung, for_s=9.0),), killed_s=6.0, make_onboard_landing_command=True),
+            Facts((partial(e.hung, for_s=9.0),), killed_s=6.0, was_landing_onboard=True),
             None,
         ),
         ("the operator's word", Facts(stop_s=9.0), 9.0),
@@ -72,7 +72,7 @@ def test_each_by_its_cause(name: str, facts: Facts, cause_s: float | None) -> No
 CAUSED: dict[str, Facts] = {
     "started again": Facts(rebooted_s=10.0),
     "cut by the firmware": Facts(silence_lock_s=10.0),
-    "lands alone": Facts((partial(e.killed),), killed_s=10.0, make_onboard_landing_command=True),
+    "lands alone": Facts((partial(e.killed),), killed_s=10.0, was_landing_onboard=True),
     "the operator's word": Facts(stop_s=10.0),
     "let go after the flight": Facts(magnet_failed_s=10.0, hung_through_watch=True),
     "knocked off the magnet": Facts(effects=(BLOW,), begin_s=9.95, slipped_s=10.0, toppled=True),

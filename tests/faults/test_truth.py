@@ -138,7 +138,7 @@ def test_silence_that_ends_in_a_cut() -> None:
     assert it.facts.silence_lock_s is None
     it.show(HOVER, 2.0, uplink=False).show(HOVER, 1.0, uplink=False, locked=True)
     assert it.facts.silence_lock_s == pytest.approx(4.0 + CUT_S + 0.05)
-    assert not it.facts.make_onboard_landing_command
+    assert not it.facts.was_landing_onboard
 
 
 @pytest.mark.parametrize(
@@ -163,8 +163,8 @@ def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() 
     it = Recorded().show(HOVER, 1.0)
     it.planner.active = True
     it.show(HOVER, CUT_S - 0.1, uplink=False)
-    assert not it.facts.make_onboard_landing_command
-    assert it.show(HOVER, 0.2, uplink=False).facts.make_onboard_landing_command
+    assert not it.facts.was_landing_onboard
+    assert it.show(HOVER, 0.2, uplink=False).facts.was_landing_onboard
 
 
 @pytest.mark.parametrize(("before", "flew"), [(HOVER, True), (HANGING, False)])
