@@ -155,7 +155,7 @@ class Coordinator:
         self._views = tuple(
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
-        # read only once, so that all decisions in this round are based on the same command
+        # read only once: a command to land must not follow the permission that it would prevent
         word = self._switch.read()
         if self._confirmed and are_all_ready(self._views) and word is OperatorRequest.NONE:
             self.started = True

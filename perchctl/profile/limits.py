@@ -100,7 +100,8 @@ _DOUBTFUL = {
     },
     "battery limits": {
         "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
-        # A full battery when a light vehicle hovers (docs/firmware.md, "Thrust to PWM").
+        # 3.7 V is what a full battery still gives while a light vehicle hovers (docs/firmware.md,
+        # "Thrust to PWM").
         "safety.min_load_v < 3.7": (
             "hovering takes even a full battery below it, so the vehicle would land as "
             "soon as it takes off"

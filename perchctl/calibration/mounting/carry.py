@@ -138,7 +138,8 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """Return the target's rotation in the world: the median of those from all images."""
+    """Return the target's rotation in the world: from the image whose rotation has the smallest
+    median distance to those from the other images."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam

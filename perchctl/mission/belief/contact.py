@@ -76,7 +76,8 @@ GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
 LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
 """Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice what a
-settled one moves. Larger: a contact's offset is reported less precisely than it is known."""
+settled one moves. Larger: a contact's offset is reported less precisely than it is known.
+Smaller: a vehicle that is pushed just before it touches is reported too precisely."""
 DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
