@@ -22,6 +22,7 @@ from typing import Protocol
 from perchctl.errors import InvalidValue, PerchError, SafetyAbort
 from perchctl.extensions import error_at
 from perchctl.fleet.dispatch import (
+    HUNG_S,
     NearPair,
     VehicleView,
     are_all_ready,
@@ -38,10 +39,6 @@ from perchctl.mission import OperatorRequest
 ROUND_S = 0.02
 """Time between two rounds, s. Longer: a stop is delayed for longer. Shorter: the rounds use too
 much computing time."""
-HUNG_S = 10.0
-"""Time without a message after which a process is ended, s. Its vehicle is down by then, since the
-firmware stops the motors 2 s after the last packet. Longer: the fleet waits for nothing. Shorter:
-flights are lost when a computer pauses."""
 START_HUNG_S = 60.0
 """The same time for a process that has not sent anything yet, s. On a busy computer, loading its
 libraries takes half a minute, and nothing is armed before all vehicles are ready. Longer: the

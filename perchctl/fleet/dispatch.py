@@ -47,6 +47,11 @@ FRESH_PLACE_S = 0.5
 """Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
 other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
 second, distances are unknown all the time."""
+HUNG_S = 10.0
+"""Time without a message after which a process is ended, s. Its vehicle is down by then, since the
+firmware stops the motors 2 s after the last packet. Longer: the fleet waits for nothing. Shorter:
+flights are lost when a computer pauses, and a neighbour climbs while a vehicle that nobody controls
+may still be in the air."""
 ROUNDING_M = 1e-6
 """Distance by which a vehicle at the very edge of its corridor may seem too near a climb, m.
 Larger: a climb begins although another vehicle is too near."""
@@ -75,6 +80,19 @@ class VehicleView:
     def is_in_air(self) -> bool:
         """True from its first setpoint to the end of its mission, according to its status."""
         return self.result is None and self.stage is Stage.FLYING
+
+    @property
+    def may_be_in_air(self) -> bool:
+        """True if it is in the air, or if its flight has ended without a known landing, and it may
+        not have come down by itself yet."""
+        result = self.result
+        lost = (
+            result is not None
+            and result.has_flown
+            and result.outcome in (VehicleOutcome.FAILED, VehicleOutcome.ABORTED)
+            and self.silent_s <= HUNG_S
+        )
+        return self.is_in_air or lost
 
     @property
     def place_age_s(self) -> float:
@@ -217,15 +235,16 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
     is, or may be, within the plan's separation from its climb, a column as wide as its corridor.
 
     A vehicle without a known position is assumed to be in its corridor only if it has no position
-    in room axes to report, still answers, and is not landing. Otherwise it may be up to
-    `TARGET_ALONE_M` away from its path.
+    in room axes to report, still flies, answers, and is not landing. Otherwise it may be up to
+    `TARGET_ALONE_M` away from its path. So may one whose flight has ended without a known landing,
+    until it is down.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
     least_m = radius_m + plan.separation_m - ROUNDING_M
     places = air_places(plan, views)
     for view in views:
         other = view.name
-        if other == name or not view.is_in_air:
+        if other == name or not view.may_be_in_air:
             continue
         place_m = places.get(other)
         if place_m is not None:
@@ -233,7 +252,7 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
                 return f"{other} is too close to its climb"
             continue
         lands = view.status is not None and view.status.phase is Phase.LANDING
-        if other in places or lands or view.is_silent:
+        if other in places or lands or view.is_silent or not view.is_in_air:
             corridor = plan.corridors[other]
             lost = replace(corridor, radius_m=max(corridor.radius_m, TARGET_ALONE_M))
             if lost.distance_to_m(target_m) < least_m:

@@ -17,6 +17,7 @@ from perchctl.errors import InvalidValue
 from perchctl.fleet import make_plan
 from perchctl.fleet.dispatch import (
     FRESH_PLACE_S,
+    HUNG_S,
     NEAR_MARGIN_M,
     VehicleView,
     decide,
@@ -284,6 +285,26 @@ def test_a_vehicle_that_cannot_share_its_place_is_trusted_until_it_lands_or_is_s
         in_own_axes("v1", TARGETS["v1"], phase=phase, place_m=None), silent_s=silent_s
     )
     assert decide(plan, views, started=True).orders["v0"].may_climb is may
+
+
+@pytest.mark.parametrize(
+    ("outcome", "has_flown", "silent_s", "may"),
+    [
+        (VehicleOutcome.FAILED, True, 0.1, False),  # a process that was killed in the air
+        (VehicleOutcome.ABORTED, True, 3.0, False),  # a landing that nothing confirmed
+        (VehicleOutcome.FAILED, True, HUNG_S + 0.1, True),  # it is down by now
+        (VehicleOutcome.FAILED, False, 0.1, True),
+        (VehicleOutcome.LANDED, True, 0.1, True),
+        (VehicleOutcome.PERCHED, True, 0.1, True),
+    ],
+)
+def test_nobody_climbs_beside_a_vehicle_that_may_still_come_down(
+    outcome: VehicleOutcome, has_flown: bool, silent_s: float, may: bool
+) -> None:
+    result = Result(exit_code=52, outcome=outcome, reason="", has_flown=has_flown)
+    views = [in_own_axes(name, TARGETS[name]) for name in TARGETS]
+    views[1] = replace(views[1], result=result, silent_s=silent_s)
+    assert [permitted(views)[name] for name in ("v0", "v2")] == [may, may]
 
 
 def test_nobody_climbs_before_the_start_or_on_a_command_to_land() -> None:
