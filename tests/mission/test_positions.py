@@ -345,6 +345,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         (0.44, 1.3, 0.0, True),  # exposed 40 ms before it touched
         (0.55, 1.3, 0.0, False),  # exposed 0.15 s before: dead reckoning knows better
         (0.05, 1.0, 0.0, False),  # it hovers: nothing holds the gear in place
+        (0.05, 1.3, 0.02, False),  # 0.1 s before it touched, however steadily it climbed
         (0.05, 1.3, 0.2, False),  # an image of before the climb, whatever its time says
     ],
 )

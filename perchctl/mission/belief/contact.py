@@ -154,6 +154,8 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
+    # If the climb is too slow for its end to change the speed, the image still shows the gap.
+    before_touch_s = max(before_touch_s, z_m / perch.climb_mps)
     sigma_m = math.hypot(
         target.measured_gear_to_target_sigma_m,
         GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M,
