@@ -52,7 +52,7 @@ def write_film(
     """Write the flight as a real-time film (.mp4 or .gif), and return the film's number of images.
 
     Args:
-        images: the recorded images, oldest first; None if there is no recording.
+        pictures: the recorded images, oldest first; None if there is no recording.
         rate_hz: images per second of flight; the period is rounded to 0.01 s.
         width_px: width of the film; the height is 9/16 of the width.
         progress: called after each image of the film with the number of images done and the total.

@@ -45,7 +45,7 @@ class FilmedVehicle:
     """One vehicle in the film of a fleet.
 
     Attributes:
-        images: the recorded images, oldest first; None if there is no recording.
+        pictures: the recorded images, oldest first; None if there is no recording.
         begin_s: time of the first tick, on the fleet's clock.
         pace: seconds on the flight's clock per second on the fleet's clock.
         home_m, target_m, radius_m: the two ends and the radius of its corridor, in room axes.

@@ -1,6 +1,7 @@
 """The analysis of one flight, as used by `log show`, `compare`, `plot` and `report`.
 
-Times are in seconds since the first turn, that is, the first iteration of the flight loop.
+Times are in seconds since the flight's first turn: the first iteration of the loop in which the
+vehicle was flown.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _NUMBER = re.compile(r"[0-9.]+")
 
 @dataclass(frozen=True)
 class Hold:
-    """A period in which the vehicle held its position; times are since the flight's first turn."""
+    """A period in which the mission paused; times are since the flight's first turn."""
 
     start_s: float
     end_s: float
@@ -105,9 +106,9 @@ class FlightAnalysis:
     `records` contains all ticks with all their fields, and `events` the flight's events.
     `column(field)` returns one field for all ticks, (n,), NaN where it is missing.
 
-    Times are measured from the first iteration of the flight loop. A property that meets an invalid
-    value in the log raises InvalidValue, TypeError, ValueError, LookupError or AttributeError;
-    within `perchctl.record.wrap_log_errors` all of these become InvalidValue.
+    Times are measured from the first iteration in which the vehicle was flown. A property
+    that meets an invalid value in the log raises InvalidValue, TypeError, ValueError, LookupError
+    or AttributeError; within `perchctl.record.wrap_log_errors` all of these become InvalidValue.
     """
 
     def __init__(self, log: FlightLog) -> None:
@@ -134,7 +135,7 @@ class FlightAnalysis:
 
     @cached_property
     def position_holds(self) -> tuple[Hold, ...]:
-        """Periods in which the vehicle held its position, each within one phase and for one reason.
+        """Periods in which the mission paused, each within one phase and for one reason.
         The numbers in the reason may change meanwhile; the text is the one at the end of the
         period."""
         found: list[Hold] = []

@@ -35,7 +35,7 @@ class Frames:
     """Timing of the camera frames that the pipeline processed, oldest first.
 
     Attributes:
-        t_s: (n,) exposure times, measured from the first iteration of the flight loop.
+        t_s: (n,) exposure times, measured from the first iteration in which it was flown.
         has_target: (n,) bool, True for the frames that showed the target.
         gaps_s: (k, 2) start and end of each gap without a usable frame.
         rate_hz: 1 over the median time between two frames; NaN if unknown.

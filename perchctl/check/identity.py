@@ -4,7 +4,8 @@ starting place of a fleet. The rows are for one of several vehicles on the floor
 ```
 vehicle  its LEDs blink, and somebody sees them blink at this home
 body     the motion capture sees its rigid body at this home
-target   its camera sees its target where it must be as seen from this home ```
+target   its camera sees its target where it must be as seen from this home
+```
 
 Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
 camera would show the same image, or if the target is not in view, perchctl asks the user to cover

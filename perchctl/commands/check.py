@@ -43,7 +43,7 @@ SHOWN = {
     checks.Verdict.SKIPPED: "skip",
 }
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
-"""Exit code of a failing row; all other rows have that of `SafetyAbort`."""
+"""Exit codes of failing rows; all other failing rows have that of `SafetyAbort`."""
 
 app = new_app()
 

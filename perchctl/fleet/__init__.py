@@ -38,10 +38,10 @@ folder: read that file again.
 load: the fleet file, and checks that two vehicles share nothing that they must not share. fleet:
 the frozen values. assignment: interchangeable targets. radio: dongles and the radio budget.
 schedule: corridors, the profiles that enforce them, and who flies when. plan: all of this in one
-call. drawing: the room from above. identify: check on the floor that each vehicle stands at its
-home. convert: lists of Crazyflies from other programs. lockstep: the simulated flight of a whole
-fleet. room: what its vehicles share. coroutine: how its flights wait for each other. results: how
-they ended.
+call. drawing: the room from above. identify: check on the floor that vehicle, body, camera and
+home belong together. convert: lists of Crazyflies from other programs. lockstep: the simulated
+flight of a whole fleet. room: what its vehicles share. coroutine: how its flights wait for each
+other. results: how they ended.
 """
 
 import lazy_loader

@@ -4,8 +4,8 @@
     groups fly in the order of the schedule, each once all of the group before have ended
     a vehicle that has ended in another one's corridor, or nobody knows where, keeps it on the floor
     a failure before the first take-off ends all flights; later, only with ``on_failure: land-all``
-    two vehicles in the air that are known to be too close to each other land no vehicle begins to
-    climb while another one is near its climb, or may be
+    two vehicles in the air that are known to be too close to each other land
+    no vehicle begins to climb while another one is near its climb, or may be
 
 A vehicle's reported position is used only if it is measured in room axes (``frame: room``). For all
 other vehicles, the positions in the plan are used.

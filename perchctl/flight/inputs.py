@@ -268,7 +268,7 @@ class FlightInputs:
         False while no good frames arrive or frames are not searched, because the filter limits its
         prediction by the number of frames."""
         target = self.perception.target(now_s)
-        if self._positioning is not None:  # the target defines the world
+        if self._positioning is not None:  # otherwise, estimate and target would drift together
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.is_blind or stale):

@@ -160,7 +160,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         )
         with contextlib.suppress(Exception):  # the part that failed may fail again
             turns.report_failure(inputs, error)
-        with contextlib.suppress(Exception):  # if several judges fail, the first error is raised
+        with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
             watchers.event(Event.make_rescue_note(parts.clock.now(), error, rest.state, rest.text))
         raise
 

@@ -90,7 +90,7 @@ def check_options(options: FlyOptions) -> None:
     if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.source.is_mocap and find_spec("motioncapture") is None:
-        raise no_motion_capture()  # only a real flight needs it: the simulated room has its own
+        raise no_motion_capture()  # it also reads the simulated room; only a host is not needed
     source = parse_source(options.source)
     if source.is_own:
         load_extension(options.source, "camera.source")

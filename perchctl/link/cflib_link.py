@@ -58,7 +58,7 @@ from perchctl.vehicle import (
 )
 
 SILENCE_S = 1.5
-"""Time without telemetry after which the link counts as lost, s."""
+"""Time without telemetry after which the link reports a problem, s."""
 DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5

@@ -10,8 +10,8 @@ One datagram carries one CRTP packet, as with cflib's `udp://`. The two reserved
 header are always set (`perchctl.link.crtp.Packet`); a datagram without them is a message:
 
 - `HELLO`, the vehicle and a key: the flight asks for this vehicle's packets, first to connect and
-then once a second. The answer is a `REPORT`. The key is a random part of the flight's URI, so that
-no other program on the computer can take over the vehicle.
+  then once a second. The answer is a `REPORT`. The key is a random part of the flight's URI, so
+  that no other program on the computer can take over the vehicle.
 - `BYE`: the flight has closed its link.
 - `ROOM` and a byte: the number of the flight's packets that are waiting in the hub for the radio.
 - `REPORT` and a `HubReport` as JSON.

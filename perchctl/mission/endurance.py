@@ -161,8 +161,8 @@ def battery_shortfall_text(c: Context) -> str:
 
 
 def _time_left_without_battery_reading_s(c: Context) -> float:
-    """Return the time without a battery reading, s, after which the row `battery-unknown` lands the
-    vehicle."""
+    """Return the time left, s, until the row `battery-unknown` lands a vehicle without a battery
+    reading."""
     return c.safety.battery_stale_s - max(
         c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
     )

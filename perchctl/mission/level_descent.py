@@ -273,8 +273,8 @@ def _find_floor_detection_time_s(
 ) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
-    The floor is detected by an impact from below during the descent, or by pictures that show no
-    motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed shows a
+    The floor is detected by an impact from below while the vehicle sank, or by pictures that show
+    no motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed shows a
     descent.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)

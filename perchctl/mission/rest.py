@@ -14,8 +14,8 @@ from perchctl.mission.phase import Phase, VehicleDiagnosis
 MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
 estimate."""
-MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M = 0.45
-"""Height at the start of a descent above which the height distinguishes hanging from standing,
+MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
+"""Height, at the start of a descent or now, above which it distinguishes hanging from standing,
 m."""
 MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
 """Height below which the vehicle stands, m."""
@@ -45,7 +45,7 @@ def find_rest_state(c: Context) -> RestState:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _find_rest_state_from_falls(c)
-    high = state.entry.position_m[2] - b.ground_z_m > MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
+    high = state.entry.position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
     stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_IF_STILL_HANGING_M
     at_contact = b.vehicle_world_z_at_last_contact_m is not None and not b.target.is_far_above
@@ -73,7 +73,7 @@ def _is_held_by_other_object(c: Context) -> bool:
         b.is_position_valid
         and not b.is_target_position_source
         and b.first_estimate_jump_at_s is None
-        and b.height_m > MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
+        and b.height_m > MIN_HEIGHT_TO_INFER_HANGING_M
     )
     return below and (b.target.is_fresh or by_position)
 

@@ -121,8 +121,8 @@ class PlannerState:
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
     obstacle_blocked_at_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
     release_began_at_s: float | None = None  #: start of the release by raw thrust
-    motor_stop_commanded_at_s: float | None = None  #: first order to stop the motors
-    last_stop_or_land_command_at_s: float | None = None  #: last order to land or to stop the motors
+    motor_stop_commanded_at_s: float | None = None  #: first command to stop the motors
+    last_stop_or_land_command_at_s: float | None = None  #: last command to land or to stop motors
     stop_or_land_command_count: int = 0
     commanded_raw_thrust: int | None = None  #: last commanded raw thrust; None in position mode
     descent: LevelDescentState = LevelDescentState()

@@ -122,7 +122,7 @@ def add_rows(
                     f"({row.severity.name}); allowed from {phase.name}: {', '.join(may) or 'none'}"
                 )
         if row.stop_command is not None or row.outcome is not None or row.diagnosis:
-            raise InvalidValue(f"row {row.name!r} must not set stop, outcome or diagnosis")
+            raise InvalidValue(f"row {row.name!r} must not set stop_command, outcome or diagnosis")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = (
             _wrap_row_function(row.name, row.when),

@@ -291,7 +291,7 @@ def serve_parent() -> None:
         import motioncapture
 
         is_loaded, options = True, setup.options
-        if setup.kind == "optitrack":  # Qualisys's reader does not resolve host names
+        if setup.kind == "optitrack":  # OptiTrack's reader does not resolve host names
             options = options | {"hostname": socket.gethostbyname(options["hostname"])}
         client = motioncapture.connect(setup.kind, options)
         faulthandler.cancel_dump_traceback_later()

@@ -254,10 +254,10 @@ class PositionFeed:
         return f"no frame has arrived from {who} {for_s}"
 
 
-# --- Validate motion-capture frames, and compute the vehicle's pose from them --- Faults of motion
-# capture look like valid data: a hidden body keeps its last pose, two bodies swap names, a
-# symmetric body flips, a pose arrives late (faults 10 and 11). Each of these poses is rejected with
-# one sentence that names the cause.
+# --- Validate motion-capture frames, and compute the vehicle's pose from them ---
+# Faults of motion capture look like valid data: a hidden body keeps its last pose, two bodies swap
+# names, a symmetric body flips, a pose arrives late (faults 10 and 11). Each of these poses is
+# rejected with one sentence that names the cause.
 
 
 STALE_FRAME_S = 0.05

@@ -103,7 +103,7 @@ _DOUBTFUL = {
         # 3.7 V is what a full battery still gives while a light vehicle hovers (docs/firmware.md,
         # "Thrust to PWM").
         "safety.min_load_v < 3.7": (
-            "hovering takes even a full battery below it, so the vehicle would land as "
+            "hovering takes even a full battery down to it, so the vehicle would land as "
             "soon as it takes off"
         ),
         "safety.min_rest_v < 4.35": "no battery rests at this voltage, so no flight would begin",

@@ -1,4 +1,4 @@
-"""The profile's keys for the mission: the seven phases, landing, and safety."""
+"""The profile's keys for the mission: the seven phases, the two ways down, and safety."""
 
 from __future__ import annotations
 
@@ -360,8 +360,7 @@ class SafetyConfig(Section):
     )
     ground_tolerance_m: float = key(
         0.15,
-        "maximum distance from `ground_z_m` at take-off; if it is larger, the vehicle hangs or is "
-        "held",
+        "maximum distance from `ground_z_m` at take-off; a vehicle farther away hangs or is held",
         gt=0,
         le=10,
     )

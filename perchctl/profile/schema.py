@@ -1,6 +1,6 @@
 """The profile as a whole: every key, its unit, its default and its bounds.
 
-Profiles are only checked here; `perchctl.profile.load` reads it from its file.
+Profiles are checked here and nowhere else; `perchctl.profile.load` reads them from their files.
 `perchctl.profile.vision`, `perchctl.profile.mission` and `perchctl.profile.simulation` hold the
 larger sections.
 """

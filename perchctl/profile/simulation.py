@@ -106,7 +106,8 @@ class SimulationConfig(Section):
         (0.11, 0.23), "internal resistance of the battery; none: 0.143, a good cell"
     )
     cell_slow_ohm: Ohms = key(
-        (0.0, 0.0), "additional resistance of an old or cold cell, which builds up within 15 s"
+        (0.0, 0.0),
+        "additional resistance of an old or cold cell, with a time constant of 15 s",
     )
     cell_charge: Charges = key((0.6, 1.0), "battery charge, as a fraction of a new cell's capacity")
     cell_knee: Knees = key((0.1, 0.1), "remaining share of charge at which the voltage drops")

@@ -52,7 +52,7 @@ FIELDS: dict[str, str] = {
     "phase": "phase of the mission",
     "stage": "markers seen in the newest frame: none, large, both or small",
     "reason": "why the phase was entered",
-    "hold": "why the vehicle is held in place, empty when it is not",
+    "hold": "why the mission pauses, empty if it does not",
     "attempts": "failed perching attempts so far",
     # the vehicle's own state estimate, world axes
     **_axes("{}_m", "body in the world of the state estimate, z up"),

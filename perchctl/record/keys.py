@@ -65,7 +65,7 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "accelerometer_offset_g": "offset_g",
         "last_telemetry_gap_ended_at_s": "silent_s",
         "last_gap_that_may_hide_fall_ended_at_s": "gap_s",
-        "integration_restarted_at_s": "started_s",
+        "vehicle_restarted_at_s": "started_s",
         "height_change_in_gap_m": "sunk_m",
         "mean_hover_thrust": "hover_thrust",
         "roll_pitch_error_rad": "misled_rad",

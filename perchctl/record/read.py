@@ -1,7 +1,7 @@
 """Read a flight log, even if its last line is incomplete.
 
 A turn is one iteration of the flight loop, and a tick is a turn in which the vehicle was flown.
-Unless stated otherwise, times are in seconds since the flight's first turn.
+Unless stated otherwise, times are in seconds since the first tick.
 """
 
 from __future__ import annotations
@@ -314,7 +314,7 @@ class FlightLog:
 
 TIMES = ("t_s", "frame_t_s")
 """Fields that are times on the loop's clock in the log; in a table, they are measured from the
-first iteration of the flight loop."""
+first iteration in which the vehicle was flown."""
 
 
 # --- the file ---

@@ -1,8 +1,9 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
-Line 1 is the header. Each iteration of the flight loop (turn) adds a `tick` record (rounded, for
-reading and plotting) and a `turn` record (exact and complete), with `event` and `sent` records
-between them. The last line is the `summary`. An error in writing the log never disturbs the flight.
+Line 1 is the header. Each iteration of the flight loop (turn) adds a `turn` record (exact and
+complete) and, if the vehicle was flown, a `tick` record (rounded, for reading and plotting), with
+`event` and `sent` records between them. The last line is the `summary`. An error in writing the log
+never disturbs the flight.
 """
 
 from __future__ import annotations

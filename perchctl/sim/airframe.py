@@ -36,8 +36,8 @@ class Airframe:
         arms_itself: True if it needs no arming request (auto-arming).
         idle_pwm: smallest duty cycle of each motor while the vehicle is armed, 0..65535; 0 if it
             arms itself.
-        spin_up_s: time from the arming request until its motors turn steadily enough to fly; after
-            2 s, the firmware disarms it.
+        spin_up_s: time from the arming request until its motors turn steadily enough to fly; if
+            that takes longer than 2 s, the firmware disarms the vehicle.
         thrust_base: its height controller's guess of the hover thrust, 0..65535.
         rate_gains: its controller's gains of roll and pitch rate (P, I, D).
         parameters: firmware parameters that differ from a Crazyflie 2.1's at boot.

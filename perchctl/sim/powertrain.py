@@ -84,11 +84,11 @@ STANDSTILL_V = motor_voltage(0.0)
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's state
-# (source: power management) are a discharge curve of the Crazyflie's own cell. - The voltage falls
-# under load by the cell's resistance at once, and in an old or cold cell by some more within
-# `ION_DIFFUSION_S`: ions that have to diffuse over a longer distance. - An old cell holds less
-# charge and has more resistance; `knee` is the share of the charge at which the steep end of the
-# curve begins.
+#   (source: power management) are a discharge curve of the Crazyflie's own cell.
+# - The voltage falls under load by the cell's resistance at once, and in an old or cold cell by
+#   some more within `ION_DIFFUSION_S`: ions that have to diffuse over a longer distance.
+# - An old cell holds less charge and has more resistance; `knee` is the share of the charge at
+#   which the steep end of the curve begins.
 
 
 CHARGE_C = 900.0
@@ -113,7 +113,7 @@ _CELL_CURVE: tuple[tuple[float, float], ...] = (
     (1.0, 4.2),
     (1.05, 4.3),
 )
-_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # slopes of its linear parts
+_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # charges at which its linear parts end
 _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 
 

@@ -42,7 +42,7 @@ class SimProcess:
         uri: address for cflib.
         stream_url: address of the video; "" without a camera.
         capture: the motion-capture system's kind and address for `motioncapture`, or None.
-        shared_time: how far simulated time has advanced, and how far it may advance.
+        shared_time: how far simulated time has advanced in real time, and how far it may advance.
         pid: process number of the child.
     """
 

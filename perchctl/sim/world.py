@@ -10,7 +10,7 @@ Assumptions of the model, each with its source:
 - Drag is linear in the airspeed, which R^2 = 0.98 confirms for 104 recorded flights; level it is
   `Scenario.drag_nspm`, vertically 0.008 N/(m/s) of four rotors that lift 42 g (identified by
   Foerster, ETH Zurich, 2015) and 0.001 of camera, board and gear.
-- Airspeed pitches the vehicle away from its direction of flight, nose up in forward flight, by
+- Airspeed tilts the vehicle away from its direction of flight, nose up in forward flight, by
   `Scenario.airspeed_moment_nmspm`.
 - Near the floor the rotors lift more, by `Scenario.ground_effect`.
 - A draught has a steady part and smooth gusts, which reach its nominal speed together when the
@@ -301,10 +301,10 @@ def build_model(scenario: Scenario) -> Any:
     )
 
 
-# --- The magnet: how it pulls the gear's tip towards the ceiling, and when it holds --- It acts
-# within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at contact, and falls
-# to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker than the later ones
-# (`Scenario.first_contact_force_n`); it is over when the tip has engaged and come off again.
+# --- The magnet: how it pulls the gear's tip towards the ceiling, and when it holds ---
+# It acts within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at contact,
+# and falls to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker than the later
+# ones (`Scenario.first_contact_force_n`); it is over when the tip has engaged and come off again.
 
 
 MAGNET_RADIUS_M = 0.025

@@ -129,8 +129,8 @@ def closed_form_weights(sums: Array) -> Array:
 
 
 # --- Widrow and Hoff's LMS, as in the paper ---
-# ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b, ``w
-# <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
+# ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b,
+# ``w <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
 # falls as 1 / rows, so that LMS ends at the least-squares weight instead of wandering about it.
 
 

@@ -150,8 +150,8 @@ def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> 
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
 
-# --- The report for a terminal of 80 columns, with the verdict first --- Lengths are in micrometres
-# and angles in thousandths of a degree.
+# --- The report for a terminal of 80 columns, with the verdict first ---
+# Lengths are in micrometres and angles in thousandths of a degree.
 
 
 WEIGHTS_COLUMNS = 80

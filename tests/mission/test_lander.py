@@ -66,7 +66,7 @@ from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint
 
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
-MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, LOW_M = 1.5, 0.2
+MIN_HEIGHT_TO_INFER_HANGING_M, LOW_M = 1.5, 0.2
 # --- By what is known ---------------------------------------------------------------------
 
 # Profile; what is observed, and what is remembered, beyond a hover that all is known of; what is
@@ -117,13 +117,7 @@ def context(
     if changes.get("last_order_s") and profile is BY_TARGET:
         # What once had positions from outside, and was found astray, knows as little.
         profile, remembered = MOCAP, {"is_position_diverged": True}
-    z_m = (
-        z_m
-        if z_m is not None
-        else HANG_Z_M
-        if held
-        else MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M
-    )
+    z_m = z_m if z_m is not None else HANG_Z_M if held else MIN_HEIGHT_TO_INFER_HANGING_M
     observed = dict(observed)
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
     state = remembering(
@@ -196,14 +190,12 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     """The kind of command that a way down gives a vehicle high up: setpoints by a position, its own
     landing where telemetry, link or loop are doubtful, else raw thrust."""
     began = remembering(
-        state_in(Phase.LANDING, NOW_S - 1.0, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
+        state_in(Phase.LANDING, NOW_S - 1.0, MIN_HEIGHT_TO_INFER_HANGING_M),
         t_s=NOW_S - TICK_S,
         **state,
     )
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
-    obs = at(
-        MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, age_s=age_s, obs=observed, behind_s=behind_s
-    )(NOW_S)
+    obs = at(MIN_HEIGHT_TO_INFER_HANGING_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
     return type(descent.act(Context(observing(began, obs, profile)))[1])
 
 
@@ -477,16 +469,14 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     before is none."""
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
-        state_in(Phase.LANDING, z_m=MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
-        last_telemetry=telemetry(NOW_S, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M),
+        state_in(Phase.LANDING, z_m=MIN_HEIGHT_TO_INFER_HANGING_M),
+        last_telemetry=telemetry(NOW_S, MIN_HEIGHT_TO_INFER_HANGING_M),
         catch_setpoint_above_vehicle_m=1.0, condition_start_times_s={MOTORS_OFF_AS_COMMANDED: 0.0,
         BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
-    obs = observation(
-        later_s, telemetry=telemetry(later_s, MIN_DESCENT_START_HEIGHT_TO_INFER_HANGING_M, **off)
-    )
+    obs = observation(later_s, telemetry=telemetry(later_s, MIN_HEIGHT_TO_INFER_HANGING_M, **off))
     after = observing(state, obs, profile)
     assert after.belief.condition_start_times_s[MOTORS_OFF_AS_COMMANDED] == (
         later_s if stale else 0.0

@@ -275,7 +275,7 @@ def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
             f"({found.frames.text}): {advice}"
         )
     pictures = len(found.views) + len(found.without_board)
-    of = f"of {pictures} images" if pictures > len(views) else "pictures"
+    of = f"of {pictures} images" if pictures > len(views) else "images"
     raise InvalidValue(
         f"only {len(views)} {of} show the board, but at least {MIN_VIEWS} are needed: "
         f"add {missing} or more (15 to 25 are good) {variety}"

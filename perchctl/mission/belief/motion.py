@@ -215,8 +215,8 @@ class FallDetector:
     decelerations harder than `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`. The climb rate v gained
     recently is
 
-        v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS, v + a dt - v dt /
-        FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
+        v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
+                 v + a dt - v dt / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
     `MAX_CLIMB_RATE_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less
@@ -429,7 +429,7 @@ class ImuMotion(
     last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest gap
     # end of the newest gap that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
-    integration_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
+    vehicle_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
     # change of the estimated height over the successive gaps until now; at most 0
     height_change_in_gap_m: float = 0.0
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
@@ -449,7 +449,7 @@ class ImuMotion(
         motion = replace(
             self.update_freeze(last, new),
             t_s=new.t_s,
-            integration_restarted_at_s=new.t_s if started_anew else self.integration_restarted_at_s,
+            vehicle_restarted_at_s=new.t_s if started_anew else self.vehicle_restarted_at_s,
             fusion_age=self.fusion_age.update(new),
             motors_off_since_s=min(self.motors_off_since_s, new.t_s)
             if new.thrust < 1

@@ -236,7 +236,7 @@ def _restart(
         # Motors that were off on both sides of the gap, or a restarted vehicle, cannot have
         # climbed under power.
         off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
-        flew = not (off or imu.integration_restarted_at_s > old.imu.t_s)
+        flew = not (off or imu.vehicle_restarted_at_s > old.imu.t_s)
         climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:

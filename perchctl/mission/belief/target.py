@@ -110,7 +110,7 @@ class VisualMotion:
         t_s: exposure of the newest detection.
         detected_since_s: exposure of the first detection after the last gap.
         gear_to_target_level_m: newest position of the target from the gear (ahead, left, up), m.
-        vehicle_velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
+        vehicle_velocity_level_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf

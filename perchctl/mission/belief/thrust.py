@@ -38,7 +38,7 @@ class HoverThrust:
 
     Attributes:
         thrust: 0..65535; 0 while unknown.
-        sigma: standard deviation, as a share of `thrust`.
+        sigma_fraction: standard deviation, as a share of `thrust`.
         estimate_before_descent: the estimate at the start of a descent by raw thrust; None before
             one.
     """

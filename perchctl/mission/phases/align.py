@@ -25,9 +25,10 @@ from perchctl.mission.setpoints import (
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
 MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
-"""Longest wait for permission to climb, s. Larger: the battery of a vehicle without permission runs
-down. Smaller: a neighbour whose landing or hanging process, which the parent ends after 10 s, bars
-the climb ends this flight, too."""
+"""Longest wait for permission to climb, s, from the entry into the phase or the end of a
+hold; `planner.perching_time_s` limits the total. Larger: the battery of a vehicle without
+permission runs down. Smaller: a neighbour that bars the climb only for a while, because it lands or
+until the parent has ended a process that does not respond, ends this flight, too."""
 
 ALIGNED = Condition[Context](
     "aligned",

@@ -49,7 +49,7 @@ def act(c: Context) -> Action:
 
 
 def time_since_motor_stop_command_s(c: Context) -> float:
-    """Seconds since the first order to stop the motors; -1 before it."""
+    """Seconds since the first command to stop the motors; -1 before it."""
     return (
         -1.0
         if c.state.motor_stop_commanded_at_s is None

@@ -11,7 +11,7 @@ drawing. Any start is safe because the photometric fit must verify it (`is_align
 
 The result is wrong where the photometric fit is (`perchctl.vision.markers.photometric_fit`). It is
 empty if another codeword would look the same, or if the marker is further from its expected
-position than 0.5 sides and 10 px. Corners are (4, 2) px.
+position than 0.5 sides or 10 px, whichever is larger. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
