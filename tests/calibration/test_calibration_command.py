@@ -150,7 +150,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     [
         (["images:{board}", "-o", "mine.yaml"], 30, ["mine.yaml already exists", "--force"]),
         (["images:{board}", "-o", "reported.yaml"], 30, ["reported.html already exists"]),
-        (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
+        (["{board}/board_0[01].png"], 30, ["only 2 images", "add 3"]),
         (["images:sizes"], 30, ["3 of 4 images are 480x360", "board_02.png is 480x300 px"]),
         (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 images"]),
     ],
