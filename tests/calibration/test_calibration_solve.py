@@ -150,7 +150,7 @@ def near_a_corner(views: list[BoardView]) -> list[BoardView]:
 @pytest.mark.parametrize(
     ("views", "advice"),
     [
-        (drawn(0)[0][:2], r"only 2 pictures.*add 3 or more"),
+        (drawn(0)[0][:2], r"only 2 images.*add 3 or more"),
         (drawn(1, max_tilt_deg=4.0)[0], r"tilted by more than.*add .* 20 to 45 deg"),
         (near_a_corner(drawn(2)[0]), r"cover .* %.*add views with the board at the .*right"),
     ],
