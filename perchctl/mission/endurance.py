@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
+    LOW_POWER_REPORT_DELAY_S,
     MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S,
     BatteryFit,
     PowerTrain,
@@ -74,7 +75,12 @@ def predict_hover_time_s(
     battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
     """Return the hover time, s, at `hover_thrust_fraction` (share of full thrust) until the row
-    `battery-low` applies; None if unknown."""
+    `battery-low` applies; None if unknown.
+
+    The row applies to the earlier of two events. The firmware reports low power
+    `LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the voltage
+    falls below `safety.min_load_v`, in hover or during a press.
+    """
     if (
         battery_fit.rest_v is None
         or battery_fit.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
@@ -82,23 +88,28 @@ def predict_hover_time_s(
     ):
         return None
     safety, perch = profile.safety, profile.planner.perch
-    hover_v = max(
-        float(profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)),
-        safety.min_load_v,
+    low_power_v = float(
+        profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)
     )
     lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V)
     press_load = max(hover_thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
     sag_v, true_to_counted_discharge_ratio = fit_sag_model(battery_fit)
-    end_v = hover_v + sag_v * hover_thrust_fraction
+    min_v = safety.min_load_v + sag_v * hover_thrust_fraction
     if profile.planner.hover is None:
-        end_v = max(end_v, press_v + sag_v * press_load)
-    share = charge_fraction_from_rest_v(battery_fit.rest_v) - charge_fraction_from_rest_v(end_v)
-    return max(0.0, share) / (
+        min_v = max(min_v, press_v + sag_v * press_load)
+    charge = charge_fraction_from_rest_v(battery_fit.rest_v)
+    discharge_per_s = (
         true_to_counted_discharge_ratio
         * hover_thrust_fraction
         * full_thrust_discharge_fraction_per_s(profile.vehicle.battery_mah, power_train)
     )
+
+    def time_until_s(rest_v: float) -> float:
+        return max(0.0, charge - charge_fraction_from_rest_v(rest_v)) / discharge_per_s
+
+    low_power_s = time_until_s(low_power_v + sag_v * hover_thrust_fraction)
+    return min(low_power_s + LOW_POWER_REPORT_DELAY_S, time_until_s(min_v))
 
 
 @dataclass(frozen=True)

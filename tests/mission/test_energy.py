@@ -17,6 +17,7 @@ from perchctl.mission.belief.battery import (
     BRUSHLESS_POWER_TRAIN,
     BatteryFit,
     PowerTrain,
+    fit_sag_model,
     update_battery_fit,
 )
 from perchctl.mission.context import Context
@@ -41,7 +42,8 @@ from tests.mission.rig import at, fly
 
 PERIOD_S, MAH = 0.02, 250.0
 BRUSHLESS_MAH = 350.0
-LOW_V = 3.2  # under a long load, by the firmware
+LOW_V = 3.2  # below it, the firmware reports low power after `LOW_POWER_REPORT_DELAY_S`
+LOW_POWER_REPORT_DELAY_S = 5.0
 HOVER = HOVER_THRUST / FULL_THRUST
 ATTEMPT_S, LANDING_DURATION_BEYOND_DESCENT_S = 12.0, 10.0
 
@@ -75,6 +77,14 @@ def hovering(
         )
 
 
+def end_of_hover_s(moments: list[Moment], low_v: float = LOW_V) -> float:
+    """When row `battery-low` applies: the firmware reports low power, or the least voltage."""
+    low_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
+    least_v = PROFILE.safety.min_load_v
+    ends_s = (m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < least_v)
+    return min(low_s + LOW_POWER_REPORT_DELAY_S, next(ends_s, math.inf))
+
+
 WEAK = {
     "low": (3.87, {}),
     "early knee": (3.9, {"knee": 0.14}),
@@ -97,8 +107,8 @@ WEAK = {
 def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None:
     """From a few seconds on, where it decides."""
     moments = list(hovering(*WEAK[name], most_s=130.0, hover=hover))
-    end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < LOW_V)
-    assert 20.0 < end_s < 125.0
+    end_s = end_of_hover_s(moments)
+    assert 20.0 < end_s < 130.0
     for moment in moments[:: round(1.0 / PERIOD_S)]:
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
@@ -123,13 +133,25 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     cell = {"ohm": 0.143 * MAH / BRUSHLESS_MAH, "charge": BRUSHLESS_MAH / MAH}
     profile, hover, low_v = changed({"vehicle.battery_mah": BRUSHLESS_MAH}), 0.55, 3.35
     moments = list(hovering(rest_v, cell, 200.0, hover, BRUSHLESS_POWER_TRAIN, BRUSHLESS_MAH))
-    end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
+    end_s = end_of_hover_s(moments, low_v)
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
         state = remembering(state_in(Phase.ALIGN), battery_fit=moment.energy, hover_thrust=0.0)
         left_s = compute_battery_outlook(context_at(state, obs, profile)).hover_time_left_s
         assert left_s is not None
         assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
+
+
+@given(st.floats(0.4, 0.8))
+def test_the_firmware_reports_low_power_only_after_its_delay(hover: float) -> None:
+    """A vehicle whose voltage has just fallen to the limit flies on until the report."""
+    sag_v = fit_sag_model(FINE_BATTERY).full_thrust_sag_v * hover
+    at_limit = replace(FINE_BATTERY, rest_v=LOW_V + sag_v)
+    at_least_v = replace(FINE_BATTERY, rest_v=PROFILE.safety.min_load_v + sag_v)
+    for energy, expected_s in ((at_limit, LOW_POWER_REPORT_DELAY_S), (at_least_v, 0.0)):
+        hovers = changed({"planner.hover": {"below_m": 0.5, "duration_s": 1.0}})  # no press
+        left_s = predict_hover_time_s(energy, hovers, hover, BRUSHED_POWER_TRAIN)
+        assert left_s == pytest.approx(expected_s)
 
 
 def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
