@@ -1,4 +1,4 @@
-"""Fly in real time from Python, with the same safety as the command."""
+"""Fly in real time from Python, with the same safeguards as `perchctl fly`."""
 
 from __future__ import annotations
 
