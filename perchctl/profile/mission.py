@@ -22,7 +22,7 @@ class SearchConfig(Section):
     max_height_m: float = key(1.3, "maximum height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
         60.0,
-        "rotation between two waits, to extend the view: the image is wider than it is high",
+        "rotation between two waits; it extends the view, as the image is wider than it is high",
         ge=0,
         le=180,
     )
@@ -125,7 +125,7 @@ class PerchConfig(Section):
     )
     contact_xy_m: float = key(
         0.025,
-        "maximum horizontal distance to the target in contact, the magnet's radius",
+        "maximum horizontal distance to the target in contact; this is the magnet's radius",
         gt=0,
         le=0.5,
     )
@@ -309,7 +309,7 @@ class SafetyConfig(Section):
     )
     jump_m: float = key(
         0.25,
-        "position jump: a change in the estimate that the velocity does not explain",
+        "change in the position estimate, unexplained by the velocity, that counts as a jump",
         gt=0,
         le=5,
     )
@@ -333,7 +333,7 @@ class SafetyConfig(Section):
     # time for which the vehicle holds after a jump before it lands
     jump_hold_s: ClassVar[float] = 0.5
     max_height_m: float = key(
-        3.0, "height above the ground above which the vehicle lands", gt=0, le=20
+        3.0, "maximum height above the ground; if the vehicle is higher, it lands", gt=0, le=20
     )
     fence_radius_m: float = key(
         2.0, "distance from the take-off point beyond which the vehicle lands", gt=0, le=50
@@ -360,7 +360,8 @@ class SafetyConfig(Section):
     )
     ground_tolerance_m: float = key(
         0.15,
-        "maximum distance from `ground_z_m` at take-off; a vehicle farther away hangs or is held",
+        "maximum distance from `ground_z_m` at take-off; a vehicle farther away counts as "
+        "hanging or held",
         gt=0,
         le=10,
     )

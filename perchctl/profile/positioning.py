@@ -107,7 +107,7 @@ class PositioningConfig(Section):
     rate_hz: float = key(100.0, "maximum rate at which positions are sent", ge=10, le=100)
     latency_s: float = key(
         0.01,
-        "time from the exposure of the motion-capture cameras to arrival, as well as you know it",
+        "your best estimate of the time from the motion-capture cameras' exposure to arrival",
         ge=0,
         le=MOST_CAPTURE_LATENCY_S,
     )

@@ -214,7 +214,7 @@ class TargetConfig(Section):
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
     size_sigma: float = key(
         0.005,
-        "relative error common to all printed sizes, one sigma; smaller once they are measured",
+        "relative error common to all printed sizes, one sigma; smaller once you measure them",
         ge=0,
         le=0.1,
     )
@@ -233,8 +233,8 @@ class TargetConfig(Section):
     )
     expected_within_m: float = key(
         0.3,
-        "maximum distance of the target from `expected_xy_m`; a target farther away belongs to "
-        "another vehicle",
+        "maximum distance of the target from `expected_xy_m`; a target farther away is "
+        "treated as another vehicle's",
         gt=0,
         le=20,
     )

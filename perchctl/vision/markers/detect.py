@@ -344,7 +344,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         requirements_text="a marker whose bits can be read",
         cost_text="4 to 9 ms, including the measurement of what it finds",
         run_condition_text="nothing was found, unless the target was cut off and still is; or "
-        "an expected marker with sides above 13 px is missing; after a loss, in three of four images",
+        "an expected marker with sides above 13 px is missing; after a loss, in three of four "
+        "images",
         should_run=_should_search,
         find=_search,
     ),
