@@ -106,7 +106,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "let go after the flight",
-        "it had hung for as long as perchctl monitors it",
+        "the vehicle had hung for as long as perchctl monitors it",
         _let_go_later,
     ),
     ExpectedOutcome(
@@ -121,7 +121,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "too weak to hover",
-        "four motors like the weakest one cannot lift the weight",
+        "four motors as weak as the weakest one cannot lift the weight",
         _too_weak,
         within_s=15.0,
     ),

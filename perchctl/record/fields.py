@@ -52,11 +52,11 @@ FIELDS: dict[str, str] = {
     "phase": "phase of the mission",
     "stage": "markers seen in the newest frame: none, large, both or small",
     "reason": "why the phase was entered",
-    "hold": "why the mission pauses, empty if it does not",
+    "hold": "why the mission pauses; empty if it does not pause",
     "attempts": "failed perching attempts so far",
     # the vehicle's own state estimate, world axes
-    **_axes("{}_m", "body in the world of the state estimate, z up"),
-    **_axes("v{}_mps", "velocity, world axes"),
+    **_axes("{}_m", "position of the body in the world frame of the state estimate, z up"),
+    **_axes("v{}_mps", "velocity of the body, world axes"),
     "roll_rad": "roll, right-handed about body x",
     "pitch_rad": "pitch, right-handed about body y: positive is nose down",
     "yaw_rad": "heading, right-handed about world z",
@@ -67,7 +67,9 @@ FIELDS: dict[str, str] = {
     "battery_state": "pm.state; 3 is low power",
     "battery_rest_v": "resting voltage according to the energy model",
     "battery_used_mah": "charge used, according to the summed thrust and the assumed battery",
-    "battery_left_s": "hover time left until row `battery-low` lands, according to the model",
+    "battery_left_s": (
+        "hover time left until row `battery-low` lands the vehicle, according to the energy model"
+    ),
     "battery_attempts": "further attempts that the battery allows, with enough left for a landing",
     "supervisor": "supervisor bits",
     "vel_var_m2ps2": "largest of the estimator's velocity variances",
@@ -75,9 +77,9 @@ FIELDS: dict[str, str] = {
     "height_var_m2": "the estimator's variance of the height",
     "tel_age_s": "age of the telemetry sample",
     # external positions, as sent to the vehicle; None if its decks measure the position
-    "pos_age_s": "age of the last external position sent, since its exposure",
+    "pos_age_s": "age of the last external position sent, counted from its exposure",
     "pos_note": "why no external position is sent now",
-    **_axes("pos_{}_m", "last external position sent, in the world of the state estimate"),
+    **_axes("pos_{}_m", "last external position sent, in the world frame of the state estimate"),
     # the camera frame; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
     "frame_t_s": "the frame's time of exposure on the loop's clock",
@@ -87,7 +89,7 @@ FIELDS: dict[str, str] = {
         key: f"{name}: {text}"
         for short, name in _POSE_SOURCES.items()
         for key, text in (
-            (f"{short}x_m", "unfiltered pose of the target, relative to the gear, level"),
+            (f"{short}x_m", "unfiltered position of the target relative to the gear, level frame"),
             (f"{short}y_m", f"as {short}x_m"),
             (f"{short}z_m", f"as {short}x_m"),
             (f"{short}yaw_rad", "unfiltered heading of the target in the level frame"),
@@ -97,9 +99,9 @@ FIELDS: dict[str, str] = {
     "lock_note": "why the frame's pose was rejected, or where the target was locked again",
     "cam_age_s": "time since the last good frame",
     "delay_s": "measured latency beyond the profile's camera.latency_s",
-    "delay_used_s": "correction of the frames' times, with `camera.latency_s: measured`",
+    "delay_used_s": "correction applied to the frames' times, with `camera.latency_s: measured`",
     # the estimate of the target at t_s, by which the planner steers: the paper's error vector
-    **_axes("e{}_m", "target relative to the gear, level frame"),
+    **_axes("e{}_m", "position of the target relative to the gear, level frame"),
     "eyaw_rad": "heading of the target in the level frame",
     **_axes("ev{}_mps", "target velocity from the filter, level axes"),
     **_axes("es{}_m", "standard deviation of the target's position"),
@@ -118,7 +120,7 @@ FIELDS: dict[str, str] = {
     "cmd_roll_rad": "roll sent with cmd_thrust, positive to the right",
     "cmd_pitch_rad": "pitch sent with cmd_thrust, positive nose down",
     "cmd_duration_s": "duration of a landing",
-    "late_s": "delay of the start of this tick",
+    "late_s": "delay with which this tick started",
     # simulation only
     **_axes("true_{}_m", "true position of the body, simulation only"),
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",
