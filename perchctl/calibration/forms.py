@@ -156,7 +156,7 @@ _MAX_RMS_SHARE = 0.01
 one on its own board is unusable."""
 
 _AS_CAMERA_INFO = (
-    "write its numbers into a file with image_width, image_height, camera_matrix, "
+    "write its numbers to a file with image_width, image_height, camera_matrix, "
     "distortion_model and distortion_coefficients"
 )
 _OTHER_FORMS = (
@@ -238,7 +238,7 @@ def _values(text: str) -> dict[str, Any]:
         except ValueError as error:
             raise InvalidValue(str(error)) from None
     if not documents or not all(isinstance(each, dict) for each in documents):
-        raise InvalidValue(f"holds no keys: a calibration is a {READ_FORMS}")
+        raise InvalidValue(f"contains no keys: a calibration is a {READ_FORMS}")
     # In the output of a topic, each message is a document whose header contains its own time.
     first, *others = ({str(k): v for k, v in d.items() if k != "header"} for d in documents)
     try:
@@ -246,7 +246,7 @@ def _values(text: str) -> dict[str, Any]:
     except RecursionError:  # in YAML, a value may contain itself
         raise InvalidValue("values are nested too deeply") from None
     if differ:
-        raise InvalidValue(f"holds {len(documents)} different documents: keep one")
+        raise InvalidValue(f"contains {len(documents)} different documents: keep one")
     return first
 
 
@@ -297,7 +297,7 @@ def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
     if K.size != 9:
         raise InvalidValue(f"{key} needs 9 numbers, found {K.size}")
     if not K.any():
-        raise InvalidValue(f"{key} holds only zeros: the camera was not calibrated")
+        raise InvalidValue(f"{key} contains only zeros: the camera was not calibrated")
     _check_rms(found, size_px[0])
     _check_entries(found, K)
     model, distortion = _distortion(found, _named_lens(found))
@@ -306,7 +306,7 @@ def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
 
 def _kalibr_lens(cam: str, camera: Any) -> Lens:
     if not isinstance(camera, dict):
-        raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
+        raise InvalidValue(f"{cam} must contain keys (intrinsics, resolution, ...)")
     camera = {str(key): value for key, value in camera.items()}
     found = _by_meaning(camera, KALIBR_CAMERA, needed=tuple(KALIBR_CAMERA.read))
     projection, lens = str(found["projection"][0][1]), str(found["lens"][0][1])
@@ -379,9 +379,9 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
 def _missing(key: str, values: Mapping[str, Any], unknown: list[str]) -> str:
     """Return the sentence about a missing key, with a similar key that may have been meant."""
     if close := difflib.get_close_matches(key, unknown, 1):
-        return f"key {key} is missing: is {close[0]} a misspelling of it?"
+        return f"key {key} is missing: did you misspell it as {close[0]}?"
     return (
-        f"key {key} is missing among {clip_text(', '.join(values))}: a calibration is a "
+        f"key {key} is missing, found {clip_text(', '.join(values))}: a calibration is a "
         f"{READ_FORMS}"
     )
 
@@ -406,7 +406,7 @@ def _check_region(found: _Found) -> None:
     """Raise InvalidValue if the file describes images that are cropped from the calibrated ones."""
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
-            raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")
+            raise InvalidValue(f"{key} must contain x_offset, y_offset, height and width")
         x, y, width, height = (
             _pixels(f"{key}.{part}", region.get(part, 0), least=0)
             for part in ("x_offset", "y_offset", "width", "height")
@@ -426,8 +426,8 @@ def _check_rms(found: _Found, width_px: int) -> None:
         rms_px = _numbers(key, value)
         if (rms_px > _MAX_RMS_SHARE * width_px).any():
             raise InvalidValue(
-                f"{key} = {rms_px.max():g} px: the calibration misses its own images by more "
-                f"than {100 * _MAX_RMS_SHARE:g} % of their width; calibrate again"
+                f"{key} = {rms_px.max():g} px: the reprojection error in the calibration's own "
+                f"images is more than {100 * _MAX_RMS_SHARE:g} % of their width; calibrate again"
             )
 
 
@@ -451,7 +451,7 @@ def _size(found: _Found, form: Form) -> tuple[int, int]:
         return _pixels(key, numbers[0]), _pixels(key, numbers[1])
     if not {"width", "height"} <= found.keys():
         raise InvalidValue(
-            f"the image size is missing in this {form.name}: add {form.read['width'][0]} "
+            f"the image size is missing from this {form.name}: add {form.read['width'][0]} "
             f"and {form.read['height'][0]}, the size in px of the images that the camera "
             "was calibrated with"
         )
@@ -489,7 +489,7 @@ def _named_lens(found: _Found) -> str | None:
         elif "fisheye" in named.values():
             named[key] = "no fisheye"
     if len(set(named.values())) > 1:
-        raise InvalidValue(f"{' and '.join(named)} name different lenses: keep the right one")
+        raise InvalidValue(f"{' and '.join(named)} name different lens models: keep the right one")
     return next(iter(named.values()), None)
 
 

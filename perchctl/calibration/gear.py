@@ -48,13 +48,13 @@ def learn_gear_mask(
         if count and soft.shape != total.shape:
             raise InvalidValue(
                 f"image {count + 1} is {soft.shape[1]}x{soft.shape[0]} px, but the first is "
-                f"{total.shape[1]}x{total.shape[0]} px: a mask is for one size"
+                f"{total.shape[1]}x{total.shape[0]} px: a mask needs images of one size"
             )
         total, squares = (soft, soft**2) if not count else (total + soft, squares + soft**2)
         count += 1
     if count < LEAST_PICTURES:
         raise InvalidValue(
-            f"{count} images are too few to find the parts that stay the same, at least "
+            f"{count} images are too few to find the parts that stay the same; at least "
             f"{LEAST_PICTURES} are needed: turn the vehicle around for several seconds"
         )
     spread = np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0.0))

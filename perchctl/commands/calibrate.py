@@ -87,11 +87,11 @@ def camera(
     """Calibrate the camera, and report the resulting error at the target in mm.
 
     A report next to the calibration file (same name, .html) shows the coverage of the image, the
-    residuals, the spread of the views, and what to do better.
+    residuals, the spread of the views, and how to improve the calibration.
 
-    A view is rejected if its RMS error exceeds 2.5 times that of the median view. A corner is
-    rejected if its error exceeds 5 times the spread of its view. The report lists rejected views
-    and corners, and images without a board.
+    A view is rejected if its RMS error exceeds 2.5 times the median over all views. A corner is
+    rejected if its error exceeds 5 times the spread of the errors in its view. The report lists
+    rejected views and corners, and images without a board.
     """
     say_on_terminal("looking for the board")
     pictures = _source(source, view)

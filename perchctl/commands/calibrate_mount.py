@@ -182,7 +182,7 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[calibrations.Mou
     if not found:
         parts = " and ".join(dict.fromkeys(recording.part for recording in held))
         raise InvalidValue(
-            f"{', '.join(map(str, logs))} holds no {part}, only {parts}: leave out --part, "
+            f"{', '.join(map(str, logs))} contains no {part}, only {parts}: leave out --part, "
             "or name the other recording too"
         )
     return list(found.values())
@@ -299,4 +299,4 @@ def _keep(recordings: Sequence[calibrations.MountingRecording], log: Path) -> No
     except InvalidValue as error:
         say(f"the recording was not kept: {error}")
         return
-    say(f"kept the recording: {log}; --from {log} evaluates it again")
+    say(f"kept the recording {log}; to evaluate it again, use --from {log}")

@@ -103,7 +103,7 @@ def test_a_calibration_is_not_judged_by_its_own_pictures(
     said = calibrate("check", file, f"images:{tmp_path}")
     assert said.exit_code == 30
     assert f"the board is {BOARD} (the calibration's)" in said.stderr
-    assert "10 of 10 views are from the images that the calibration was made from" in said.stderr
+    assert "10 of 10 views are from images that the calibration was made from" in said.stderr
     render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
     passed = calibrate("check", file, f"images:{tmp_path}")
     assert passed.exit_code == 0, passed.output

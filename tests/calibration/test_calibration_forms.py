@@ -135,11 +135,11 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
         (ros(FIVE, "distortion_model: ''\n"), "distortion_model is empty"),
         (
             ros(FISHEYE, "distortion_model: plumb_bob\ncamera_model: fisheye\n"),
-            "distortion_model and camera_model name different lenses",
+            "distortion_model and camera_model name different lens models",
         ),
         (
             opencv(FISHEYE, "distortion_model: equidistant\nfisheye_model: 0\n"),
-            "name different lenses",
+            "name different lens models",
         ),
         (ros(EIGHT, "distortion_model: plumb_bob\n"), "plumb_bob needs 4 or 5 .* found 8"),
         (ros(FIVE, "distortion_model: equidistant\n"), "fisheye needs 4 .* found 5"),
@@ -164,10 +164,10 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
         (ros(FIVE, "mm: 3\nfov: 0.9\np: 1\n"), "keys mm, fov, p of this"),
         (
             ros(FIVE).replace("coefficients", "coefficents"),
-            "is distortion_coefficents a misspelling",
+            "did you misspell it as distortion_coefficents",
         ),
         (ros(FIVE).replace("image_width: 400", "image_width: 400.5"), "whole number of pixels"),
-        (ros(FIVE, matrix=[0.0] * 9), "camera_matrix holds only zeros"),
+        (ros(FIVE, matrix=[0.0] * 9), "camera_matrix contains only zeros"),
         (message(FIVE, "plumb_bob").replace("binning_x: 0", "binning_x: 2"), "binning_x = 2"),
         (message(FIVE, "plumb_bob") + message(FISHEYE, "equidistant"), "2 different documents"),
         (message([], "''"), "distortion_model is empty: the camera was not calibrated"),
@@ -237,13 +237,19 @@ RECURSIVE = f"{ros(FIVE)}note: &own [*own]\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (opencv(FIVE, "rms: [50.0]\n").replace("avg_re", "re"), "rms = 50 px: the calibration"),
-        (opencv(FIVE, "rms: '50'\n").replace("avg_re", "re"), "rms = 50 px: the calibration"),
+        (
+            opencv(FIVE, "rms: [50.0]\n").replace("avg_re", "re"),
+            "rms = 50 px: the reprojection error",
+        ),
+        (
+            opencv(FIVE, "rms: '50'\n").replace("avg_re", "re"),
+            "rms = 50 px: the reprojection error",
+        ),
         (
             "cam0: {camera_model: pinhole, 1: 2}\n",
-            "key resolution is missing among camera_model, 1:",
+            "key resolution is missing, found camera_model, 1:",
         ),
-        ("cam0: {2026-02-02: 2}\n", "is missing among 2026-02-02"),
+        ("cam0: {2026-02-02: 2}\n", "is missing, found 2026-02-02"),
         pytest.param("[" * 2000, "values are nested too deeply", marks=pytest.mark.long),
         ('{"K":' * 2000, "values are nested too deeply"),
         (f"{RECURSIVE}---\n{RECURSIVE}", "values are nested too deeply"),
@@ -329,7 +335,7 @@ def test_lists_of_rows_are_read(tmp_path: Path) -> None:
     assert_reads(load(tmp_path, f"{text}distortion_coefficients: {FIVE}\n"), "plumb_bob")
     with pytest.raises(InvalidValue, match="this CameraInfo message: add width and height"):
         load(tmp_path, json.dumps({"K": ROWS, "D": [FIVE]}))
-    with pytest.raises(InvalidValue, match="image size is missing in this camera_info or File"):
+    with pytest.raises(InvalidValue, match="image size is missing from this camera_info or File"):
         load(tmp_path, f"camera_matrix:\n{rows}\ndist_coeff:\n- {FIVE}\n")
 
 
@@ -353,10 +359,10 @@ def test_lists_of_rows_are_read(tmp_path: Path) -> None:
         ('{"cameraData": []}', "DepthAI"),
         ("<calibration><f>210.5</f></calibration>", "XML file is from another program"),
         ("<opencv_storage><camera_matrix>", "not a readable OpenCV FileStorage file"),
-        ("M1: [1, 2]\nD1: [0]\n", "camera_matrix is missing among M1, D1"),
+        ("M1: [1, 2]\nD1: [0]\n", "camera_matrix is missing, found M1, D1"),
         ("extends: sim\ncamera: {}\n", "camera_matrix is missing.*it is a profile"),
-        ("- 1\n", "holds no keys"),
-        ("", "holds no keys"),
+        ("- 1\n", "contains no keys"),
+        ("", "contains no keys"),
         ("a: !!python/tuple [1]\n", "line 1: only plain numbers, strings, lists and mappings"),
     ],
 )

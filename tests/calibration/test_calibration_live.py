@@ -121,7 +121,7 @@ def test_one_advice_at_a_time_leads_to_the_end() -> None:
     given: set[str] = set()
     for _ in range(12):
         shown = [rng.uniform((0.1, 0.1, 0.2, -0.3, -0.3), (0.9, 0.9, 0.9, 0.3, 0.3))]
-        while (advice := next_advice(shown)) != "show the board somewhere new":
+        while (advice := next_advice(shown)) != "move the board to a new place":
             before = min(covered_shares(shown).values())
             part, value = FOLLOWED[advice]
             shown.append(np.where(np.arange(5) == part, value, shown[-1]))

@@ -61,7 +61,7 @@ def test_rejected_views_are_named_with_the_reason() -> None:
     found = FoundViews(tuple(views), without_board, frames)
     result = calibrate_camera(found, CHARUCO.notation())
     words = Page(calibration_report(result, "camera.yaml", DATE)).words
-    assert re.search(r"view 3: RMS \d\.\d\d px, but the median view has", words)
+    assert re.search(r"view 3: RMS error \d\.\d\d px, but the median is", words)
     assert "<script>.png: no board found" in words
     assert "24 of 30 frames show the board: 20 taken, 4 moved by more than 1.5 px" in words
     assert "Some views do not fit the others: take them again" in words

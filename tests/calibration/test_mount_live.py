@@ -189,7 +189,7 @@ def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     assert film.now_s == pytest.approx(LEAST_RECORDING_S["carry"], abs=0.5)
     assert moments[-1].advice.startswith("enough")
     assert ("missing", "nothing", None) in moments[-1].rows
-    assert any("turn it about the vertical" in row[1] for m in moments for row in m.rows)
+    assert any("turn the vehicle about the vertical" in row[1] for m in moments for row in m.rows)
     assert recording.poses[:100] == whole.poses[:100]
 
 

@@ -132,13 +132,13 @@ def slower(recording: MountingRecording, factor: float) -> MountingRecording:
 
 CARRY, PIVOT = seen(hand("carry", 3, latency_s=0.02), errors=False), seen(hand("pivot", 2, 14.0))
 LACKING = {
-    "tilt it": turned_about("carry", (1.0, 0.0), 0.0),
-    "turn it about": turned_about("carry", (1.0, 1.0), 0.1),
+    "tilt the vehicle": turned_about("carry", (1.0, 0.0), 0.0),
+    "turn the vehicle about": turned_about("carry", (1.0, 1.0), 0.1),
     "faster": slower(CARRY, 8.0),
     "continue": replace(CARRY, poses=CARRY.poses[:150]),
     "bring the target": replace(CARRY, poses=[]),
     "wait for the vehicle": MountingRecording("carry"),
-    "tilt it in every direction": turned_about("pivot", (1.0, 0.0), 0.0),
+    "tilt the vehicle in every direction": turned_about("pivot", (1.0, 0.0), 0.0),
 }
 
 
@@ -146,7 +146,9 @@ LACKING = {
 def test_the_missing_motion_is_named(named: str) -> None:
     recording = LACKING[named]
     assert not missing_motion(CARRY)
-    with pytest.raises(InvalidValue, match=f"the {recording.part} lacks motion:.*{named}"):
+    with pytest.raises(
+        InvalidValue, match=f"the {recording.part} recording lacks motion:.*{named}"
+    ):
         solve_rotation(recording) if recording.part == "carry" else solve_pivot(recording)
 
 

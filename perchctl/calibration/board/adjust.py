@@ -85,10 +85,10 @@ def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
             objects, corners, size_px, np.eye(3), np.zeros(0), flags=flags, criteria=_STILL
         )
     except cv2.error:
-        raise NoSolution(f"no {model} camera fits the corners") from None
+        raise NoSolution(f"no {model} camera model fits the corners") from None
     poses = np.concatenate([np.reshape(rvecs, (-1, 3)), np.reshape(tvecs, (-1, 3))], axis=1)
     if not (np.isfinite(K).all() and np.isfinite(dist).all() and np.isfinite(poses).all()):
-        raise NoSolution(f"no {model} camera fits the corners")
+        raise NoSolution(f"no {model} camera model fits the corners")
     return _fit_of(views, CameraModel(size_px, np.array(K, float), np.ravel(dist), model), poses)
 
 
@@ -183,9 +183,9 @@ def reject_outliers(
         if len(rejections) > MAX_VIEWS_OUT * len(views):
             named = ", ".join(r.view for r in rejections[:4])
             raise InvalidValue(
-                f"{len(rejections)} of {len(views)} views do not fit one camera ({named}): "
-                "check that the board is flat, that --board matches it, and that zoom and "
-                "focus were not changed between the images"
+                f"{len(rejections)} of {len(views)} views do not fit a single camera model "
+                f"({named}): check that the board is flat, that --board matches it, and that zoom "
+                "and focus were not changed between the images"
             )
         kept = [
             view.select(mask)
@@ -196,7 +196,9 @@ def reject_outliers(
     for view in kept:
         out = np.setdiff1d(whole[view.name].ids, view.ids)
         if len(out):
-            reason = f"off by more than {CORNER_FACTOR:g} times the view's spread"
+            reason = (
+                f"off by more than {CORNER_FACTOR:g} times the spread of the errors in its view"
+            )
             rejections.append(Rejection(view.name, reason, tuple(out.tolist())))
     return fit, kept, rejections
 
@@ -218,7 +220,7 @@ def _find_outliers(
         left = int(mask.sum())
         had = len(whole[view.name])
         if view_rms > limit:
-            reasons[view.name] = f"RMS {view_rms:.2f} px, but the median view has {median:.2f} px"
+            reasons[view.name] = f"RMS error {view_rms:.2f} px, but the median is {median:.2f} px"
         elif had - left > MAX_CORNERS_OUT * had or left < MIN_CORNERS:
             reasons[view.name] = f"{had - left} of its {had} corners are outliers"
     return masks, reasons

@@ -93,7 +93,7 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
     named = ", ".join(f"{name} is {size[0]}x{size[1]} px" for name, size in odd.items() if size)
     raise InvalidValue(
         f"{count} of {counts.total()} images are {most[0]}x{most[1]} px, but {named}: "
-        "a calibration is for one size, so remove the others"
+        "a calibration needs images of one size, so remove the others"
     )
 
 
@@ -318,7 +318,7 @@ def next_advice(signatures: Sequence[Array]) -> str:
     done = covered_shares(signatures)
     least = min(COVERAGE_AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
-        return "show the board somewhere new"
+        return "move the board to a new place"
     return axis_advice(signatures, least)
 
 

@@ -94,11 +94,11 @@ def check_calibration(
     found = replace(found, views=tuple(view for view in found.views if view not in own))
     if own and len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
-            f"{len(own)} of {len(own) + len(found.views)} views are from the images that "
-            "the calibration was made from, which cannot test it: take new images"
+            f"{len(own)} of {len(own) + len(found.views)} views are from images that the "
+            "calibration was made from, so they cannot test it: take new images"
         )
     if len(found.views) < MIN_CHECK_VIEWS:
-        advice = "add some with the board tilted by 20 to 45 deg and near the image's edges"
+        advice = "add images with the board tilted by 20 to 45 deg and near the image's edges"
         seen = f"{len(found.views)} images show the board"
         if found.frames is not None:
             seen = f"{len(found.views)} usable views ({found.frames.text})"
@@ -109,7 +109,7 @@ def check_calibration(
     rejections = [*(Rejection(view.name, reason) for view in own), *outliers]
     fixed = fit_poses(kept, camera)
     if fixed is None:
-        reason = "no pose of the boards fits the calibration: it may be another camera's"
+        reason = "the calibration fits no pose of the boards: it may belong to another camera"
         return CheckResult(False, reason, np.inf, free.rms_px, (), tuple(rejections))
     deviations = tuple(
         Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)
@@ -145,6 +145,6 @@ def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
         return
     raise InvalidValue(
         f"{len(free.poses)} images (board tilted by at most "
-        f"{tilts_deg(free.poses).max():.0f} deg) are not enough to judge a focal "
-        "length: add some with the board tilted by 20 to 45 deg and filling the image"
+        f"{tilts_deg(free.poses).max():.0f} deg) are not enough to judge the focal "
+        "length: add images with the board tilted by 20 to 45 deg and filling the image"
     )

@@ -105,7 +105,10 @@ class Calibration:
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
-            text += f", but within {aside.mm95:.2g} mm off the axis at {aside.z_m * 100:.0f} cm"
+            text += (
+                f", but only within {aside.mm95:.2g} mm away from the optical axis at "
+                f"{aside.z_m * 100:.0f} cm"
+            )
         return text
 
     def lines(self) -> list[str]:
@@ -289,8 +292,9 @@ def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
     if tilted < MIN_TILTED:
         raise InvalidValue(
             f"{tilted} of {len(tilts)} views are tilted by more than {MIN_TILT_DEG:g} deg (the "
-            f"most by {tilts.max():.0f}), so focal length and distance cannot be separated: add "
-            f"{MIN_TILTED - tilted} or more with the board tilted by 20 to 45 deg, about both axes"
+            f"largest tilt is {tilts.max():.0f} deg), so focal length and distance cannot be "
+            f"separated: add {MIN_TILTED - tilted} or more with the board tilted by 20 to 45 deg, "
+            "about both axes"
         )
     if covered.mean() < MIN_COVERED:
         raise InvalidValue(
@@ -313,7 +317,7 @@ def _check_focal(parameters: Array, std: Array) -> None:
 def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
     lacks = []
     if not _is_usable(fit.camera):
-        lacks.append("the lens model folds back inside the image: add views at its edges")
+        lacks.append("the lens model folds back inside the image: add views at the image's edges")
     if views < GOOD_VIEWS:
         lacks.append(f"only {views} views: add {GOOD_VIEWS - views} or more")
     if covered.mean() < GOOD_COVERED:

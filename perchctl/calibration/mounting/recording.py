@@ -130,7 +130,7 @@ def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
     """The numbers of a key, or a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
-        raise ValueError(f"{key} must hold {math.prod(shape)} numbers")
+        raise ValueError(f"{key} must contain {math.prod(shape)} numbers")
     return values if shape else float(values)
 
 
@@ -193,10 +193,10 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
         if together < 0.5 * len(poses):
             raise InvalidValue(
                 f"only {together} of {len(poses)} images were taken while telemetry was "
-                "recorded: both must use the same clock; record again"
+                "recorded: camera and telemetry must use the same clock; record again"
             )
     if lacking := missing_motion(recording):
-        raise InvalidValue(f"the {part} lacks motion: {'; '.join(lacking)}")
+        raise InvalidValue(f"the {part} recording lacks motion: {'; '.join(lacking)}")
 
 
 def missing_motion(recording: MountingRecording) -> list[str]:
@@ -216,16 +216,20 @@ def missing_motion(recording: MountingRecording) -> list[str]:
     along = tilts_deg @ np.stack([np.cos(directions), np.sin(directions)])
     tilted = min(_extent(column) for column in along.T)
     if tilted < TILT_DEG[part]:
-        lacking.append(f"tilt it in every direction ({tilted:.0f} of {TILT_DEG[part]:.0f} deg)")
+        lacking.append(
+            f"tilt the vehicle in every direction ({tilted:.0f} of {TILT_DEG[part]:.0f} deg)"
+        )
     if part == "carry":
         across = arrays.R_cam_target[:, :2, 0]
         turned = _extent(np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0]))))
         if turned < YAW_DEG:
-            lacking.append(f"turn it about the vertical axis ({turned:.0f} of {YAW_DEG:.0f} deg)")
+            lacking.append(
+                f"turn the vehicle about the vertical axis ({turned:.0f} of {YAW_DEG:.0f} deg)"
+            )
         gyro_radps = np.array([a.gyro_radps for a in attitudes])
         rate_dps = math.degrees(math.sqrt(float((gyro_radps**2).sum(axis=1).mean())))
         if rate_dps < LEAST_RATE_DPS:
-            lacking.append(f"turn faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
+            lacking.append(f"turn the vehicle faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
         if len(attitudes) < LEAST_ATTITUDES:
             lacking.append(f"telemetry: {len(attitudes)} of {LEAST_ATTITUDES} samples")
     seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # time in which the target is seen
