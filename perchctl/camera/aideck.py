@@ -119,14 +119,14 @@ class AiDeckSource(LiveSource):
             length, _, function = _PACKET.unpack(head)
             if not 2 <= length <= MAX_PACKET_BYTES or function not in _FUNCTIONS:
                 self._note(
-                    "it does not send the packets of Bitcraze's wifi-img-streamer",
+                    "the data is not in the format of Bitcraze's wifi-img-streamer",
                     "check that the deck runs wifi-img-streamer",
                 )
-                return "a packet is not one of wifi-img-streamer"
+                return "a packet is not in the format of wifi-img-streamer"
             data = stream.read(length - 2)
             if self._picture is None and self._arrived == 0:
                 self._note(
-                    "it sends data, but no picture", "check that the deck runs wifi-img-streamer"
+                    "data arrives, but no picture", "check that the deck runs wifi-img-streamer"
                 )
             if function == _APP:
                 self._take(data, came_s)

@@ -39,8 +39,8 @@ def open_video_capture(
         if not linux:
             raise NotFound(
                 f"camera:{number} cannot be opened",
-                "plug it in, close other programs that use it, and let the terminal use cameras "
-                "(in the privacy settings of the system)",
+                "plug it in, close other programs that use it, and allow the terminal to use "
+                "cameras (in the system's privacy settings)",
             )
         raise NotFound(
             f"camera:{number} exists but cannot be opened",
@@ -206,7 +206,7 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
     if fitting:
         raise InvalidValue(
             f"camera:{wanted} matches {len(fitting)} cameras: {', '.join(map(str, fitting))}",
-            "write more of the name, the path, or the number",
+            "write a longer part of the name, or the path or number",
         )
     raise _not_found(wanted, known)
 
@@ -216,4 +216,4 @@ def _not_found(wanted: str, known: list[ConnectedCamera]) -> NotFound:
         nothing = _no_camera()
         return NotFound(f"camera:{wanted} was not found; {nothing.found}", nothing.advice)
     there = ", ".join(map(str, known))
-    return NotFound(f"camera:{wanted} was not found; there are {there}", PLUG_IN)
+    return NotFound(f"camera:{wanted} was not found; connected cameras: {there}", PLUG_IN)

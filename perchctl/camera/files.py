@@ -40,7 +40,7 @@ class RecordedSource:
         self._ahead = self._read()
         if self._ahead is None:
             raise InvalidValue(
-                f"{name} holds no readable frame", "check that it is a picture or video file"
+                f"{name} contains no readable frame", "check that it is a picture or video file"
             )
         image = self._ahead[0]
         self.size_px = (image.shape[1], image.shape[0])
@@ -173,7 +173,7 @@ def image_files(where: str | Sequence[Path]) -> list[Path]:
             raise NotFound(f"{shown} is neither a folder nor a pattern that matches pictures")
     if not found:
         allowed = " ".join(sorted(IMAGE_SUFFIXES))
-        raise NotFound(f"folder {where} holds no pictures ({allowed})")
+        raise NotFound(f"folder {where} contains no pictures ({allowed})")
     return sorted(found, key=_natural)
 
 

@@ -114,14 +114,15 @@ class MjpegSource(LiveSource):
             if self._arrived == 0:
                 kind = response.headers.get("Content-Type", "no content type")
                 self._note(
-                    f"it sends {kind}, but no complete JPEG",
-                    "check that the address is that of the stream itself",
+                    f"the server sends {kind}, but no complete JPEG",
+                    "check that the address points to the stream itself",
                 )
             # If several images arrived at once, only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
                 if width * height > MOST_STREAM_PX:
                     self._drop(
-                        f"they have {width}x{height} px, and at most {MOST_STREAM_PX} px are read"
+                        f"they have {width}x{height} px, but at most {MOST_STREAM_PX} px are "
+                        "allowed"
                     )
                     continue
                 image = decode_grey(picture)
@@ -223,9 +224,9 @@ class RtspSource(LiveSource):
         if not stream.streams.video:
             self._is_connected = True
             self._note(
-                "the stream carries no video", "check that the address is that of the video stream"
+                "the stream contains no video", "check that the address points to the video stream"
             )
-            return "the stream carries no video"
+            return "the stream contains no video"
         self._connected()
         video = stream.streams.video[0]
         # With one decoder thread per frame, images would be delayed by as many frames as there are
@@ -242,7 +243,7 @@ class RtspSource(LiveSource):
                 damaged += 1
                 self._drop("they cannot be decoded")
                 if damaged >= MAX_DAMAGED:
-                    return "its pictures cannot be decoded"
+                    return "the pictures cannot be decoded"
                 continue
             damaged = 0
             for image, time_s in frames:
@@ -259,10 +260,12 @@ _FINAL = (
 )
 """PyAV's errors that another attempt would not solve, by name."""
 _REASONS = {
-    "HTTPUnauthorizedError": "it rejects this user name and password (401)",
+    "HTTPUnauthorizedError": "the camera rejects this user name and password (401)",
     "OSError": "the host cannot be reached, or its name cannot be resolved",
     "ExitError": "no answer in time, or no video in the stream",
     "InvalidDataError": "no answer in time, or not an RTSP answer",
 }
 """Texts that replace FFmpeg's less informative ones."""
-_ADVICE = {"HTTPUnauthorizedError": "write them as in rtsp://NAME:PASSWORD@HOST/PATH"}
+_ADVICE = {
+    "HTTPUnauthorizedError": "write the user name and password as in rtsp://NAME:PASSWORD@HOST/PATH"
+}

@@ -107,7 +107,7 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
     raise InvalidValue(
         f"{source} delivers frames of {size_px[0]}x{size_px[1]} px, but the calibration was made "
         f"at {camera.size_px[0]}x{camera.size_px[1]} px",
-        "set the camera to that size or calibrate it at this one",
+        "set the camera to the calibrated size, or calibrate it at the current size",
     )
 
 
@@ -415,7 +415,9 @@ def mirrored_problem(config: CameraConfig) -> Problem:
     """Return the message that the image is mirrored, with advice that depends on the `config`."""
     advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
-        advice = "the camera does not mirror it, so remove camera.mirrored from the profile"
+        advice = (
+            "the camera does not mirror the picture, so remove camera.mirrored from the profile"
+        )
     return Problem("the picture is mirrored", advice)
 
 

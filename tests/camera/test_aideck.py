@@ -162,11 +162,11 @@ DAMAGED = header(324, 244, 500, 1) + packet(b"\xff\xd8\xff\xe0" + bytes(496))
 NEVER_WHOLE = [
     ([NEVER], f"connected, but it sends no data: {OFF_AND_ON}"),
     ([], f"connected, but the stream ended without a picture: {OFF_AND_ON}"),
-    ([b"HTTP/1.1 200 OK\r\n", NEVER], "packets of Bitcraze's wifi-img-streamer: check"),
+    ([b"HTTP/1.1 200 OK\r\n", NEVER], "format of Bitcraze's wifi-img-streamer: check"),
     ([TRUNCATED * 3, NEVER], "pictures arrive but are dropped (3 so far)"),
 ]  # fmt: skip
 NEVER_WHOLE_LIKEWISE = [
-    ([console(), NEVER], "it sends data, but no picture: check that the deck runs wifi"),
+    ([console(), NEVER], "data arrives, but no picture: check that the deck runs wifi"),
     ([TRUNCATED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is incomplete"),
     ([DAMAGED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is damaged"),
     ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, but the header"),

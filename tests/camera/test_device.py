@@ -66,7 +66,9 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
     for text, count in (("usb", 3), ("USB Video", 2), ("", 3)):
         with pytest.raises(InvalidValue, match=rf"camera:{text} matches {count} cameras: .*deluxe"):
             number(text)
-    with pytest.raises(NotFound, match=r"camera:nix was not found; there are camera:0 \(HD W"):
+    with pytest.raises(
+        NotFound, match=r"camera:nix was not found; connected cameras: camera:0 \(HD W"
+    ):
         number("nix")
 
 

@@ -73,7 +73,7 @@ def test_the_profile_turns_pictures_and_gives_the_latency_unless_another_is_give
 def test_images_by_pattern_and_single_and_those_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="neither a folder nor a pattern"):
         open_camera(f"images:{tmp_path}/nowhere", CLOCK)
-    with pytest.raises(NotFound, match="holds no pictures"):
+    with pytest.raises(NotFound, match="contains no pictures"):
         open_camera(f"images:{tmp_path}", CLOCK)
     write_images(tmp_path, 12)
     assert len(drain(open_camera(f"images:{tmp_path}/shot_1*.png", CLOCK))) == 3

@@ -154,9 +154,9 @@ HTML = b"<html>the camera's page</html>"
 
 @pytest.mark.parametrize(("script", "words"), [
     ([threading.Event()], "connected, but it sends no data: close other programs"),
-    ([HTML, threading.Event()], "it sends no content type, but no complete JPEG: check"),
+    ([HTML, threading.Event()], "the server sends no content type, but no complete JPEG: check"),
     pytest.param([part(jpeg(60)[:300]), threading.Event()],
-                 "it sends no content type, but no complete JPEG", marks=pytest.mark.long),
+                 "the server sends no content type, but no complete JPEG", marks=pytest.mark.long),
     pytest.param([part(resized(jpeg(60), 5000, 4000)), threading.Event()],
                  "pictures arrive but are dropped (1 so far): they have 5000x4000 px",
                  marks=pytest.mark.long),

@@ -489,7 +489,7 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
         (["images:*.nothing"], 20, "matches pictures"),
         (["nonsense:1"], 30, "camera:N"),
-        (["."], 20, "holds no pictures"),
+        (["."], 20, "contains no pictures"),
         (["BROKEN"], 30, "cannot be read as a picture"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
     ],
