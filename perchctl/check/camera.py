@@ -83,7 +83,7 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
-    advice = "set the camera to that size, or calibrate it at this one"
+    advice = "set the camera to the calibrated size, or calibrate it at the current size"
     return failed(f"{found} px, but calibrated at {wanted} px", advice)
 
 
@@ -121,7 +121,7 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
         advice = _AGAIN.get(rehearsal.scheme, _RESTART)
-        return failed(f"none for the last {rehearsal.silent_s:.1f} s", advice)
+        return failed(f"no picture for the last {rehearsal.silent_s:.1f} s", advice)
     pairs = pairwise(rehearsal.arrivals)
     gaps_s = [t - t0 for (i0, t0), (i, t) in pairs if i == i0 + 1]
     if len(gaps_s) < LEAST_RATED:
@@ -147,11 +147,11 @@ def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
-        found = f"{late} of {rehearsal.pictures} arrived after newer ones"
+        found = f"{late} of {rehearsal.pictures} pictures arrived after newer ones"
         return failed(found, "use another stream or receiver: this one delays pictures")
     if not rehearsal.problems:
         again = rehearsal.repeats
-        repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
+        repeated = f"; {again} pictures that the receiver repeated are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good pictures{repeated}")
     if any(problem.kind == "mirrored" for problem in rehearsal.problems):
         mirrored = mirrored_problem(profile.camera)
@@ -166,7 +166,7 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
     blur_px = rehearsal.blur_px
     if blur_px is None:
-        why = "focus is measured on the target's edges, and no target was seen"
+        why = "focus is measured on the target's edges, but no target was seen"
         return skipped(why, "put the camera under the target")
     advice = "turn the lens until perchctl track --view shows a sharp target"
     return limits_finding(blur_px, 1.6, 2.5, f"blur sigma {blur_px:.1f} px", advice)
@@ -175,7 +175,7 @@ def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.target_pictures:
         return skipped("not in view", "put the vehicle under the target to check the other rows")
-    found = f"in {100 * rehearsal.target_pictures // rehearsal.pictures} % of the pictures"
+    found = f"seen in {100 * rehearsal.target_pictures // rehearsal.pictures} % of the pictures"
     target = rehearsal.target
     if target is not None:
         away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -215,12 +215,13 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
-            "not in view, so fly would refuse to take off",
+            "the target is not in view, so fly would refuse to take off",
             f"put the vehicle under the target: {where}",
         )
     if rehearsal.target is None:
         return warned(
-            "no longer in view at the end", "see lost frames and target, then check again"
+            "the target was no longer in view at the end",
+            "see lost frames and target, then check again",
         )
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)
@@ -260,8 +261,8 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
     )
     latest_s = max(rehearsal.tick_delays_s)
     found = (
-        f"{1e3 * work_s:.0f} of {1e3 * period_s:.0f} ms used for each picture; "
-        f"{100.0 * late:.0f} % of the ticks late, by at most {1e3 * latest_s:.0f} ms"
+        f"processing takes {1e3 * work_s:.0f} of {1e3 * period_s:.0f} ms for each picture; "
+        f"{100.0 * late:.0f} % of the ticks are late, by at most {1e3 * latest_s:.0f} ms"
     )
     advice = "close other programs, request smaller pictures, or use a faster computer"
     if latest_s > profile.safety.loop_late_hold_s:

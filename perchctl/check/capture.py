@@ -166,7 +166,10 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
         f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} "
         "mm"
     )
-    hidden = "it may be hidden at times or have too few markers: look at it in the capture software"
+    hidden = (
+        "the body may be hidden at times or have too few markers: look at it in the capture "
+        "software"
+    )
     slow = "raise the capture's rate, connect by cable, or close other programs on this computer"
     noisy = (
         "keep the vehicle still; calibrate the capture, or raise positioning.position_sigma_m"
@@ -204,7 +207,8 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
 # --- Moved by hand ---
 
 HOW_TO_TURN = (
-    "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and sideways, and put it back"
+    "lift the vehicle straight up by 30 cm, turn it by 90 deg, tilt it forward and sideways, and "
+    "put it back"
 )
 POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
@@ -434,7 +438,9 @@ def _body_finding(
     found = f"rotation agrees with the vehicle's within {off_deg:.0f} deg"
     risen_m = float(_risen_m(turns, motion) @ turns.vertical)
     if risen_m < LEAST_RISE_M:
-        return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
+        return warned(
+            f"{found}; the vehicle was not lifted along the capture's z axis", HOW_TO_TURN
+        )
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
@@ -470,9 +476,7 @@ def save_comparison_row(
         return Row(COMPARED, *failed(found, advice))
     return Row(
         COMPARED,
-        *warned(
-            f"the result could not be saved, so fly does not know of it: {why}", "then check again"
-        ),
+        *warned(f"the result could not be saved, so fly cannot use it: {why}", "then check again"),
     )
 
 

@@ -131,7 +131,7 @@ def _vehicle_finding(
     if seen.telemetry is None:
         return failed("no telemetry arrives", "restart the vehicle, and run perchctl check")
     if seen.is_armed or seen.telemetry.supervisor & FLYING:
-        return failed("it is armed or flying, and its propellers may turn", DISARM_IT)
+        return failed("the vehicle is armed or flying, and its propellers may turn", DISARM_IT)
     try:
         with link.blinking():
             is_there = ask(
@@ -156,7 +156,7 @@ def _body_finding(
 ) -> Finding:
     config = profile.positioning
     if mocap is None or isinstance(mocap, PerchError):
-        return failed("" if mocap is None else mocap.found, "run perchctl check with this vehicle")
+        return failed("" if mocap is None else mocap.found, "run perchctl check for this vehicle")
     scope.announce(f"listening to {config.label} for {scope.capture_s:g} s")
     seen = capture.collect_samples(list, mocap, time.monotonic, time.sleep, scope.capture_s)
     poses = seen.body_poses(config)
@@ -228,12 +228,14 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
         if ask is None or not stand.lookalikes:
             return passed(found)
         return _covered_finding(
-            view, own, ask, f"the camera of {stand.lookalikes[0]} would show its target there too"
+            view, own, ask, f"the camera of {stand.lookalikes[0]} would also see its target there"
         )
     anywhere = target.model_copy(update={"expected_xy_m": None})
     other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))
     if other_m is not None:
-        found = f"its camera sees a target {math.dist(other_m, expected_m):.2f} m from its own"
+        found = (
+            f"its camera sees a target {math.dist(other_m, expected_m):.2f} m from its own target"
+        )
         there = _nearest(other_m, stand.views, target.expected_within_m)
         if there is not None:
             found += f", as the camera of {there} would"
@@ -241,7 +243,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     if ask is not None:
         return _covered_finding(view, own, ask, "its target is not in view")
     where = overhead_text(target, view.calibrated, view.profile.camera.mount)
-    return failed("its target is not in view", f"put home_m nearer to the target: {where}")
+    return failed("its target is not in view", f"move home_m closer to the target: {where}")
 
 
 def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:
@@ -249,7 +251,7 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
     this home."""
     name = view.stand.name
     if _is_dark(before) or not before.pictures:
-        return failed(f"{why}, and its pictures are dark", "add light, or see perchctl check")
+        return failed(f"{why}, and its pictures are dark", "add light, or run perchctl check")
     if not ask(
         f"{name}: {why}. Cover the lens of the vehicle at {view.stand.home_text} with your hand. "
         f"Is it covered?"

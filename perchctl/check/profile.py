@@ -94,7 +94,7 @@ def _calibration(plan: _Plan) -> Finding:
     try:
         path = find_calibration(plan.profile.camera.calibration)
     except PerchError as error:
-        return failed(str(error), "make one with perchctl calibrate")
+        return failed(str(error), "make a calibration with perchctl calibrate")
     if not plan.source.startswith("sim:") and is_shipped_example(path):
         return warned(
             f"{path.name} is the shipped example",
@@ -110,8 +110,8 @@ def _camera_turn(plan: _Plan) -> Finding:
     if up < LOOKS_UP:
         tilted_deg = math.degrees(math.acos(max(-1.0, up)))
         return failed(
-            f"{found}: the camera looks {tilted_deg:.0f} deg away from straight up",
-            "correct camera.mount.rpy_deg: 0 0 0 looks up, and the last angle turns the picture",
+            f"{found}: the camera points {tilted_deg:.0f} deg away from straight up",
+            "correct camera.mount.rpy_deg: 0 0 0 points up, and the last angle turns the picture",
         )
     return passed(found)
 
@@ -176,7 +176,7 @@ def log_finding(folder: Path) -> Finding:
     except OSError as error:
         return skipped(f"free space unknown ({error.strerror or error})")
     if not usage.total:
-        return skipped(f"{folder} is not on a disk")
+        return skipped(f"free space unknown: {folder} is not on a disk")
     found = f"{folder}, {usage.free / 1e6:,.0f} MB free"
     return limits_finding(
         -usage.free, -500e6, -50e6, found, "free some space: a flight log takes about 5 MB a minute"

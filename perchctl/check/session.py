@@ -229,7 +229,7 @@ def _camera_rows(
         why = "pictures of another size cannot be checked"
         yield from skipped_rows(camera.picture_row_names(profile), why)
         return None
-    scope.announce(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
+    scope.announce(f"rehearsing with live pictures for {scope.rehearse_s:g} s")
     done = rehearse(take, source, pipeline, profile, WallClock(), scope.rehearse_s)
     done.scheme = scheme
     yield from camera.picture_rows(done, profile, pipeline.camera)

@@ -41,10 +41,10 @@ MOVED_WARN_M = 0.05
 flight."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
-BY_FLY = "fly sends the positions, and waits for the estimate to agree"
+BY_FLY = "fly sends the positions, and waits until the estimate agrees with them"
 """Finding for a vehicle that gets its positions from motion capture or from the target."""
 ARMED_BY_FLY = "fly arms it after you confirm"
-UNREPORTED = "link.unreported says that this vehicle reports none"
+UNREPORTED = "according to link.unreported, this vehicle does not report it"
 
 Wait = Callable[[float], None]
 
@@ -56,10 +56,11 @@ LINK_ADVICE = {
 }
 """Advice against lost and slow packets, by the scheme of the vehicle's URI."""
 ADDRESS_ADVICE = {
-    "radio": "switch it on; perchctl check --scan lists the vehicles that answer",
-    "usb": "plug it in and switch it on; perchctl check --scan lists the vehicles that answer",
-    "udp": "switch it on, and check its address; perchctl check --scan lists the vehicles "
-    "that answer",
+    "radio": "switch the vehicle on; perchctl check --scan lists the vehicles that answer",
+    "usb": "plug the vehicle in and switch it on; perchctl check --scan lists the vehicles that "
+    "answer",
+    "udp": "switch the vehicle on, and check its address; perchctl check --scan lists the "
+    "vehicles that answer",
     "sim": "start it again",
 }
 
@@ -193,7 +194,7 @@ def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     limit_s = profile.safety.proof_age_s
     slow_s, slow_advice = min(0.03, limit_s), advice
     if p95_s > slow_s and busy_s > BUSY_SHARE * p95_s:
-        found += f", this computer late by {1e3 * busy_s:.0f} ms"
+        found += f", and this computer was late by {1e3 * busy_s:.0f} ms"
         slow_advice = BUSY_ADVICE
     return worst_finding(
         limits_finding(lost, 0.01, 0.05, found, advice),
@@ -214,8 +215,8 @@ def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     age_ms = 1e3 * vehicle.age_s
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"
     if vehicle.age_s > profile.safety.telemetry_hold_s:
-        return failed(found, "see packets; restart the vehicle")
-    advice = "see packets, or raise link.telemetry_period_s"
+        return failed(found, "see packets above, then restart the vehicle")
+    advice = "see packets above, or raise link.telemetry_period_s"
     if vehicle.link_scheme == "radio":
         advice = "use a radio rate of 2M, or raise link.telemetry_period_s"
     return limits_finding(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)
@@ -224,14 +225,16 @@ def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
     found, needed = f"protocol {vehicle.protocol}", ProbeLink.NEEDED_PROTOCOL
     if vehicle.protocol < needed:
-        advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
+        advice = f"update the firmware: protocol {needed} or later is needed (release 2026.08)"
         return failed(found, advice)
     if vehicle.missing_variables:
         found = f"{found}, which lacks log variables {', '.join(vehicle.missing_variables)}"
-        return failed(found, "update it to release 2026.08 or later")
+        return failed(found, "update the firmware to release 2026.08 or later")
     if vehicle.parameters.get(SELF_TEST) == 0:
         found = f"{found}, its self-test failed at boot"
-        return failed(found, "restart it level and at rest, and read its console")
+        return failed(
+            found, "restart the vehicle while it is level and at rest, and read its console"
+        )
     return passed(found)
 
 
@@ -257,7 +260,7 @@ def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
-        "mocap": f"by {profile.positioning.label}, see the rows for it",
+        "mocap": f"by {profile.positioning.label}, see its rows",
         "target": "by the target, see the row in view",
         "deck": f"by {decks}",
     }
@@ -286,7 +289,9 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return warned(f"{ESTIMATOR} {kind:g} estimates no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
-        return warned(found, "keep it still; if it was still, check the light and the floor")
+        return warned(
+            found, "keep the vehicle still; if it was still, check the light and the floor"
+        )
     if all(each.value is None for each in criteria.variances):
         return skipped(UNREPORTED)
     return passed(found)
@@ -305,7 +310,7 @@ def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t, limit_deg = vehicle.known_telemetry, profile.safety.start_tilt_deg
     criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
-    advice = "put it on level ground; if it is level already, restart it there"
+    advice = "put the vehicle on level ground; if it is level already, restart it there"
     return worst_finding(
         limits_finding(criteria.tilt_deg, 3.0, limit_deg, found, advice),
         problem_finding(criteria.not_still, found),
@@ -322,9 +327,9 @@ def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return skipped(UNREPORTED)
     found = f"{t.battery_v:.2f} V at rest"
     if t.battery_state == LOW_POWER:
-        return failed(f"{found}, but it reports low power", "charge it")
+        return failed(f"{found}, but it reports low power", "charge the battery")
     if t.battery_v < profile.safety.min_rest_v + 0.1:
-        return warned(found, "enough only for a short flight: charge it")
+        return warned(found, "enough only for a short flight: charge the battery")
     return passed(found)
 
 
@@ -347,7 +352,7 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
 
 LIFTED = "lifted"
 LIFT_S = 20.0
-HOW_TO_LIFT = "lift it by 30 cm, hold it level, and put it back"
+HOW_TO_LIFT = "lift the vehicle by 30 cm, hold it level, and put it back"
 LIFT_CHECK_M = 0.15
 """Rise of the estimate above which a lift is evaluated, m. Larger: a short lift is skipped."""
 FOLLOWED_M = 0.08
@@ -377,11 +382,14 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
     heights_m = [t.position_m[2] for t in samples]
     rise_m, back_m = max(heights_m) - heights_m[0], heights_m[-1] - heights_m[0]
     moved_g = max(abs(t.acc_z_g - 1.0) for t in samples)
-    found = f"rose by {rise_m:.2f} m, then {back_m:+.2f} m"
+    found = f"rose by {rise_m:.2f} m, and ended {back_m:+.2f} m from its initial height"
     if rise_m < FOLLOWED_M and moved_g < MOVED_G:
         return skipped("the vehicle was not moved", HOW_TO_LIFT)
     if rise_m < FOLLOWED_M:
-        advice = "the positioning does not follow: check the light, the floor and the base stations"
+        advice = (
+            "the position estimate does not follow the vehicle: check the light, the floor and the "
+            "base stations"
+        )
         return failed(f"the vehicle moved, but the position only {found}", advice)
     if rise_m < LIFT_CHECK_M:
         return skipped(f"{found}: not enough to judge", HOW_TO_LIFT)

@@ -81,9 +81,9 @@ def check(
 ) -> int:
     """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
-    Each check passes, warns, fails, or is skipped if perchctl cannot find out. It arms nothing,
-    and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not answer,
-    20 if the camera gives no image, and 52 if any other check fails.
+    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl check arms
+    nothing, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not
+    answer, 20 if the camera gives no image, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")
@@ -140,7 +140,7 @@ def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     failing = [row.name for row in rows if row.verdict is checks.Verdict.FAIL]
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
-        ends.append("not finished, the other checks were not run")
+        ends.append("not finished: the other checks were not run")
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 

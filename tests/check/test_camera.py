@@ -134,7 +134,7 @@ def test_a_good_camera_fails_nothing() -> None:
         ("dark", "pictures", "fail", "dark"),
         ("slow", "frame rate", "fail", "6 Hz"),
         ("out of focus", "focus", "fail", "blur sigma 3"),
-        ("silent", "lost frames", "fail", "none for the last 0."),
+        ("silent", "lost frames", "fail", "no picture for the last 0."),
         ("out of order", "pictures", "fail", "arrived after newer ones"),
     )),
 ])  # fmt: skip
@@ -209,7 +209,7 @@ def test_what_a_receiver_gives_out_again_is_counted_once() -> None:
     assert done.repeats >= 10
     rows = rows_of(done)
     assert rows["pictures"].verdict is Verdict.PASS
-    assert "repetitions by the receiver" in rows["pictures"].found
+    assert "pictures that the receiver repeated" in rows["pictures"].found
     assert 23.0 < float(rows["frame rate"].found.split()[0]) < 27.5
     assert rows["lost frames"].verdict in (Verdict.PASS, Verdict.SKIPPED)
     assert done.target_pictures == done.pictures, "nor does it make the target seem unseen"

@@ -281,7 +281,7 @@ class Scripted:
     ([0.01] * 30, 0.0, "skipped", "not moved"),
     ([0.01] * 30, 0.3, "fail", "moved, but the position"),
     ([0.01, 0.1, 0.01], 0.2, "skipped", "not enough to judge"),
-    ([0.0, 0.4, 0.25], 0.2, "warn", "then +0.25 m"),
+    ([0.0, 0.4, 0.25], 0.2, "warn", "ended +0.25 m"),
     ([], 0.0, "skipped", "no telemetry"),
 ])  # fmt: skip
 def test_a_lift_makes_its_row(

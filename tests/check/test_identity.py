@@ -128,7 +128,7 @@ def test_a_lens_that_is_not_covered_proves_nothing(sim: SimProcess, relay: Relay
     stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", lookalikes=("east",))
     row = rows_of(relay.uri, sim, stand, lambda question: "blink" in question)["target"]
     assert row.verdict is Verdict.FAIL
-    assert "the camera of east would show its target there too" in row.found
+    assert "the camera of east would also see its target there" in row.found
 
 
 def test_a_body_at_another_home_is_named(sim: SimProcess, relay: Relay) -> None:

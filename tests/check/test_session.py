@@ -81,7 +81,7 @@ def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
     assert rows[0].verdict is Verdict.FAIL
     assert "--scan" in rows[0].advice
-    assert "switch it on" not in rows[0].found
+    assert "switch the vehicle on" not in rows[0].found
     assert {row.verdict for row in rows[1 : len(VEHICLE)]} == {Verdict.SKIPPED}
     assert exit_code(rows) == 10
 
@@ -112,7 +112,7 @@ def test_nobody_is_asked_to_lift_a_vehicle_that_is_armed() -> None:
     assert rows["supervisor"].verdict is Verdict.FAIL
     assert "is armed, and its propellers may turn" in rows["supervisor"].found
     assert (rows["lifted"].verdict, rows["lifted"].found) == (Verdict.SKIPPED, "it is armed")
-    assert not any("lift it" in text for text in asked)
+    assert not any("lift the vehicle" in text for text in asked)
 
 
 @pytest.mark.long

@@ -225,7 +225,7 @@ def test_a_busy_computer_is_named_where_it_explains_the_late_packets() -> None:
     assert "computer" not in rows_of(late)["packets"].found
     row = rows_of(replace(late, wake_delays_s=[0.001] * 90 + [0.06] * 10))["packets"]
     assert row.verdict is Verdict.WARN or row.verdict is Verdict.FAIL
-    assert row.found.endswith("this computer late by 60 ms")
+    assert row.found.endswith("this computer was late by 60 ms")
     assert row.advice == BUSY_ADVICE
     # What is lost is not lost by being late.
     lost = replace(late, round_trips_s=[0.004] * 80 + [math.inf] * 20, wake_delays_s=[0.06] * 50)
