@@ -282,13 +282,13 @@ FAULTS: tuple[Fault, ...] = (
     Fault("link-silent", "no packet in either direction", radio_effect(up=True, down="all")),
     Fault(
         "landing-lost",
-        "the operator lands, but 1 or 2 landing commands are lost",
+        "the operator requests a landing, but 1 or 2 landing commands are lost",
         (packet_loss("land"), ONCE),
         BEFORE_LANDING,
     ),
     Fault(
         "notify-lost",
-        "the operator lands, but 1 or 2 notify packets are lost",
+        "the operator requests a landing, but 1 or 2 notify packets are lost",
         (packet_loss("notify"), ONCE),
     ),
     Fault("stop-lost", "1 or 2 stop packets are lost", packet_loss("stop"), STOPPING),
@@ -300,7 +300,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "emergency-stop-lost",
-        "the operator stops, but 1 or 2 stop commands are lost",
+        "the operator cuts the motors, but 1 or 2 stop commands are lost",
         (packet_loss("emergency-stop"), effect(e.operator, presses_s=(0.0, 0.8))),
     ),
     Fault("packet-twice", "a packet arrives twice", _packet_twice),
@@ -326,12 +326,12 @@ FAULTS: tuple[Fault, ...] = (
     Fault("target-covered", "the target is hidden", COVERED),
     Fault(
         "camera-late",
-        "pictures 50 to 600 ms late that look fresh",
+        "pictures arrive 50 to 600 ms late but look fresh",
         effect(e.camera_fault, kind="late", for_s=duration_s(1.0), late_s=log_uniform(0.05, 0.6)),
     ),
     Fault(
         "camera-out-of-order",
-        "pictures in pairs, the newer one first",
+        "pictures arrive in pairs, the newer one first",
         camera_effect("out-of-order"),
     ),
     Fault(
@@ -384,7 +384,11 @@ FAULTS: tuple[Fault, ...] = (
         "the rigid body is hidden",
         effect(e.external_positions, how="occluded", for_s=either(0.5, 0.3, duration_s(0.5))),
     ),
-    Fault("external-swapped", "another body takes the vehicle's name", mocap_effect("swapped")),
+    Fault(
+        "external-swapped",
+        "the vehicle's rigid body swaps names with another",
+        mocap_effect("swapped"),
+    ),
     Fault("external-scaled", "positions in millimetres", mocap_effect("millimetres")),
     Fault(
         "external-late",
@@ -405,11 +409,14 @@ FAULTS: tuple[Fault, ...] = (
         "motor-weak", "one motor has 15 % less thrust", effect(e.thrust_changed, to=_one_weak_motor)
     ),
     # External forces.
-    Fault("kick", "a blow of 0.2 to 1 m/s", KICK),
+    Fault("kick", "a blow that changes the speed by 0.2 to 1 m/s", KICK),
     Fault("gust", "a gust of 5 to 20 % of the weight, for 0.5 to 1 s", GUST),
     # The magnet.
     Fault(
-        "no-magnet", "the magnet does not hold", effect(e.magnet_holds, of_weight=0.0), AT_CONTACT
+        "no-magnet",
+        "the magnet does not hold the vehicle",
+        effect(e.magnet_holds, of_weight=0.0),
+        AT_CONTACT,
     ),
     Fault("weak-magnet", "the magnet carries 0.2 to 1.1 times the weight", WEAK_MAGNET, AT_CONTACT),
     Fault(

@@ -87,7 +87,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "cut by the firmware",
-        "2 s after the last setpoint the firmware cuts the motors and locks",
+        "2 s after the last setpoint the firmware cuts the motors and locks the vehicle",
         lambda facts: facts.silence_lock_s,
         CUT_DOWN,
     ),
@@ -111,7 +111,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "too low to catch",
-        "a catch takes up to 0.8 m; the vehicle hung below 1 m",
+        "catching a fall takes up to 0.8 m of height; the vehicle hung below 1 m",
         _too_low,
     ),
     ExpectedOutcome(

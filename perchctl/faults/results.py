@@ -19,7 +19,7 @@ ENDS = {
     "aborted": "stopped by the operator, by the vehicle or for safety",
     "refused": "never took off",
     "failed": "an exception ended the flight after the rescue",
-    "gone": "the program ended before its flight",
+    "gone": "the program ended before the flight did",
 }
 """The ways in which a flight can end, and their meanings."""
 
@@ -75,9 +75,9 @@ class FaultResult(CampaignFlight):
 
 WORST_CASES = 20
 SHARES = {
-    "wrong": "with a flag that counts",
-    "not_known": "perchctl reports: it hangs or stands",
-    "unconfirmed": "perchctl reports: no landing was seen",
+    "wrong": "with a flag that counts against perchctl",
+    "not_known": "perchctl reports that the vehicle hangs or stands",
+    "unconfirmed": "perchctl reports that no landing was seen",
 }
 """The counts that are given as shares of all flights, and what they mean."""
 
