@@ -89,7 +89,7 @@ def test_the_same_flight_is_drawn_to_the_same_bytes(logs: Path, name: str) -> No
 
 
 def test_two_flights_are_compared(logs: Path) -> None:
-    assert "their profiles are the same" in run("log", "compare", OLD, NEW).stdout
+    assert "A and B have the same profile" in run("log", "compare", OLD, NEW).stdout
     assert json.loads(run("log", "compare", OLD, NEW, "--json").stdout)["profile"] == {}
 
 

@@ -82,9 +82,9 @@ class FlightComparison:
             yield _row(f"  {name}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
         yield ""
         yield (
-            "profile keys that differ, A and B"
+            "profile keys that differ, with their values in A and B"
             if self.changed_keys
-            else "their profiles are the same"
+            else "A and B have the same profile"
         )
         for key, values in self.changed_keys.items():
             a, b = ("none" if value is None else value for value in values)

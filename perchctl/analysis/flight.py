@@ -70,7 +70,7 @@ class Measures:
     battery_start_v: float | None = _number("battery, first", "V", digits=2)
     battery_min_v: float | None = _number("battery, lowest", "V", digits=2)
     battery_end_v: float | None = _number("battery, last", "V", digits=2)
-    battery_used_mah: float | None = _number("battery, used by the thrust", "mAh")
+    battery_used_mah: float | None = _number("battery, used for thrust", "mAh")
     frames: int | None = _number("frames")
     frames_unseen: int | None = _number("frames without target")
     frame_rate_hz: float | None = _number("frames, median rate", "Hz", digits=1)

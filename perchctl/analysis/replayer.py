@@ -79,7 +79,7 @@ class PerceptionReplay:
     @property
     def end_reason(self) -> str:
         """Why the replay ends before the flight does; empty if it does not."""
-        return f"{self.missing}: what follows cannot be replayed" if self.missing else ""
+        return f"{self.missing}: later frames cannot be replayed" if self.missing else ""
 
     @property
     def is_identical(self) -> bool:

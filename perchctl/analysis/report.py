@@ -33,7 +33,7 @@ OUTCOME_TITLES = {
     "landed": "Landed",
     "aborted": "Aborted",
     "failed": "Failed",
-    UNFINISHED: "Unfinished: the log has no end",
+    UNFINISHED: "Unfinished: the end of the log is missing",
 }
 GRADES = {"perched": "good", "landed": "warn"}
 
@@ -153,7 +153,9 @@ class ReportedFlight:
                 "failed. This report ends with the last record."
             )
         if log.ignored_bytes:
-            found.append(f"Its last {log.ignored_bytes} bytes are unreadable and were ignored.")
+            found.append(
+                f"The last {log.ignored_bytes} bytes of the log are unreadable and were ignored."
+            )
         if end.lost_records:
             why = end.log_problem or "the reason is unknown"
             found.append(f"The log lacks {count_text(end.lost_records, 'record')}: {why}.")

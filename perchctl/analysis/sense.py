@@ -120,7 +120,8 @@ class _Given:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
                     raise _PictureIsAnother(
-                        f"the recorded picture of frame {seen.index} differs from the one flown"
+                        f"the recorded picture of frame {seen.index} differs from the one that the "
+                        "flight used"
                     )
                 return image
             if index > seen.index:

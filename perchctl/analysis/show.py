@@ -55,7 +55,7 @@ def show_text(flight: FlightAnalysis) -> str:
     for head, rows in (
         ("phase     why", [(stay, stay.phase, _why(stay)) for stay in phases]),
         ("held in   because", [(hold, hold.phase, hold.reason) for hold in flight.position_holds]),
-        ("sent by   instead of the loop", [(go, go.by, go.text) for go in flight.takeovers]),
+        ("sent by   commands (count)", [(go, go.by, go.text) for go in flight.takeovers]),
     ):
         if rows:
             lines += ["", f"  at [s]  for [s]  {head}"]
@@ -82,7 +82,7 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     if log.summary is None:
         cause = "its end: the program may have been killed, or the disk may have failed"
         if not log.phases:
-            cause = "nothing: it never took off, or the program was killed before"
+            cause = "nothing: the vehicle never took off, or the program was killed before take-off"
         yield from _named("log lost", cause)
     if log.ignored_bytes:
         yield from _named("log lost", f"its end, {log.ignored_bytes} unreadable bytes")

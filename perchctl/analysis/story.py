@@ -15,7 +15,7 @@ HELD_LEAST_S = 0.1
 FLYING = frozenset(phase.value for phase in Phase if phase.is_before_landing)
 TOOK_OVER = {
     "watchdog": "The watchdog took over",
-    "rescue": "The rescue took over, after an error",
+    "rescue": "After an error, the rescue took over",
     "reconnect": "The link was reopened",
 }
 ACTIONS = {
@@ -98,7 +98,7 @@ def _loss(loss: TargetLoss) -> Sentence:
         count = count_text(loss.frames_without_target, "frame")
         text = f"The target was lost {for_s}: {count} without it"
     else:
-        text = f"No usable picture arrived {for_s if loss.is_regained else 'any more'}"
+        text = f"No usable picture arrived {for_s if loss.is_regained else 'after this'}"
     return Sentence(loss.start_s, text, "warn")
 
 

@@ -114,7 +114,7 @@ class Trim:
                 MOTOR_PLACES, self.shares, self.shares_margin, strict=True
             )
         )
-        return f"{each} against the mean thrust (95 %, {self.hover_s:.1f} s of level hover)"
+        return f"{each} relative to the mean thrust (95 %, {self.hover_s:.1f} s of level hover)"
 
     @property
     def balance_text(self) -> str:
@@ -246,8 +246,8 @@ def _advice(trim: Trim) -> Iterator[str]:
         pair, more = _yaw_pair(trim.yaw_imbalance)
         yield (
             f"the motors {pair} need {_percent(more, trim.yaw_margin)} thrust to hold the "
-            "heading, regardless of the battery's position: check their propellers, and that "
-            "every motor is upright"
+            "heading, regardless of the battery's position: check their propellers, and check "
+            "that every motor is upright"
         )
 
 

@@ -94,7 +94,7 @@ def test_a_log_without_a_tick_says_so() -> None:
     log.records.clear()
     words = Page(report_html([ReportedFlight(FlightAnalysis(log))])).words
     assert "The log has no ticks" in words
-    assert "Unfinished: the log has no end" in words
+    assert "Unfinished: the end of the log is missing" in words
 
 
 @words_only

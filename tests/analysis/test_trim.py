@@ -297,7 +297,7 @@ def test_show_and_report_say_the_same(tmp_path: Path) -> None:
     assert max(map(len, show_text(flight).splitlines())) <= COLUMNS
     said = [
         "motors: front right +14.3 +- 2.2 %, back right -14.2 +- 2.2 %, back left -10.3 +- 2.2 %, "
-        "front left +10.2 +- 2.2 % against the mean thrust (95 %, 6.0 s of level hover)",
+        "front left +10.2 +- 2.2 % relative to the mean thrust (95 %, 6.0 s of level hover)",
         "balance: centre of mass 4.0 +- 0.5 mm forward and 0.0 +- 0.5 mm to the right, if the "
         "motors are equal; weaker motors on that side look the same in flight",
         "yaw: front right and back left +2.0 +- 0.5 %; caused by unequal motors or propellers, or "

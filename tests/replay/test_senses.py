@@ -177,7 +177,7 @@ def damaged(pictures: list[Picture]) -> Iterator[Picture]:
 @pytest.mark.parametrize(
     ("change", "frames", "same", "why"),
     [
-        (altered, 20, False, "differs from the one flown"),
+        (altered, 20, False, "differs from the one that the flight used"),
         (lambda pictures: [*pictures[:20], *pictures[21:]], 20, True, "was not recorded"),
         (lambda pictures: pictures[:20], 20, True, "was not recorded"),
         (lambda pictures: [], 0, True, "was not recorded"),
