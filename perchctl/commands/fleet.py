@@ -51,7 +51,7 @@ from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 
 PLAN_COLUMNS = 80
-PICTURE = "how the room is drawn"
+PICTURE = "a drawing of the room"
 
 FleetArgument = Annotated[
     str | None,
@@ -88,13 +88,13 @@ def check(
 ) -> int:
     """Plan, fly and simulate several vehicles in one room, and import other fleet files.
 
-    By default (check), perchctl reads the fleet file, checks that each radio dongle can carry its
-    vehicles, decides which vehicles fly together and in which order, and draws the room from above.
-    It connects to nothing. If the plan cannot be flown, perchctl still draws it, and says why in
-    one sentence.
+    By default (subcommand check), perchctl reads the fleet file, checks that each radio dongle can
+    carry its vehicles, decides which vehicles fly together and in which order, and draws the room
+    from above. It does not connect to anything. If the plan cannot be flown, perchctl still draws
+    it, and states the reason in one sentence.
 
     With --identify, perchctl then connects to the vehicles one at a time and checks that each
-    one is at its home. It arms nothing. The exit codes are those of perchctl check.
+    one is at its home. It does not arm any vehicle. The exit codes are those of perchctl check.
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
@@ -127,8 +127,8 @@ def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
     real = [vehicle for vehicle in plan.fleet.vehicles if not vehicle.simulated]
     if real and not sys.stdin.isatty():
         raise UsageError(
-            f"--identify asks about {real[0].name} which vehicle blinks, and the input is not a "
-            f"terminal: run it on one"
+            f"--identify asks you whether {real[0].name} blinks, but the input is not a "
+            f"terminal: run the command in a terminal"
         )
     if not as_json:
         print_result(plan_text(plan))
@@ -320,7 +320,7 @@ def simulate(
     if faults == "list":
         return _list_fleet_faults(as_json)
     if resume and out is None:
-        raise UsageError("--resume continues a file of results: name it with --out")
+        raise UsageError("--resume continues a results file: name it with --out")
     _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)
     names = () if faults is None else fleets.select_fleet_faults(faults)
@@ -393,12 +393,12 @@ def convert(
     perchctl copies names, URIs and, from Crazyswarm2, initial positions and motion-capture bodies.
     These lists contain no targets and cameras: add them to the fleet file.
     """
-    check_output(output, (".yaml", ".yml"), force, "what a fleet file is")
+    check_output(output, (".yaml", ".yml"), force, "a fleet file")
     say_on_terminal(f"reading {file}")
     found = fleets.convert_fleet(file)
     write_files({output: found.text().encode()})
     if found.skipped:
-        say(f"left out, as they are switched off: {', '.join(found.skipped)}")
+        say(f"left out because they are switched off: {', '.join(found.skipped)}")
     count = len(found.vehicles)
     print(f"wrote {output}: {count} vehicle{'s' if count > 1 else ''}")
     print(

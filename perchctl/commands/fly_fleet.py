@@ -267,7 +267,7 @@ class FleetSession:
         """Land the vehicle with this number at once; return the reply to the operator. Called in
         the keyboard thread, which must not be blocked."""
         if not 1 <= number <= self._keys:
-            return f"no vehicle has the key {number}: press 1 to {self._keys} to land one"
+            return f"no vehicle is assigned to key {number}: press 1 to {self._keys} to land one"
         return self._land_one(coordinator, number, f"key {number}")
 
     def _land_one(self, coordinator: fleets.Coordinator, number: int, how: str) -> str:
@@ -334,7 +334,7 @@ class FleetSession:
                 self._radios.slow_down(self._options[view.name].uri)
         before, self._radio_problems = self._radio_problems, self._radios.problems()
         for dongle in before.keys() - self._radio_problems.keys():
-            self._tell(f"dongle {dongle}: it works again")
+            self._tell(f"dongle {dongle} works again")
         for dongle, problem in self._radio_problems.items():
             if dongle not in before:
                 self._problems.append(f"dongle {dongle}: {problem}")

@@ -59,7 +59,7 @@ class ConvertedFleet:
         frame = ", frame: room" if self.in_room_axes and not mocap else ""
         positioning = ", positioning: {by: mocap}" if mocap else ""
         lines = [
-            "# Made by perchctl fleet convert. Add to each vehicle what is missing:",
+            "# Made by perchctl fleet convert. Add the missing keys to each vehicle:",
             f"# {', '.join(self.missing)}; then run perchctl fleet check on this file.",
             *(_CAPTURE if mocap else ()),
             f"name: {yaml_scalar(self.name)}",
@@ -91,11 +91,11 @@ def convert_fleet(path: Path) -> ConvertedFleet:
         found = _from_cfcli(path, units, values)
     else:
         raise InvalidValue(
-            f"{path}: has neither robots, as Crazyswarm2's crazyflies.yaml has, nor a list of "
-            f"units, as a swarm of cfcli or Swarmkeeper has"
+            f"{path}: has neither robots, like Crazyswarm2's crazyflies.yaml, nor a list of "
+            f"units, like a swarm file from cfcli or Swarmkeeper"
         )
     if not found.vehicles:
-        raise InvalidValue(f"{path}: has no vehicle that is switched on")
+        raise InvalidValue(f"{path}: no vehicle in this file is switched on")
     names = [vehicle.name.lower() for vehicle in found.vehicles]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InvalidValue(f"{path}: two vehicles would be called {twice}: rename one")
@@ -149,7 +149,7 @@ def _from_cfcli(path: Path, units: Sequence[Any], values: Mapping[str, Any]) -> 
 
 def _mapping(where: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise InvalidValue(f"{where}: must hold keys and values, found {type(value).__name__}")
+        raise InvalidValue(f"{where}: must contain keys and values, found {type(value).__name__}")
     return value
 
 

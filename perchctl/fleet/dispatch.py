@@ -249,14 +249,14 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
         place_m = places.get(other)
         if place_m is not None:
             if math.dist(place_m, target_m) < least_m:
-                return f"{other} is too close to its climb"
+                return f"{other} is too close to its climb path"
             continue
         lands = view.status is not None and view.status.phase is Phase.LANDING
         if other in places or lands or view.is_silent or not view.is_in_air:
             corridor = plan.corridors[other]
             lost = replace(corridor, radius_m=max(corridor.radius_m, TARGET_ALONE_M))
             if lost.distance_to_m(target_m) < least_m:
-                return f"the distance of {other} from its climb is unknown"
+                return f"the distance of {other} from its climb path is unknown"
     return None
 
 
@@ -273,7 +273,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
         elif is_at_home(vehicle, result):
             place, where = vehicle.home_m, "stands"
         elif not plan.schedule.may_fly_together(name, other):
-            return f"{other} may be in its corridor: its flight ended away from its home"
+            return f"{other} may be in the corridor: its flight ended away from its home"
         else:
             continue
         away_m = corridor.distance_to_m(place)

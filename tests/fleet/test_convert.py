@@ -116,10 +116,10 @@ def test_what_is_missing_is_refused_until_it_is_there(tmp_path: Path, text: str)
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("extends: sim\n", "has neither robots, as Crazyswarm2's crazyflies.yaml has, nor a list"),
-        ("robots: {a: {enabled: false}}\n", "has no vehicle that is switched on"),
+        ("extends: sim\n", "has neither robots, like Crazyswarm2's crazyflies.yaml, nor a list"),
+        ("robots: {a: {enabled: false}}\n", "no vehicle in this file is switched on"),
         ("robots: {a: {enabled: true}}\n", "robots.a: has no uri"),
-        ("robots: {a: 3}\n", "robots.a: must hold keys and values, found int"),
+        ("robots: {a: 3}\n", "robots.a: must contain keys and values, found int"),
         (
             "robots: {a: {enabled: true, uri: 'usb://0', initial_position: [1, x]}}\n",
             "robots.a.initial_position: must be x, y and z in metres, found [1, 'x']",

@@ -219,7 +219,7 @@ def test_one_that_ended_somewhere_keeps_its_neighbour_on_the_floor() -> None:
     rig.fly("v0")
     rig.end("v0", ABORTED)
     assert rig["v1"].order == Order(may_take_off=False, word=OperatorRequest.LAND)
-    assert "v0 may be in its corridor" in rig.fleet.reasons["v1"]
+    assert "v0 may be in the corridor" in rig.fleet.reasons["v1"]
 
 
 def test_one_that_hangs_or_stands_at_its_home_keeps_nobody() -> None:
@@ -270,7 +270,7 @@ def test_a_climb_is_permitted_again_and_again_until_a_neighbour_is_near() -> Non
     rig["v0"].tell(Stage.FLYING, phase=Phase.LANDING, place_m=strays, **known)
     rig.pass_s()
     assert [child.order.may_climb for child in rig.children.values()] == [True, False, True, True]
-    assert rig["v1"].order.why_not_climb == "v0 is too close to its climb"
+    assert rig["v1"].order.why_not_climb == "v0 is too close to its climb path"
     assert rig.words == [OperatorRequest.NONE] * 4, "it waits, but does not land"
     rig.end("v0", ABORTED)
     assert rig["v1"].order.may_climb

@@ -108,7 +108,7 @@ def test_a_dead_dongle_and_its_return_are_told_once(
     session._look(nobody)
     assert capsys.readouterr().err.splitlines() == [
         "perchctl: dongle 0: the radio hub has not reported for 1.1 s",
-        "perchctl: dongle 0: it works again",
+        "perchctl: dongle 0 works again",
     ]
     assert len(session._outcome(nobody).record()["problems"]) == 1
 
@@ -281,7 +281,7 @@ def test_each_number_key_is_answered(
     assert ends == ["landed", "perched", "perched", "landed"]
     said = [re.sub(r"^\[.*\] ", "", line) for line in capsys.readouterr().err.splitlines()]
     assert [line for line in said if "key" in line and "cuts" not in line] == [
-        "no vehicle has the key 0: press 1 to 4 to land one",
+        "no vehicle is assigned to key 0: press 1 to 4 to land one",
         "west: take-off cancelled (key 4)",
         "north: landing (key 1)",
     ]

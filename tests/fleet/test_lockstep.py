@@ -538,4 +538,4 @@ def test_the_command_flies_writes_and_resumes(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("[0, 0]}", "[0.1, 0]}"))
     other = run(*words, "-n", "1", "--resume")
     assert other.code == 30
-    assert "have another" in other.stderr
+    assert "made with a different" in other.stderr
