@@ -177,11 +177,11 @@ def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dic
         others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header.get(key)]
         if others:
             raise InvalidValue(
-                f"the flights in {path} have another {' and another '.join(others)}: use the same, "
-                "or name another file"
+                f"the flights in {path} were made with a different "
+                f"{' and a different '.join(others)}: use the same, or name another file"
             )
         if any(flight.pop("kind") != "flight" for flight in flights):
-            raise ValueError("a line is not a flight")
+            raise ValueError("a line does not describe a flight")
         results = [from_exact_json(result_type, flight) for flight in flights]
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(

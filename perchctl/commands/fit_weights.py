@@ -51,7 +51,7 @@ def fit(
     ] = None,
     method: Annotated[
         Literal["closed_form", "lms"],
-        typer.Option("--method", help="Closed-form least squares, or the paper's LMS."),
+        typer.Option("--method", help="Closed-form least squares, or the paper's LMS algorithm."),
     ] = "closed_form",
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write the weights even if they are not recommended.")
@@ -61,10 +61,10 @@ def fit(
 ) -> int:
     """Fit the merge weights to poses with known ground truth, and verify that they help.
 
-    Each CSV row is one image. Its columns are position (a number for each place), t_s, and
+    Each CSV row describes one image. The columns are position (a number for each place), t_s, and
     x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and actual_. The cells of a
     marker that was not detected are empty. All three poses are in the same coordinate frame;
-    collect writes the target relative to the gear, in the level frame.
+    fit-weights collect writes the target's pose relative to the gear, in the level frame.
     """
     if output is not None:
         if same_file(output, data):
@@ -209,7 +209,7 @@ def _open_capture(profile: profiles.Profile, target_body: str) -> weights.MocapP
     of connecting."""
     if not profile.positioning.source.is_mocap:
         raise UsageError(
-            "--truth mocap needs a profile with its motion capture, as in "
+            "--truth mocap needs a profile with motion capture, as in "
             "positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: cf}"
         )
     import numpy as np

@@ -73,12 +73,12 @@ def hover(
     as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> int:
-    """Hover below the target for a time, land, and report the position error.
+    """Hover below the target for a set time, land, and report the position error.
 
-    Use it before the first perch, to check the camera, its mounting and the tuning: the vehicle
+    Hover before the first perch to check the camera, its mounting and the tuning: the vehicle
     finds the target, aligns and climbs as it does for a perch, but stays away from the ceiling. The
-    exit code is 0 only if it hovered for the whole time and has landed. Ctrl-C and the space bar
-    work as in `perchctl fly`.
+    exit code is 0 only if the vehicle hovered for the whole time and then landed. Ctrl-C and the
+    space bar work as in `perchctl fly`.
     """
     say_on_terminal(f"reading profile {profile}")
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)

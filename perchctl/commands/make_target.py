@@ -69,8 +69,8 @@ def sheet(
 ) -> None:
     """Make a PDF of the target or a calibration board, design a target, or enter its printed size.
 
-    By default (sheet), perchctl writes a true-to-size PDF of the profile's target, front and back.
-    It first verifies that the markers can be detected.
+    By default (subcommand sheet), perchctl writes a true-to-size PDF of the profile's target, front
+    and back. It first verifies that the markers can be detected.
     """
     say_on_terminal(f"reading profile {profile}")
     config = profiles.load_profile(profile)
@@ -102,7 +102,7 @@ def board(
     page: PageOption = "a4",
     force: ForceOption = False,
 ) -> None:
-    """Write a PDF of a calibration board, named as in calibrate --board."""
+    """Write a PDF of a calibration board, specified as for calibrate --board."""
     say_on_terminal(f"reading board {notation}")
     printed = targets.Board.parse(notation)
     if printed.scale != (1.0, 1.0):

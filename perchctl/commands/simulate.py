@@ -124,7 +124,7 @@ def run(
             "--record writes its files next to the flight logs: name their folder with --log-dir"
         )
     if resume and out is None:
-        raise UsageError("--resume continues a file of results: name it with --out")
+        raise UsageError("--resume continues a results file: name it with --out")
     say_on_terminal(f"reading profile {profile}")
     flown = with_positioning(profiles.load_profile(profile), positioning)
     if cluster is not None and log_dir is not None:

@@ -125,7 +125,7 @@ def track(
         count = None
         if isinstance(recording, cameras.RecordedSource):
             paths, count = recording.paths, recording.count
-        advice = ", the shipped example: name your camera's with --calibration"
+        advice = ", the shipped example: name your own camera's file with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
         # Image files may be unrelated.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))

@@ -233,11 +233,11 @@ class _Handler(BaseHTTPRequestHandler):
             case ["picture", *name]:
                 jpeg = self.server.page.picture("".join(name))
                 if jpeg is None:
-                    self._refuse(404, "there is no picture now")
+                    self._refuse(404, "there is no picture at the moment")
                 else:
                     self._send(200, "image/jpeg", jpeg)
             case _:
-                self._refuse(404, "there is /, /state, /stream and /picture")
+                self._refuse(404, "not found: this server has /, /state, /stream and /picture")
 
     def do_POST(self) -> None:
         if not self._from_here():
@@ -246,9 +246,9 @@ class _Handler(BaseHTTPRequestHandler):
         if not page.has_button(name):
             self._refuse(404, "only buttons accept POST requests")
         elif not page.may_order(self.headers.get(TOKEN_HEADER, "")):
-            self._refuse(403, "this button needs the token of the address that perchctl printed")
+            self._refuse(403, "this button needs the token from the address that perchctl printed")
         elif not page.order(name):
-            self._refuse(403, "this page has no buttons: nothing flies")
+            self._refuse(403, "this page has no buttons: nothing is flying")
         else:
             self._send(200, "application/json", json.dumps({"ordered": name}).encode())
 

@@ -70,7 +70,9 @@ def test_other_flights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     written(path, 0)
     before = path.read_bytes().replace(b'"seed"', b'"number"')  # as others may call it
     path.write_bytes(before)
-    with pytest.raises(InvalidValue, match="another profile and another selection of faults"):
+    with pytest.raises(
+        InvalidValue, match="a different profile and a different selection of faults"
+    ):
         written(path, profile=load_profile("rough"), faults=["killed"], resume=True)
     monkeypatch.setattr(results_file, "source_sha256", lambda: "ffff")
     with pytest.raises(InvalidValue, match="another program: "):
