@@ -107,8 +107,8 @@ def check_writable(path: Path, force: bool, *, makes_folder: bool = True) -> Non
         raise InvalidValue(f"{path} cannot be written: {folder} is a file, not a folder")
     if folder != path.absolute().parent and not makes_folder:
         raise InvalidValue(
-            f"{path} cannot be written: folder {path.parent} does not exist; make it, or name "
-            "another place"
+            f"{path} cannot be written: folder {path.parent} does not exist; create it, or "
+            "name another folder"
         )
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InvalidValue(f"{path} cannot be written: no permission to write in {folder}")

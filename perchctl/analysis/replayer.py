@@ -134,12 +134,12 @@ class Replay:
         found = []
         if made_by != perchctl.__version__:
             found.append(
-                f"perchctl {made_by} flew this flight, and this is {perchctl.__version__}: a "
-                "difference may be a deliberate change"
+                f"perchctl {made_by} flew this flight, but this is version "
+                f"{perchctl.__version__}: a difference may be a deliberate change"
             )
         if elsewhere:
             found.append(
-                f"the flight was made with {elsewhere}: numbers may differ in their last bits"
+                f"the flight was flown with {elsewhere}: numbers may differ in their last bits"
             )
         if self.uncompared:
             found.append(

@@ -139,12 +139,13 @@ def _vehicle_finding(
                 f"it at its home, {stand.home_text}?"
             )
     except PerchError as error:
-        return failed(f"its LEDs do not blink: {error.found}", "update its firmware")
+        return failed(f"the vehicle's LEDs do not blink: {error.found}", "update its firmware")
     if is_there:
-        return passed(f"you confirmed that it blinks at its home, {stand.home_text}")
+        return passed(f"you confirmed that the vehicle blinks at its home, {stand.home_text}")
     return failed(
-        f"you did not confirm that it blinks at its home, {stand.home_text}",
-        "put each vehicle at its own home, or correct uri; if two blink, give one another address",
+        f"you did not confirm that the vehicle blinks at its home, {stand.home_text}",
+        "put each vehicle at its own home, or correct uri; if two vehicles blink, give one of them "
+        "another address",
     )
 
 
@@ -262,7 +263,7 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
         return passed("its camera image went dark when you covered the lens")
     return failed(
         "its camera image did not go dark when you covered the lens",
-        "it may be another vehicle's: correct source; if it is not, cover the whole lens",
+        "the camera may be another vehicle's: correct source; if it is not, cover the whole lens",
     )
 
 

@@ -286,7 +286,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return failed(f"{found}, but {problem.found}", problem.advice)
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
-        return warned(f"{ESTIMATOR} {kind:g} estimates no position", advice)
+        return warned(f"{ESTIMATOR} {kind:g} does not estimate the position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
         return warned(

@@ -196,7 +196,7 @@ def check(
     notes = calibrations.load_notes(calibration)
     layout = targets.Board.parse(board or notes.board or DEFAULT_BOARD)
     if board is None:
-        origin = "the calibration's" if notes.board else "the default"
+        origin = "from the calibration" if notes.board else "the default"
         say(f"the board is {layout.notation()} ({origin})")
     found = _find_views(pictures, model.size_px, layout)
     cameras.check_size(found.views[0].size_px, model, cameras.without_password(pictures))

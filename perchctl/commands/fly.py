@@ -438,7 +438,7 @@ def _positioning(options: flights.FlyOptions) -> str:
         return f"the target, seen by the camera from the ground: {view}"
     if not config.source.is_mocap:
         return "the vehicle's own deck"
-    where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
+    where = "in the simulated room" if options.simulated else f"{config.system}:{config.host}"
     return (
         f"motion capture {where}, body {config.body!r}, {config.send} at most {config.rate_hz:g} Hz"
     )

@@ -35,7 +35,7 @@ PAGES = ((".html", ".htm"), "a page")
 LogArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="Flight log, or a folder to take the newest log from. Default: perchctl-logs."
+        help="Flight log, or a folder with logs (the newest is used). Default: perchctl-logs."
     ),
 ]
 app = new_app(Group)
@@ -90,7 +90,7 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     """Show, plot, compare, export, replay, film or summarise a flight from its log.
 
     All subcommands read logs of real and simulated flights, of flights that were killed, and of
-    older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do
+    older perchctl versions. Only replay needs complete tick records, which log versions 1 and 2 do
     not contain.
     """
     with _opened(_log_file(file)) as log:

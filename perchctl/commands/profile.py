@@ -338,7 +338,7 @@ def answers_text(answers: Answers) -> str:
     mirrored = "mirrored" if profile.camera.mirrored else "not mirrored"
     turn = profile.camera.mount.rpy_deg[2]
     rows = [(name, _shown(name, answers[name])) for name in QUESTIONS if name in answers]
-    rows.append(("picture", f"{mirrored}, turned by {turn:g} deg about the vertical"))
+    rows.append(("picture", f"{mirrored}, turned by {turn:g} deg about the vertical axis"))
     return "\n".join(f"  {name:<24} {text}" for name, text in rows)
 
 

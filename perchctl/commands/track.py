@@ -83,7 +83,7 @@ def track(
     \b
     frame         file name of the image, or index of the frame
     t_s           time of exposure; for a live source, on the monotonic clock
-    unix_s        the same as Unix time, or null for a recording
+    unix_s        time of exposure as Unix time, or null for a recording
     stage         detected markers: large, both, small or none
     large, small  null, or corners_px (TL TR BR BL), rvec_rad, tvec_m and
                   reprojection_px

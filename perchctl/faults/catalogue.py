@@ -371,7 +371,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "estimate-nan",
-        "position, velocity: NaN",
+        "position and velocity are NaN",
         effect(e.log_reads, names=STATE, value=math.nan, for_s=duration_s(0.02)),
     ),
     Fault(

@@ -102,7 +102,7 @@ def test_a_calibration_is_not_judged_by_its_own_pictures(
         cv2.imwrite(f"{tmp_path}/copy_{i}.png", np.asarray(cv2.imread(str(path), 0)))
     said = calibrate("check", file, f"images:{tmp_path}")
     assert said.exit_code == 30
-    assert f"the board is {BOARD} (the calibration's)" in said.stderr
+    assert f"the board is {BOARD} (from the calibration)" in said.stderr
     assert "10 of 10 views are from images that the calibration was made from" in said.stderr
     render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
     passed = calibrate("check", file, f"images:{tmp_path}")
@@ -123,7 +123,7 @@ def test_a_board_in_the_older_layout_is_calibrated_and_stored(tmp_path: Path) ->
     error = np.abs(lens_parameters(load_calibration(file)) - lens_parameters(camera))
     assert error[:4].max() < 2.0
     own = calibrate("check", file, f"images:{tmp_path / 'board'}")
-    assert f"the board is {board.notation()} (the calibration's)" in own.stderr
+    assert f"the board is {board.notation()} (from the calibration)" in own.stderr
     assert "6 of 6 views" in own.stderr
 
 

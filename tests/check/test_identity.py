@@ -77,7 +77,10 @@ def test_a_vehicle_that_nobody_has_seen_blink_at_its_home_fails(
 ) -> None:
     rows = rows_of(relay.uri, sim, ask=lambda _: False)
     assert rows["vehicle"].verdict is Verdict.FAIL
-    assert rows["vehicle"].found == "you did not confirm that it blinks at its home, 0.00 1.20 m"
+    assert (
+        rows["vehicle"].found
+        == "you did not confirm that the vehicle blinks at its home, 0.00 1.20 m"
+    )
     assert rows["target"].verdict is Verdict.PASS
 
 

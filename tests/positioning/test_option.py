@@ -39,7 +39,7 @@ def test_a_section_that_cannot_be_meant_is_refused(
 
 
 @pytest.mark.parametrize(("words", "by", "said"), [
-    (("--positioning", "mocap"), "mocap", "motion capture the simulated room's, body 'crazyflie'"),
+    (("--positioning", "mocap"), "mocap", "motion capture in the simulated room, body 'crazyflie'"),
     (("-p", "LAB", "--positioning", "deck"), "deck", "the vehicle's own deck"),
     (("-p", "target_only"), "target", "the target, seen by the camera"),
 ])  # fmt: skip

@@ -182,7 +182,8 @@ def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Pat
     lines[0] = altered(lines[0], perchctl="0.0.9")
     other = replay(read_log(log_of(tmp_path, lines[:100])))
     assert any(
-        f"0.0.9 flew this flight, and this is {perchctl.__version__}" in n for n in other.notes
+        f"0.0.9 flew this flight, but this is version {perchctl.__version__}" in n
+        for n in other.notes
     )
 
 

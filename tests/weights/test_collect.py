@@ -51,7 +51,7 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
 def test_a_mistyped_folder_is_not_made(tmp_path: Path) -> None:
     done = run("collect", tmp_path / "sesions/session.csv", "--truth", "sim")
     assert done.exit_code == 30
-    assert "sesions does not exist; make it, or name another place" in done.stderr
+    assert "sesions does not exist; create it, or name another folder" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
