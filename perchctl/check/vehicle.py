@@ -210,7 +210,9 @@ def _quantile_95(ordered_s: Sequence[float]) -> float:
 
 def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.telemetry is None:
-        return failed("none arrives", "see firmware and packets above, then restart the vehicle")
+        return failed(
+            "no telemetry arrives", "see the rows packets and firmware, then restart the vehicle"
+        )
     wanted_hz = 1.0 / profile.link.telemetry_period_s
     age_ms = 1e3 * vehicle.age_s
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"

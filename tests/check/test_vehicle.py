@@ -105,7 +105,7 @@ FAULTS = [
     ("level", "bad", "fail", "pitch 20"),
     ("battery", "bad", "fail", "rests at 3.5"),
     ("firmware", "old", "fail", "protocol 11"),
-    ("telemetry", "old", "fail", "none arrives"),
+    ("telemetry", "old", "fail", "no telemetry arrives"),
 ]
 
 
