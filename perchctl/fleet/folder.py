@@ -48,7 +48,8 @@ class FleetFolder:
         except (TypeError, ValueError, LookupError, AttributeError) as error:
             why = f"{type(error).__name__}: {error}"
             raise InvalidValue(
-                f"{RECORD_NAME} does not say where each vehicle flew ({why}): film one log"
+                f"{RECORD_NAME} does not record where each vehicle flew ({why}): make the film "
+                "from a single log instead"
             ) from None
 
 

@@ -60,8 +60,10 @@ class _Common(Section):
 class _Vehicle(_Common):
     name: str = key(..., "name of the vehicle", pattern=_NAME_PATTERN)
     home_m: tuple[_Length, _Length] = key(..., "position before take-off: x, y")
-    target_m: tuple[_Length, _Length] | None = key(None, "position of its target: x, y")
-    body: str | None = key(None, "its rigid body in the motion-capture system", min_length=1)
+    target_m: tuple[_Length, _Length] | None = key(None, "position of the vehicle's target: x, y")
+    body: str | None = key(
+        None, "name of the vehicle's rigid body in the motion-capture system", min_length=1
+    )
 
 
 class _File(Section):
@@ -105,8 +107,8 @@ def load_fleet(name: str | Path = EXAMPLE_FLEET) -> Fleet:
     values = read_yaml(path)
     if "vehicles" not in values:
         raise InvalidValue(
-            f"{path}: has no vehicles, so it is no fleet file: list them under vehicles, each with "
-            f"name, uri, home_m and target_m{kind_note(path)}"
+            f"{path}: has no vehicles, so it is not a fleet file: list them under vehicles, each "
+            f"with name, uri, home_m and target_m{kind_note(path)}"
         )
     keys: _File = _validated(path, _File, values)
     defaults = _split(f"{path}: defaults", _Common, keys.defaults)
@@ -203,10 +205,10 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
-        axes = "the room's axes" if only == "room" else "axes that start where it stands"
+        axes = "the room's axes" if only == "room" else "axes with their origin where it stands"
         raise InvalidValue(
             f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
-            f"estimate has {axes}: write {only}, or leave it out"
+            f"estimate uses {axes}: write {only}, or leave it out"
         )
     try:
         if not is_own_uri(uri):
@@ -230,8 +232,8 @@ def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> 
     expected_m = vehicle.profile.target.expected_xy_m
     if expected_m is None:
         raise InvalidValue(
-            f"{where}: nothing says where its target is: give target_m, or target: FILE with "
-            f"target.expected_xy_m in it"
+            f"{where}: the position of its target is missing: set target_m, or set target to a "
+            f"file that contains target.expected_xy_m"
         )
     return vehicle.to_room(expected_m)
 
@@ -241,10 +243,14 @@ def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> 
 
 def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
     kinds: tuple[tuple[Callable[[FleetVehicle], str | None], str], ...] = (
-        (lambda v: v.name.lower(), "share the name {0}: give each its own"),
-        (_address, "share the address {0}: give each its own in Bitcraze's client, and in its uri"),
-        (_camera, "share the camera {0}: give each its own source"),
-        (_body, "share the motion-capture body {0}: give each its own body"),
+        (lambda v: v.name.lower(), "share the name {0}: give each vehicle its own name"),
+        (
+            _address,
+            "share the address {0}: give each vehicle its own address, in Bitcraze's client and in "
+            "its uri",
+        ),
+        (_camera, "share the camera {0}: give each vehicle its own source"),
+        (_body, "share the motion-capture body {0}: give each vehicle its own body"),
     )
     for read, words in kinds:
         seen: dict[str, tuple[int, FleetVehicle]] = {}
@@ -301,7 +307,7 @@ def _split(
         if name in _SECTIONS and not is_text and not isinstance(value, dict):
             raise InvalidValue(
                 f"{where}: {name}: must have keys and values, found {clip_text(repr(value))}; "
-                f"add some, or remove it"
+                f"add some, or remove the section"
             )
     return own, sections
 
@@ -319,9 +325,9 @@ def _in_words(key: str, reason: str) -> str:
     regular expression."""
     found = reason.rpartition(", found ")[2]
     if reason.startswith("string should match") and key == "order":
-        return f"found {found}; allowed are one-at-a-time, together, or as in 2 at a time"
+        return f"found {found}; allowed are one-at-a-time, together, or a number as in 2 at a time"
     if reason.startswith("string should match"):
-        return f"found {found}; allowed are letters, digits, -, _ and ., at most 32"
+        return f"found {found}; allowed are at most 32 letters, digits, -, _ and ."
     if reason.startswith("field required"):
         return f"is missing; {_NEEDED.get(key, 'give it')}"
     return reason

@@ -336,11 +336,14 @@ class FleetFlight:
             return f"it is unknown where {other} {does}"
         gap_m = self._plan.corridors[name].distance_to_m(place_m)
         if gap_m < OBSTACLE_M:
-            return f"{other} {does} {gap_text(gap_m)} its corridor"
+            return f"{other} {does} {gap_text(gap_m)} this vehicle's corridor"
         away_m = math.dist(place_m, self._plan.fleet.vehicle(other).home_m)
         together = self._plan.schedule.may_fly_together(other, name)
         if not (hangs or together or away_m <= AT_HOME_M):
-            return f"{other} lies {away_m:.2f} m from its home, in a corridor that is too close"
+            return (
+                f"{other} lies {away_m:.2f} m from its home, in a corridor that is too close to "
+                "this vehicle's"
+            )
         return ""
 
     def _is_lasting(self, name: str) -> bool:

@@ -178,7 +178,7 @@ def find_fault(message: object) -> str | None:
         case _:
             return f"{type(message).__name__} instead of its status"
     if not (is_good and _is_place(message.place_m)):
-        return f"{type(message).__name__} with parts of a wrong type"
+        return f"{type(message).__name__} with fields of the wrong type"
     return None
 
 

@@ -30,7 +30,7 @@ from perchctl.fleet.plan import FleetPlan
 from perchctl.flight import FlyOptions
 
 RECORD_NAME = "fleet.json"
-LOOK_FIRST = "look where the vehicle is before you reach for it"
+LOOK_FIRST = "check where the vehicle is before you reach for it"
 """Advice for a vehicle if it is unknown how its flight ended."""
 _WORST_FIRST: tuple[type[PerchError], ...] = (
     EmergencyStopped,

@@ -66,7 +66,7 @@ class ParentSwitch(OperatorSwitch):
         if self.lost is not None:
             return self.lost
         if not 0.0 <= self.clock() - order.sent_s <= PERMISSION_FRESH_S:
-            return "the newest order of the parent process is old"
+            return "the newest order from the parent process is too old"
         return None if order.may_climb else order.why_not_climb or "the fleet is not flying"
 
     def lose_parent(self, why: str = "the parent process is gone") -> None:

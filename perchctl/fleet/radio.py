@@ -182,17 +182,19 @@ def _refuse_mixed(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> N
             if place.channel != there.channel:
                 raise InvalidValue(
                     f"dongle {dongle} has {first.name} on channel {there.channel} and {other.name} "
-                    f"on channel {place.channel}, and would carry {OTHER_CHANNELS_PER_S[2]:g} "
-                    f"packets/s for each of two vehicles instead of {SAME_CHANNEL_PER_S[2]:g}: set "
-                    f"both to the same channel, or give {other.name} another dongle"
+                    f"on channel {place.channel}; on two channels it carries "
+                    f"{OTHER_CHANNELS_PER_S[2]:g} packets/s for each of two vehicles instead of "
+                    f"{SAME_CHANNEL_PER_S[2]:g}: set both to the same channel, or move {other.name} "
+                    "to another dongle"
                 )
             if MEASURED_RATE not in (there.rate, place.rate) or place.rate != there.rate:
                 slow, rate = (
                     (other, place.rate) if there.rate == MEASURED_RATE else (first, there.rate)
                 )
                 raise InvalidValue(
-                    f"dongle {dongle} is shared, but {slow.name} is at {rate}, for which the "
-                    f"capacity of a shared dongle is unknown: set it to {MEASURED_RATE}"
+                    f"dongle {dongle} is shared, but {slow.name} uses the data rate {rate}, for "
+                    f"which the capacity of a shared dongle is unknown: set the rate to "
+                    f"{MEASURED_RATE}"
                 )
 
 
@@ -202,8 +204,8 @@ def _refuse_near(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> No
         if high - low < LEAST_APART:
             where = f"channel {low}" if low == high else f"channels {low} and {high}"
             raise InvalidValue(
-                f"dongles {one} and {other} interfere on {where}: put vehicles on the same channel "
-                f"on one dongle, or set channels that are at least {LEAST_APART} apart"
+                f"dongles {one} and {other} interfere on {where}: put vehicles that use the same "
+                f"channel on one dongle, or set channels that are at least {LEAST_APART} apart"
             )
 
 
@@ -220,8 +222,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
     need = needed_per_s(profile, None if is_named else periods_s[-1])
     most = _most_that_fit(need)
     fewer = (
-        f"leave at most {most} on it, and give the others another dongle, on a channel at least "
-        f"{LEAST_APART} away"
+        f"leave at most {most} on it, and move the others to another dongle, on a channel at "
+        f"least {LEAST_APART} away"
     )
     if shared_by > MOST_ON_A_DONGLE:
         raise InvalidValue(
@@ -231,7 +233,7 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
     if need > usable:
         raise InvalidValue(
             f"dongle {dongle} carries {carried_per_s(shared_by):.0f} packets/s for each of its "
-            f"{shared_by} vehicles on channel {channel}, of which {usable:.0f} can be relied on, "
+            f"{shared_by} vehicles on channel {channel}, of which {usable:.0f} are usable, "
             f"but {vehicle.name} needs {need:.0f}: {_slower(profile, usable, fits)}{fewer}"
         )
     return vehicle if is_named else _with_link(vehicle, telemetry_period_s=fits[0])

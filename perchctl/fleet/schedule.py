@@ -287,8 +287,8 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         circle = error.args[1]  # each must precede the one after it
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
-            f"{each.first} and {each.then} cannot fly in any order, as {' before '.join(circle)} "
-            f"would be needed: {each.why}; {_advice(each.first, each.then, corridors)}"
+            f"{each.first} and {each.then} cannot fly in any order, because the order "
+            f"{' before '.join(circle)} would be needed: {each.why}; {_advice(each.first, each.then, corridors)}"
         ) from None
 
 
@@ -296,12 +296,12 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
     radius_m = max(corridors[first].radius_m, corridors[then].radius_m)
     least_m = WANDER_M + ROOM_ERROR_M
     more = (
-        f", or use a motion-capture system or Lighthouse (frame: room), with which a radius of "
-        f"{least_m:.2f} m is enough instead of {radius_m:.2f} m"
+        f", or use a motion-capture system or Lighthouse (frame: room), with which a corridor radius "
+        f"of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
     return (
-        f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from it: move a home or "
-        f"target farther away{more if radius_m > least_m else ''}"
+        f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from another vehicle's "
+        f"corridor: move a home or target farther away{more if radius_m > least_m else ''}"
     )
 
 
@@ -311,8 +311,8 @@ def _check_fence(vehicle: FleetVehicle) -> None:
     if away_m + WANDER_M > fence_m:
         raise InvalidValue(
             f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a "
-            f"draught can carry it {WANDER_M:g} m beyond, but safety.fence_radius_m is "
-            f"{fence_m:g} m: move its home nearer, or set a larger fence"
+            f"draught can carry the vehicle {WANDER_M:g} m farther, but safety.fence_radius_m is "
+            f"{fence_m:g} m: move its home nearer to the target, or set a larger fence"
         )
 
 

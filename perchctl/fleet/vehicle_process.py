@@ -84,7 +84,7 @@ def fly_vehicle(
         )
         outcome = VehicleOutcome.from_phase(report.phase)
         summary = log.close(report, miss_m if outcome is VehicleOutcome.PERCHED else None)
-        assert summary is not None, "it was closed with a report"
+        assert summary is not None, "the log was closed with a report"
         for sentence in report.detached_watchers:
             _say(sentence)
         return reporter.result_of(outcome, summary, str(log.path))
@@ -182,7 +182,9 @@ class ParentLine:
         except (EOFError, OSError):
             raise
         except Exception as error:  # any error that unpickling raises
-            self._switch.lose_parent(f"a message of the parent is unreadable ({error_at(error)})")
+            self._switch.lose_parent(
+                f"a message from the parent process is unreadable ({error_at(error)})"
+            )
             return None
         if isinstance(message, Order) and isinstance(message.word, OperatorRequest):
             return message
@@ -216,7 +218,7 @@ class StatusReporter(Watcher):
         failure: the result, if the flight has raised an exception.
     """
 
-    name = "the status for the fleet"
+    name = "the status report to the fleet"
     problem: str | None = None
 
     def __init__(self, line: ParentLine, switch: ParentSwitch) -> None:
@@ -243,7 +245,7 @@ class StatusReporter(Watcher):
             self.watchers = (FlightPage.of(page, options.profile),)
             self._picture_port = page.port
         except Exception as error:
-            _say(f"the pictures cannot be served: {error_at(error)}")
+            _say(f"the images for the fleet's page cannot be served: {error_at(error)}")
 
     def may_take_off(self, waiting: str) -> bool:
         """`FlightParts.may_take_off`: the parent's permission."""

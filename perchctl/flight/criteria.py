@@ -149,7 +149,7 @@ class GroundCriteria:
             return None
         rests, needed = distinct_texts(rests_v, needed_v, 2)
         return Problem(
-            f"the battery rests at {rests} V, but at least {needed} V are needed "
+            f"the resting battery voltage is {rests} V, but at least {needed} V is needed "
             "(safety.min_rest_v)",
             "charge it",
         )
@@ -163,7 +163,7 @@ class GroundCriteria:
             return None
         rests, most = distinct_texts(rests_v, MOST_CELL_V, 2)
         return Problem(
-            f"the battery rests at {rests} V, but one cell has at most {most} V",
+            f"the resting battery voltage is {rests} V, but a single cell has at most {most} V",
             "use a vehicle with a one-cell battery",
         )
 
@@ -176,13 +176,13 @@ class GroundCriteria:
         if not is_battery_reading(telemetry.battery_v):
             return Problem(
                 "the vehicle reports no battery voltage",
-                "restart it; a vehicle that never reports it needs link.unreported: [battery]",
+                "restart it; if it never reports the voltage, set link.unreported: [battery]",
             )
         if telemetry.battery_behind_s <= READING_AGE_S:
             return None
         return Problem(
-            f"the battery voltage is {telemetry.battery_behind_s:.1f} s old, at most "
-            f"{READING_AGE_S:g} s allowed",
+            f"the battery voltage is {telemetry.battery_behind_s:.1f} s old, but at most "
+            f"{READING_AGE_S:g} s is allowed",
             "restart the vehicle if this persists",
         )
 
@@ -224,20 +224,21 @@ class GroundCriteria:
                 if unreported:
                     continue
                 return Problem(
-                    f"the vehicle reports no variance of its {each.what}",
-                    "run its Kalman filter (stabilizer.estimator: 2 under link.parameters); a "
-                    "vehicle that has none needs link.unreported: [variance]",
+                    f"the vehicle reports no variance for its {each.what}",
+                    "run its Kalman filter (stabilizer.estimator: 2 under link.parameters); if "
+                    "the vehicle has none, set link.unreported: [variance]",
                 )
             if not each.value <= each.most:
                 found, allowed = distinct_texts(each.value, each.most, 2)
                 return Problem(
-                    f"the {each.what}'s variance is {found} {each.unit}, at most {allowed} allowed",
+                    f"the {each.what}'s variance is {found} {each.unit}, but at most {allowed} is "
+                    "allowed",
                     advice,
                 )
         if not (unreported or telemetry.variance_behind_s <= READING_AGE_S):
             return Problem(
-                f"the variances are {telemetry.variance_behind_s:.1f} s old, at most "
-                f"{READING_AGE_S:g} s allowed",
+                f"the variances are {telemetry.variance_behind_s:.1f} s old, but at most "
+                f"{READING_AGE_S:g} s is allowed",
                 "restart the vehicle if this persists",
             )
         return None
@@ -249,8 +250,8 @@ class GroundCriteria:
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
-            "if it hangs, take it down and restart it; if the positioning system has its "
-            "origin elsewhere, set safety.ground_z_m",
+            "if the vehicle hangs, take it down and restart it; if the positioning system has its "
+            "origin at another height, set safety.ground_z_m",
         )
 
     def _off_the_ground(self, z_m: float, found: str, advice: str) -> Problem | None:
@@ -275,7 +276,8 @@ class GroundCriteria:
             return None
         found, allowed = distinct_texts(self.tilt_deg, most_deg, 0)
         return Problem(
-            f"tilted by {found} deg, at most {allowed} deg allowed", "put it on level ground"
+            f"tilted by {found} deg, but at most {allowed} deg is allowed",
+            "put the vehicle on level ground",
         )
 
     @property
@@ -284,7 +286,7 @@ class GroundCriteria:
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
             return None
-        return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "keep it still")
+        return Problem(f"the accelerometer reads {acc_z_g:.2f} g", "keep it still")
 
     @property
     def stands(self) -> bool:
@@ -317,7 +319,7 @@ class GroundCriteria:
             return None
         away, needed = distinct_texts(away_m, WITHIN_REACH_M, 2)
         return Problem(
-            f"the target is only {away} m away, but at least {needed} m are needed",
+            f"the target is only {away} m away, but at least {needed} m is needed",
             "if the vehicle hangs, take it down first; if not, move it farther from the target",
         )
 
@@ -333,7 +335,7 @@ class GroundCriteria:
         """
         if not samples:
             return None
-        newest, advice = samples[-1], "keep it still; if it was still, check its positioning"
+        newest, advice = samples[-1], "keep the vehicle still; if it was, check its positioning"
         if profile.positioning.source.is_deck:
             advice += " (light, floor, base stations)"
         window = rest_window(samples)
@@ -342,8 +344,8 @@ class GroundCriteria:
         if not moved_m <= DRIFT_M:
             moved, most = distinct_texts(moved_m, DRIFT_M, 2)
             found = (
-                f"the estimated position moved {moved} m in {lasts_s:.1f} s, at most {most} m "
-                "allowed"
+                f"the estimated position moved {moved} m in {lasts_s:.1f} s, but at most {most} m "
+                "is allowed"
             )
             return Problem(found, advice)
         mean_mps = math.hypot(*np.mean([s.velocity_mps for s in window], axis=0))
@@ -351,7 +353,7 @@ class GroundCriteria:
             mean, most = distinct_texts(mean_mps, STANDING_MPS, 2)
             found = (
                 f"the estimated speed was {mean} m/s for {lasts_s:.1f} s, "
-                f"at most {most} m/s allowed"
+                f"but at most {most} m/s is allowed"
             )
             return Problem(found, advice)
         return None
@@ -364,7 +366,7 @@ class GroundCriteria:
             return None
         return Problem(
             f"{feed_name(profile)} shows a motion of {moved_m:.2f} m, but the vehicle stands still",
-            "keep the target still, put down what is being carried, or correct positioning.body",
+            "keep the target still, put down the body being carried, or correct positioning.body",
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
@@ -383,8 +385,8 @@ class GroundCriteria:
         standing = self._off_the_ground(
             z,
             "the motion-capture system places the vehicle at",
-            "its axes may be swapped, its unit millimetres, or its origin or rigid body "
-            "wrong: run perchctl check --lift; if this height is right, set "
+            "its axes may be swapped, its unit may be millimetres, or its origin or rigid body "
+            "may be wrong: run perchctl check --lift; if this height is right, set "
             "safety.ground_z_m to it",
         )
         return up_axis_problem(place, self.telemetry) or standing or self._unreachable(place)
@@ -430,15 +432,15 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
         return None
     axis = nearest_axis(up)
     found = (
-        f"the motion-capture system shows the vehicle tilted by {off_deg:.0f} deg from its own "
-        "attitude"
+        "the vertical in the motion-capture system differs from the vehicle's own by "
+        f"{off_deg:.0f} deg"
     )
     if axis is not None:
         found = f"swapped axes: up is {axis} in the motion-capture system"
     return Problem(
         found,
-        "set the capture's world to z up, define the rigid body's axes level, or set "
-        "positioning.body_rpy_deg; perchctl check --lift reports by how much",
+        "set the capture's world to z up, define the rigid body with level axes, or set "
+        "positioning.body_rpy_deg to the angles that perchctl check --lift reports",
     )
 
 
@@ -475,7 +477,11 @@ def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
         return None
-    age = f"{status.age_s:.2f} s old" if math.isfinite(status.age_s) else "none has been sent yet"
+    age = (
+        f"{status.age_s:.2f} s old"
+        if math.isfinite(status.age_s)
+        else "no position has been sent yet"
+    )
     return Problem(age, "see perchctl check")
 
 
@@ -489,6 +495,6 @@ def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem |
     if away_m <= ESTIMATE_AGREE_M and turned_deg <= ESTIMATE_AGREE_DEG:
         return None
     return Problem(
-        f"they are {away_m:.2f} m and {turned_deg:.0f} deg of heading apart",
-        "check that the positions arrive at this vehicle and that positioning.body names it",
+        f"the positions differ by {away_m:.2f} m, and the headings by {turned_deg:.0f} deg",
+        "check that this vehicle receives the positions and that positioning.body names its body",
     )

@@ -281,7 +281,7 @@ class FlightInputs:
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
-                f"the picture has {width}x{height} px, but the calibration has "
+                f"the picture has {width}x{height} px, but the calibration was made at "
                 f"{size_px[0]}x{size_px[1]} px"
             )
         live = self.source.live
@@ -298,7 +298,7 @@ class FlightInputs:
         t_s = self.perception.exposure_s(frame)
         age_s = now_s - t_s
         if live and not age_s >= -PICTURE_AHEAD_S:
-            return f"the picture's time, {t_s:.3f} s, is in the future"
+            return f"the picture's exposure time, {t_s:.3f} s, is in the future"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s old" if is_late else None
 

@@ -148,13 +148,13 @@ def still_waiting_for(turn: GroundTurn) -> str:
         }
     )
     if not waiting:
-        waiting = _first({"the state estimate to stand still": _unrest(turn.samples, profile)})
+        waiting = _first({"the state estimate to stop moving": _unrest(turn.samples, profile)})
         limit_s += REST_S if waiting else 0.0
     if not waiting:
         abort_on(criteria.off_ground)
         waiting = _first(
             {
-                "a reading of the battery": criteria.battery_unknown,
+                "a battery reading": criteria.battery_unknown,
                 "the vehicle to stand level": criteria.not_level,
                 "the vehicle to stand still": criteria.not_still,
                 "the supervisor to allow flight": criteria.supervisor_not_ready,
@@ -167,7 +167,9 @@ def still_waiting_for(turn: GroundTurn) -> str:
         others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
         if waited_s <= others_s + limit_s:  # the camera may have failed during the other checks
             waited_s = min(waited_s, turn.unseen_s)
-    waiting = waiting or _first({"a view of the target, which measures the position": unsent})
+    waiting = waiting or _first(
+        {"a view of the target, from which the position is measured": unsent}
+    )
     if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
         waiting = f"the flight loop to keep up (a tick took {turn.took_s:.1f} s)"
     if not waiting:
@@ -182,7 +184,7 @@ def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
-        return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "keep it still")
+        return Problem(f"observed for {seen_s:.1f} of {REST_S:g} s", "keep it still")
     positions_s = [sample.t_s - sample.behind_s for sample in window]
     pause_s = max(after_s - before_s for before_s, after_s in pairwise(positions_s))
     if not pause_s <= profile.safety.telemetry_hold_s:
@@ -304,20 +306,20 @@ def view_problem(
     at take-off height, above the start or above `planner.approach_xy_m`, no marker would be
     completely in the image. `yaw_rad` is the vehicle's heading."""
     planner, (x, y, z) = profile.planner, start_m
-    advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
+    advice = f"lower planner.takeoff_height_m (now {planner.takeoff_height_m:g} m)"
     for over in ((x, y), planner.approach_xy_m):
         if over is None:
             continue
         body_m = (*over, z + planner.takeoff_height_m)
         sight = _seen_leaning(body_m, yaw_rad, target, profile, camera)
         if over == (x, y):
-            advice = f"put the vehicle {sight.aside_text} of where it stands, or {advice}"
+            advice = f"move the vehicle {sight.aside_text}, or {advice}"
         else:
             advice = "remove planner.approach_xy_m, or set it near the target"
         if not sight.has_marker:
             return Problem(
                 f"the target is the positioning system, but from x {over[0]:.2f}, y "
-                f"{over[1]:.2f} m at take-off height the vehicle would not see it: it would be "
+                f"{over[1]:.2f} m at take-off height the vehicle would not see it, because it would be "
                 f"{math.hypot(*sight.aside_m):.2f} m from the camera's axis and "
                 f"{sight.height_m:.2f} m above the camera",
                 advice,

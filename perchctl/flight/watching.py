@@ -125,7 +125,7 @@ class Watchers:
             remarks = [*self._remarks()]
         except Exception as error:
             remarks, self._remarks = [], tuple
-            self._report(f"perchctl no longer adds notes on this recording: {error_at(error)}")
+            self._report(f"perchctl no longer adds notes about this recording: {error_at(error)}")
         with self._lock:
             notes, self._notes = self._notes, []
         return [*remarks, *notes]

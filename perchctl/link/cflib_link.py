@@ -213,7 +213,7 @@ class CflibLink:
         newest, now_s = self._blocks.newest, self._clock()
         if not is_fresh(newest, now_s):
             raise ConnectionFailed(
-                f"the telemetry of {self._uri} has stopped: perchctl does not take over the vehicle"
+                f"telemetry from {self._uri} has stopped: perchctl does not take over the vehicle"
             )
         if newest is not None and newest.has_bit(FLYING):
             raise ConnectionFailed(
@@ -253,7 +253,9 @@ class CflibLink:
                 f"cflib has been sending one packet for more than {LIBRARY_HANG_S:g} s"
             )
         elif stuck_s > LIBRARY_HANG_S and connection.is_dead():
-            connection.reopen(f"the radio has neither taken nor lost a packet for {stuck_s:.1f} s")
+            connection.reopen(
+                f"the radio has neither accepted nor lost a packet for {stuck_s:.1f} s"
+            )
 
     def _may_hear_more(self) -> bool:
         """True unless the link is lost permanently. While a sender exists, a lost link is being

@@ -310,7 +310,7 @@ def _as_cflib(packet: Packet) -> Any:
     return outgoing
 
 
-_PERMISSION = "you have no permission to use it"
+_PERMISSION = "you do not have permission to use it"
 _CAUSES = {
     "Resource busy": Problem(
         "another program has it open: a Crazyradio or a USB cable serves one program at a time",

@@ -94,7 +94,7 @@ def settle_estimator(
     for _ in range(RESETS):
         if may_be_flying(newest(), clock()):
             raise ConnectionFailed(
-                f"the vehicle at {uri} may be flying: its estimate is set only on the ground"
+                f"the vehicle at {uri} may be flying: its estimate is reset only on the ground"
             )
         start = feed.sent_pose()
         assert start is not None  # the loop above has waited for one
@@ -109,10 +109,10 @@ def settle_estimator(
             return
     where = "the origin, where the vehicle stands"
     if not config.source.is_target:
-        where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees it"
+        where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees the vehicle"
     raise TimedOut(
         f"the estimate of {uri} does not converge to {where}: check that the vehicle is "
-        "at rest and that its own positions arrive, in metres"
+        "at rest and that it receives its own positions, in metres"
     )
 
 

@@ -69,7 +69,7 @@ def check_airframe(cf: Any, uri: str) -> None:
         return
     found = f"is a {device_type}" if device_type else "does not report its airframe"
     raise ConnectionFailed(
-        f"the vehicle at {uri} {found}: perchctl's thrust and battery figures are those of a "
+        f"the vehicle at {uri} {found}: perchctl's thrust and battery figures hold only for a "
         f"{', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}; fly one of these"
     )
 

@@ -107,31 +107,55 @@ class _Named:
 
 
 INTERNALS = (
-    Internal("_link_error_cb", _crazyflie, "replaced: it joins cflib's threads and deadlocks"),
-    Internal("_send_lock", _crazyflie, "taken without waiting, and replaced with a new driver"),
-    Internal("link", _crazyflie, "replaced where a driver has ended"),
+    Internal(
+        "_link_error_cb", _crazyflie, "replaced, because it joins cflib's threads and deadlocks"
+    ),
+    Internal(
+        "_send_lock", _crazyflie, "acquired without waiting, and renewed with each new driver"
+    ),
+    Internal("link", _crazyflie, "replaced after a driver has ended"),
     Internal("link_uri", _crazyflie, "read to open a new driver"),
-    Internal("link_statistics", _crazyflie, "its callback is handed to a new driver"),
-    Internal("packet_sent", _crazyflie, "called for each packet that is sent past `send_packet`"),
-    Internal("start", _latency, "replaced: its pings wait for the lock while a radio is silent"),
-    Internal("needs_resending", _radio_driver, "false once a radio has agreed on safelink"),
-    Internal("out_queue", _radio_driver, "asked for room: `send_packet` would wait for 2 s"),
-    Internal("_thread", _radio_driver, "asked whether the driver is alive"),
-    Internal("_radio", _radio_driver, "its share of the dongle, for the two below"),
-    Internal("send_packet", _dongle_share, "wrapped: the hub counts what the dongle answers"),
-    Internal("_rsp_queue", _dongle_share, "wakes a thread that waits for a dongle that is gone"),
-    Internal("_retry_before_disconnect", _radio_thread, "counts lost packets; a dead dongle stops"),
-    Internal("rate_limit", _radio_thread, "set: the hub slows down the polls of an idle vehicle"),
+    Internal("link_statistics", _crazyflie, "its callback is passed to each new driver"),
+    Internal("packet_sent", _crazyflie, "called for each packet that bypasses `send_packet`"),
+    Internal(
+        "start",
+        _latency,
+        "replaced, because its pings wait for the lock while a radio is silent",
+    ),
+    Internal("needs_resending", _radio_driver, "false once a radio has negotiated safelink"),
+    Internal(
+        "out_queue",
+        _radio_driver,
+        "checked for room, because `send_packet` would wait for 2 s",
+    ),
+    Internal("_thread", _radio_driver, "the thread that shows whether the driver is alive"),
+    Internal(
+        "_radio", _radio_driver, "the driver's share of the dongle, read for the next two parts"
+    ),
+    Internal(
+        "send_packet", _dongle_share, "wrapped, so that the hub can count the dongle's answers"
+    ),
+    Internal("_rsp_queue", _dongle_share, "used to wake a thread that waits for a dead dongle"),
+    Internal(
+        "_retry_before_disconnect", _radio_thread, "counts lost packets, unless the dongle is dead"
+    ),
+    Internal("rate_limit", _radio_thread, "set by the hub to poll an idle vehicle less often"),
     Internal("_radio", _dongle_thread, "None once the dongle is closed; it may never open again"),
-    Internal("_radios", _radio_manager, "a dongle's thread that has ended is removed"),
-    Internal("_lock", _radio_manager, "held while it is"),
-    Internal("set_retries_before_disconnect", _radio_module, "a radio is waited for, not given up"),
+    Internal("_radios", _radio_manager, "list from which a dongle's ended thread is removed"),
+    Internal("_lock", _radio_manager, "held while that thread is removed"),
+    Internal(
+        "set_retries_before_disconnect",
+        _radio_module,
+        "called to make a radio tolerate many lost packets",
+    ),
     Internal(
         "print",
         lambda: _Named(_radio_driver().scan_interface),
-        "replaced: it would print on stdout, amid JSON",
+        "replaced, because it would print to stdout, in the middle of JSON output",
     ),
-    Internal("variables", _log_block, "read for the packets that start a forgotten block again"),
+    Internal(
+        "variables", _log_block, "read to build the packets that start a forgotten log block again"
+    ),
     Internal("id", _log_block, "as `variables`"),
     Internal("period", _log_block, "as `variables`"),
     Internal("get_storage_and_fetch_byte", _log_variable, "as `variables`"),

@@ -69,9 +69,9 @@ class GuardedLink:
         if is_armed_by_request(self._newest.supervisor):
             raise ConnectionFailed(
                 "the vehicle of your own link is already armed: keep away from its propellers; "
-                "connect must not arm it, since perchctl sends Arm just before take-off; if it "
-                "arms itself without turning its motors, its telemetry must have the bit "
-                "AUTO_ARM"
+                "connect must not arm the vehicle, since perchctl sends Arm just before take-off; "
+                "if the vehicle arms itself without turning its motors, its telemetry must set the "
+                "bit AUTO_ARM"
             )
 
     def telemetry(self) -> list[Telemetry]:

@@ -98,7 +98,9 @@ which cflib's statistics have already read."""
 
 logger = logging.getLogger(__name__)
 
-DEAD = "the Crazyradio does not answer any more (it may be unplugged): all its vehicles are lost"
+DEAD = (
+    "the Crazyradio no longer answers (it may be unplugged): the links to all its vehicles are lost"
+)
 
 
 class Carrier:
@@ -392,7 +394,7 @@ class Hub:
             except (
                 Exception
             ) as error:  # any error from cflib or USB: the dongle is not plugged in yet
-                logger.info("the dongle does not open: %s", error)
+                logger.info("the dongle cannot be opened: %s", error)
                 continue
             self._stuck_ticks = 0
             self._set_problem(None)

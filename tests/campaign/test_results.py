@@ -156,7 +156,9 @@ def test_the_command_says_so_after_its_table(tmp_path: Path) -> None:
     said = run("simulate", "-p", str(flat), "-n", "2", "--jobs", "1", "--json")
     assert said.code == SafetyAbort.exit_code
     assert json.loads(said.stdout)["refused"] == 2
-    assert said.complaint.startswith("every flight was refused before take-off: the battery rests")
+    assert said.complaint.startswith(
+        "every flight was refused before take-off: the resting battery"
+    )
 
 
 def test_a_rate_in_words_and_as_a_record() -> None:

@@ -103,7 +103,7 @@ ROWS = [
         "22 %, longest gap 111 ms " + "and more " * 12,
         "bring it nearer " * 8,
     ),
-    Row("battery", Verdict.FAIL, "the battery rests at 3.50 V", "charge it"),
+    Row("battery", Verdict.FAIL, "the resting battery voltage is 3.50 V", "charge it"),
     Row("print", Verdict.SKIPPED, "both markers must be in view", "hold the vehicle closer"),
     Row("level", Verdict.SKIPPED, "the vehicle does not answer"),
 ]
@@ -113,7 +113,7 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
     lines = format_rows(ROWS).splitlines()
     assert max(map(len, lines)) <= 80
     text = re.sub(r"\s+", " ", " ".join(lines))
-    assert "FAIL battery the battery rests at 3.50 V -> charge it" in text
+    assert "FAIL battery the resting battery voltage is 3.50 V -> charge it" in text
     assert "skip level the vehicle does not answer" in text
     skipped = [replace(ROWS[-1], name=name) for name in ("packets", "telemetry", "level")]
     assert "skip  3 checks         the vehicle does not answer" in format_rows(skipped)

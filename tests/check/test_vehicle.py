@@ -103,7 +103,7 @@ FAULTS = [
     ("positioning", "bad", "fail", "no positioning deck"),
     ("ground", "bad", "fail", "places the vehicle at 0."),
     ("level", "bad", "fail", "pitch 20"),
-    ("battery", "bad", "fail", "rests at 3.5"),
+    ("battery", "bad", "fail", "voltage is 3.5"),
     ("firmware", "old", "fail", "protocol 11"),
     ("telemetry", "old", "fail", "no telemetry arrives"),
 ]

@@ -237,7 +237,7 @@ def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> No
 
 def test_a_refusal_says_that_nothing_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
     def refusing(parts: Any) -> Any:
-        raise SafetyAbort("the battery rests at 3.7 V")
+        raise SafetyAbort("the resting battery voltage is 3.7 V")
 
     monkeypatch.setattr(faulty, "fly", refusing)
     scenario = draw_scenario(profile(), SEED)

@@ -50,7 +50,7 @@ def test_what_cannot_be_used_is_told_and_the_next_message_is_heard(start: Start)
 
 def test_a_status_with_wrong_parts_is_not_shown(start: Start) -> None:
     child = start("channel.send(Status(stage='flying')); time.sleep(60)\n")
-    assert until(child.fault) == "it sent Status with parts of a wrong type"
+    assert until(child.fault) == "it sent Status with fields of the wrong type"
     assert child.newest()[0] is None
 
 
@@ -79,15 +79,15 @@ BAD: Any = "landed"
     [
         (1, "int instead of its status"),
         ("READY", "str instead of its status"),
-        (Status(stage=BAD), "Status with parts of a wrong type"),
-        (Status(loop_age_s=BAD), "Status with parts of a wrong type"),
-        (Status(place_m=BAD), "Status with parts of a wrong type"),
-        (Status(picture_port=BAD), "Status with parts of a wrong type"),
+        (Status(stage=BAD), "Status with fields of the wrong type"),
+        (Status(loop_age_s=BAD), "Status with fields of the wrong type"),
+        (Status(place_m=BAD), "Status with fields of the wrong type"),
+        (Status(picture_port=BAD), "Status with fields of the wrong type"),
         (Status(place_m=(1.0, 2.0), picture_port=40000), None),
-        (Result(exit_code=0, outcome=BAD, reason=""), "Result with parts of a wrong type"),
+        (Result(exit_code=0, outcome=BAD, reason=""), "Result with fields of the wrong type"),
         (
             Result(exit_code=BAD, outcome=VehicleOutcome.LANDED, reason=""),
-            "Result with parts of a wrong type",
+            "Result with fields of the wrong type",
         ),
         (GOOD, None),
     ],

@@ -506,7 +506,7 @@ def test_one_that_hangs_holds_up_nobody_and_is_ended() -> None:
     result = rig.fleet.views[0].result
     assert result is not None
     assert (result.exit_code, result.has_flown, result.hangs) == (52, True, False)
-    assert "look where the vehicle is" in result.reason
+    assert "check where the vehicle is" in result.reason
 
 
 def test_one_that_still_starts_is_given_the_time_that_a_busy_computer_takes() -> None:
@@ -551,7 +551,7 @@ def test_a_process_that_was_lost_after_its_permission_may_have_flown() -> None:
     result = rig.fleet.views[0].result
     assert result is not None
     assert (result.exit_code, result.has_flown) == (52, True)
-    assert "look where the vehicle is" in result.reason
+    assert "check where the vehicle is" in result.reason
     assert rig["v1"].order == Order(may_take_off=False, word=OperatorRequest.LAND)
 
 

@@ -87,7 +87,7 @@ def test_a_folder_that_cannot_be_filmed_is_refused_in_a_sentence(folder: Path) -
         path.write_text(json.dumps(record | {"plan": {"vehicles": vehicles}}), encoding="utf-8")
         refused = run("log", "film", str(folder))
         assert refused.code == 30
-        assert refused.complaint.startswith("fleet.json does not say where each vehicle flew")
+        assert refused.complaint.startswith("fleet.json does not record where each vehicle flew")
     path.write_text(json.dumps({"vehicles": [end("west", log=None)]}), encoding="utf-8")
     refused = run("log", "film", str(folder))
     assert (refused.code, "has left a log" in refused.complaint) == (20, True)

@@ -156,26 +156,29 @@ REFUSED = [
     (two(first=", target: [1]"), "vehicle north: target: must have keys and values, found [1]; "),
     (
         two(", safety: {fence_radius_m: 1}", defaults=", safety: 3"),
-        "defaults: safety: must have keys and values, found 3; add some, or remove it",
+        "defaults: safety: must have keys and values, found 3; add some, or remove the section",
     ),
     (two(second=", profile: smi"), "vehicle east: profile: profile 'smi' not found"),
     (two(second=", uri: radio://0/80/3M/E7"), f"vehicle east: {BAD_URI}"),
     (two(second=", source: 'camra:0'"), "vehicle east: "),
     (two(second=", uri: radio://0/80/2M/E7E7E7E701"), "vehicle east: camera source sim: is no"),
-    (two().replace("east", "north"), "vehicles 1 and 2 share the name north: give each its own"),
+    (two().replace("east", "north"), "vehicles 1 and 2 share the name north: give each "),
     (
         two(RADIO.format("01", 0), RADIO.format("01", 1).replace("//0", "//1")),
-        "vehicles north and east share the address radio/80/2M/E7E7E7E701: give each its own",
+        "vehicles north and east share the address radio/80/2M/E7E7E7E701: give each vehicle",
     ),
     (
         two(RADIO.format("01", 0), RADIO.format("02", 0)),
-        "vehicles north and east share the camera camera:0: give each its own source",
+        "vehicles north and east share the camera camera:0: give each vehicle its own source",
     ),
     (
         two(", body: cf", ", body: cf", defaults=", positioning: mocap"),
-        "vehicles north and east share the motion-capture body cf: give each its own body",
+        "vehicles north and east share the motion-capture body cf: give each vehicle its own body",
     ),
-    (two().replace(", target_m: [3.2, 0]", ""), "vehicle east: nothing says where its target is"),
+    (
+        two().replace(", target_m: [3.2, 0]", ""),
+        "vehicle east: the position of its target is missing",
+    ),
     (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure where it"),
     (two(second=", target: none.yaml"), "vehicle east: target: "),
     (
@@ -187,7 +190,7 @@ REFUSED = [
         "vehicle north: frame: is home, but with positioning by motion capture at vicon its",
     ),
     (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
-    ("extends: sim\n", "has no vehicles, so it is no fleet file: list them under vehicles"),
+    ("extends: sim\n", "has no vehicles, so it is not a fleet file: list them under vehicles"),
     (two(first=", name: west"), "line 4: key name appears twice, first in line 4: keep one"),
 ]
 
@@ -205,7 +208,7 @@ def test_two_names_of_one_camera_are_one_camera(
     plugged = [device.ConnectedCamera(0, "FPV receiver", "/dev/v4l/by-id/usb-fpv")]
     monkeypatch.setattr(device, "_known_cameras", lambda *_: plugged)
     text = two(RADIO.format("01", 0), RADIO.format("02", "receiver"))
-    words = "vehicles north and east share the camera camera:0: give each its own source"
+    words = "vehicles north and east share the camera camera:0: give each vehicle its own source"
     assert refusal(tmp_path, text) == words
 
 

@@ -107,7 +107,7 @@ def test_a_record_of_a_fleet_that_still_flies_claims_no_success(tmp_path: Path) 
     assert (record["exit_code"], record["error"]) == (1, EXIT_CODES[1])
     assert record["unfinished"] == names[1:]
     for name in names[1:]:
-        assert f"{name:<12}unknown: look where the vehicle is" in flying.text()
+        assert f"{name:<12}unknown: check where the vehicle is" in flying.text()
     ended_record = replace(flying, results=dict.fromkeys(names, PERCHED)).record()
     assert (ended_record["exit_code"], ended_record["error"]) == (0, None)
     assert ended_record["unfinished"] == []

@@ -68,9 +68,9 @@ def test_no_flight_of_a_plan_needs_more_than_its_dongle_carries(count: int) -> N
 
 def test_five_at_100_hz_are_refused_with_what_to_change() -> None:
     assert refusal(same_channel(5, NAMED)) == (
-        "dongle 0 carries 97 packets/s for each of its 5 vehicles on channel 80, of which 78 can "
-        "be relied on, but v0 needs 220: set link.telemetry_period_s to 0.04 (for 70 packets/s) "
-        "instead of 0.01, or leave at most 1 on it, and give the others another dongle, on a "
+        "dongle 0 carries 97 packets/s for each of its 5 vehicles on channel 80, of which 78 are "
+        "usable, but v0 needs 220: set link.telemetry_period_s to 0.04 (for 70 packets/s) "
+        "instead of 0.01, or leave at most 1 on it, and move the others to another dongle, on a "
         "channel at least 2 away"
     )
 
@@ -103,9 +103,9 @@ def test_positions_that_are_sent_count_too() -> None:
 def test_vehicles_of_one_dongle_belong_on_one_channel() -> None:
     uris = ["radio://0/80/2M/E7E7E7E701", "radio://0/90/2M/E7E7E7E702"]
     assert refusal(on_air(uris)) == (
-        "dongle 0 has v0 on channel 80 and v1 on channel 90, and would carry 151 packets/s for "
-        "each of two vehicles instead of 245: set both to the same channel, or give v1 "
-        "another dongle"
+        "dongle 0 has v0 on channel 80 and v1 on channel 90; on two channels it carries 151 "
+        "packets/s for each of two vehicles instead of 245: set both to the same channel, or move "
+        "v1 to another dongle"
     )
 
 
@@ -120,7 +120,7 @@ def test_dongles_are_two_channels_apart(channel: int, where: str) -> None:
 
 def test_what_a_shared_dongle_carries_at_1m_is_not_known() -> None:
     uris = ["radio://0/80/1M/E7E7E7E701", "radio://0/80/1M/E7E7E7E702"]
-    assert refusal(on_air(uris)).startswith("dongle 0 is shared, but v0 is at 1M")
+    assert refusal(on_air(uris)).startswith("dongle 0 is shared, but v0 uses the data rate 1M")
     budget_radio(on_air(uris[:1]))
 
 

@@ -181,21 +181,21 @@ def test_who_would_hang_in_each_other_s_corridor_is_refused_with_both_names() ->
     assert refusal(fleet([((0, 0), (1, 0)), ((2, 0), (1.2, 0))])) == (
         "v0 and v1 cannot fly in any order: v1 hangs 0.15 m inside the corridor of v0, and v0 "
         "hangs 0.15 m inside the corridor of v1; a vehicle that waits or hangs must be 0.24 m away "
-        "from it: move a home or target farther away"
+        "from another vehicle's corridor: move a home or target farther away"
     )
 
 
 def test_a_drifting_estimate_is_the_reason_that_is_named() -> None:
     sentence = refusal(fleet([((0, 0), (0.2, 0)), ((1, 0), (1, 0.2))], "target"))
     assert "v0 and v1 cannot fly in any order" in sentence
-    assert "a radius of 0.35 m is enough instead of 1.00 m" in sentence
+    assert "a corridor radius of 0.35 m is enough instead of 1.00 m" in sentence
 
 
 def test_a_circle_of_three_is_refused() -> None:
     """Each waits in the way of the next one."""
     ways: list[tuple[Point, Point]] = [((0, 0), (2, 0)), ((2, 0), (2, 2)), ((2, 2), (0, 0.4))]
     sentence = refusal(fleet(ways, order="together"))
-    assert re.match(r"v\d and v\d cannot fly in any order, as v\d before v\d before ", sentence)
+    assert re.match(r"v\d and v\d cannot fly in any order, because the order v\d before ", sentence)
 
 
 def test_a_target_beyond_the_fence_is_refused() -> None:

@@ -196,7 +196,7 @@ def line(ends: tuple[Channel, Channel]) -> Iterator[tuple[Channel, ParentSwitch]
     [
         (pickle.dumps("land"), "the parent sent a str instead of an order"),
         (pickle.dumps(Order(word="land")), "the parent sent a Order instead"),  # type: ignore[arg-type]
-        (b"no pickle", "a message of the parent is unreadable"),
+        (b"no pickle", "a message from the parent process is unreadable"),
     ],
     ids=["text", "word", "bytes"],
 )

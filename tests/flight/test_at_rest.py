@@ -47,8 +47,8 @@ def problem(alter: Callable[[Telemetry], Telemetry], profile: Profile = PROFILE)
 @pytest.mark.parametrize("profile", [PROFILE, MOCAP, BY_TARGET], ids=["deck", "mocap", "target"])
 def test_an_estimate_that_runs_away_at_rest_is_named(profile: Profile, mps: float) -> None:
     said = problem(lambda s: runs_away(s, mps), profile)
-    assert f"moved {REST_S * mps:.2f} m in 1.9 s, at most 0.07 m allowed" in said
-    assert "keep it still; if it was still, check its positioning" in said
+    assert f"moved {REST_S * mps:.2f} m in 1.9 s, but at most 0.07 m is allowed" in said
+    assert "keep the vehicle still; if it was, check its positioning" in said
     assert ("base stations" in said) is (profile is PROFILE)
     still = {"position_m": (0.0, 0.0, 0.0)}
     said = problem(lambda s: replace(runs_away(s, mps), **still), profile)  # type: ignore[arg-type]
@@ -121,7 +121,7 @@ def test_a_healthy_vehicle_stands_still_whatever_places_it(by: str, tilt_rad: fl
 )
 def test_a_vehicle_whose_estimate_runs_away_does_not_take_off(mps: float) -> None:
     rig = Rig(Vehicle(lambda sample: runs_away(sample, mps)))
-    rig.refused(TimedOut, r"estimate to stand still .the estimated position moved")
+    rig.refused(TimedOut, r"estimate to stop moving .the estimated position moved")
     assert rig.link.now_s == pytest.approx(PROFILE.safety.estimator_wait_s + REST_S, abs=0.2)
 
 

@@ -235,7 +235,9 @@ def test_a_link_that_arms_as_it_connects_is_refused_and_disarmed(bits: int) -> N
     """Its propellers would turn while the operator is asked."""
     vehicle = Vehicle()
     vehicle.bits = bits
-    with pytest.raises(ConnectionFailed, match=r"already armed: keep away .* must not arm it"):
+    with pytest.raises(
+        ConnectionFailed, match=r"already armed: keep away .* must not arm the vehicle"
+    ):
         vehicle.link.connect()
     vehicle.act["send"] = lambda: setattr(vehicle, "bits", CAN_ARM)
     vehicle.act["problem"] = lambda: setattr(vehicle, "now_s", vehicle.now_s + 0.01)
