@@ -19,8 +19,8 @@ class _Loader(yaml.SafeLoader):
             line = int(key.start_mark.line) + 1
             if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in first:
                 raise ValueError(
-                    f"line {line}: key {clip_text(key.value)} appears twice, first in line "
-                    f"{first[key.tag, key.value]}: keep one"
+                    f"line {line}: key {clip_text(key.value)} appears twice, first on line "
+                    f"{first[key.tag, key.value]}: keep only one"
                 )
             if isinstance(key, yaml.ScalarNode):
                 first[key.tag, key.value] = line

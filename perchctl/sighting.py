@@ -120,7 +120,7 @@ def track(
     if calibration is None:
         calibration = find_calibration(profile.camera.calibration)
         if is_shipped_example(calibration) and source != "sim:":
-            what = f"{calibration.name} is the example calibration: pass your own camera's"
+            what = f"{calibration.name} is the example calibration: pass that of your own camera"
             warnings.warn(what, Note, stacklevel=2)
     require_type("calibration", calibration, CameraModel, Path, str)
     camera = calibration if isinstance(calibration, CameraModel) else load_calibration(calibration)
@@ -134,8 +134,8 @@ def track(
         stills = False
     elif not isinstance(source, Iterable) or isinstance(source, np.ndarray):
         raise InvalidValue(
-            "a source must be a string such as camera:0, a FrameSource, or pictures as in "
-            f"track([picture]); found {type(source).__name__}"
+            "a source must be a string such as camera:0, a FrameSource, or an iterable of "
+            f"pictures, as in track([picture]); found {type(source).__name__}"
         )
     at = None if attitude is None else partial(_attitude_at, attitude)
     return _sightings(source, profile, camera, at, stills, rate_hz or 1.0)

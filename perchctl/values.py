@@ -26,7 +26,7 @@ else:
             return value
 
     _NAMES: dict[type, tuple[str, ...]] = {}
-    """Of the fields; none where the class has to be built by its own `__init__`."""
+    """Names of the fields of each class; empty if its own `__init__` has to build it."""
 
     def replace(value: Any, /, **changes: Any) -> Any:
         """Return a copy of the dataclass with these changes, like `dataclasses.replace`. For a

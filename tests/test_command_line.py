@@ -332,7 +332,7 @@ LOG = '{"kind":"header","format":"perchctl-flight-log","version":3}\n{}\n'
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("fly -p a.jsonl", "a.jsonl is no profile (it is a flight log)"),
+        ("fly -p a.jsonl", "a.jsonl is not a profile (it is a flight log)"),
         ("fly -p ./a.jsonl", "(it is a flight log)"),
         (f"profile -p {ROOT}/fleets/four.yaml", "is a fleet file, not a profile"),
         (f"fly -p {CALIBRATION}", "is a camera calibration, not a profile"),

@@ -109,7 +109,7 @@ def test_a_scheme_is_never_taken_for_a_module_that_lies_about(words: str) -> Non
     said = run(*words.split())
     assert not Path("ran").exists(), said
     if "vicon:lab" in words or "mocap" in words:
-        assert "'vicon:lab' is vicon and a host" in said.stderr
+        assert "'vicon:lab' is vicon with a host" in said.stderr
 
 
 def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -184,8 +184,8 @@ def _refuse_mixed(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> N
                     f"dongle {dongle} has {first.name} on channel {there.channel} and {other.name} "
                     f"on channel {place.channel}; on two channels it carries "
                     f"{OTHER_CHANNELS_PER_S[2]:g} packets/s for each of two vehicles instead of "
-                    f"{SAME_CHANNEL_PER_S[2]:g}: set both to the same channel, or move {other.name} "
-                    "to another dongle"
+                    f"{SAME_CHANNEL_PER_S[2]:g}: set both to the same channel, or move "
+                    f"{other.name} to another dongle"
                 )
             if MEASURED_RATE not in (there.rate, place.rate) or place.rate != there.rate:
                 slow, rate = (

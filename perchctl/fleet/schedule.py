@@ -288,7 +288,8 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
             f"{each.first} and {each.then} cannot fly in any order, because the order "
-            f"{' before '.join(circle)} would be needed: {each.why}; {_advice(each.first, each.then, corridors)}"
+            f"{' before '.join(circle)} would be needed: {each.why}; "
+            f"{_advice(each.first, each.then, corridors)}"
         ) from None
 
 
@@ -296,8 +297,8 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
     radius_m = max(corridors[first].radius_m, corridors[then].radius_m)
     least_m = WANDER_M + ROOM_ERROR_M
     more = (
-        f", or use a motion-capture system or Lighthouse (frame: room), with which a corridor radius "
-        f"of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
+        f", or use a motion-capture system or Lighthouse (frame: room), with which a corridor "
+        f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
     return (
         f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from another vehicle's "

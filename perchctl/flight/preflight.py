@@ -319,8 +319,8 @@ def view_problem(
         if not sight.has_marker:
             return Problem(
                 f"the target is the positioning system, but from x {over[0]:.2f}, y "
-                f"{over[1]:.2f} m at take-off height the vehicle would not see it, because it would be "
-                f"{math.hypot(*sight.aside_m):.2f} m from the camera's axis and "
+                f"{over[1]:.2f} m at take-off height the vehicle would not see it, because the "
+                f"target would be {math.hypot(*sight.aside_m):.2f} m from the camera's axis and "
                 f"{sight.height_m:.2f} m above the camera",
                 advice,
             )

@@ -207,12 +207,12 @@ class Tick:
 
     @property
     def observation(self) -> Observation:
-        assert self.record.observation is not None, "a turn that was flown has one"
+        assert self.record.observation is not None, "every turn in flight has an observation"
         return self.record.observation
 
     @property
     def command(self) -> Command:
-        assert self.record.command is not None, "a turn that was flown has one"
+        assert self.record.command is not None, "every turn in flight has a command"
         return self.record.command
 
     @property

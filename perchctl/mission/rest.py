@@ -32,7 +32,7 @@ class RestState(Enum):
     HELD = "something holds the vehicle away from the target; the motors are off"
     STANDS = "the vehicle stands on the floor with its motors off"
     UNKNOWN = "the motors are off; it is unknown whether the vehicle hangs or stands"
-    END_UNCONFIRMED = "how the flight ended could not be confirmed: keep away from the vehicle"
+    END_UNCONFIRMED = "the end of the flight could not be confirmed: keep away from the vehicle"
 
 
 def find_rest_state(c: Context) -> RestState:

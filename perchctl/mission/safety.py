@@ -240,10 +240,11 @@ def wrong_camera_latency_reason(c: Context) -> str:
         least_s, most_s = USED_LATENCY_S
         return (
             f"{found}, but only a latency of {1e3 * least_s:.0f} to {1e3 * most_s:.0f} ms can be "
-            f"measured in flight (camera.latency_s): find what delays the pictures"
+            f"measured in flight (camera.latency_s): find out what delays the pictures"
         )
     return (
-        f"{found}, but camera.latency_s is {1e3 * assumed_s:.0f} ms: find what delays the pictures"
+        f"{found}, but camera.latency_s is {1e3 * assumed_s:.0f} ms: find out what delays the "
+        "pictures"
     )
 
 

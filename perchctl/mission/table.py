@@ -146,8 +146,9 @@ def _check_types(row: object) -> None:
         and (isinstance(row.reason, str) or callable(row.reason))
     ):
         raise InvalidValue(
-            f"row {getattr(row, 'name', row)!r} must be a Transition: phases a set of Phase, to a "
-            f"Phase, severity a Severity, when a function, reason a text"
+            f"row {getattr(row, 'name', row)!r} must be a Transition in which phases is a set of "
+            f"Phase, to is a Phase, severity is a Severity, when is a function, and reason is a "
+            f"text or a function"
         )
 
 

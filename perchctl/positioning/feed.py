@@ -168,7 +168,7 @@ class PositionFeed:
                 "positioning.host, the computer that runs the motion-capture system, is missing: "
                 "write it in the profile, as in positioning: {by: mocap, system: vicon, host: "
                 "192.168.1.2, body: crazyflie}; system is vicon, optitrack, qualisys or vrpn, "
-                "and body is the vehicle's rigid body there"
+                "and body is the name of the vehicle's rigid body"
             )
         if find_spec("motioncapture") is None:
             raise no_motion_capture()
@@ -333,7 +333,7 @@ class PoseValidator:
             self.problem = f"{label} does not see the rigid body {who!r}; it sees {others}"
             return None
         if now_s - arrived_s > STALE_FRAME_S:
-            self.problem = f"{self._who} is {now_s - arrived_s:.3f} s old on arrival"
+            self.problem = f"the pose of {self._who} was {now_s - arrived_s:.3f} s old on arrival"
             return None
         if not _is_pose(pose):
             self.problem = f"{self._who} has an invalid pose: {pose}"
@@ -368,8 +368,9 @@ class PoseValidator:
                 self._stranger = placed
                 self.problem = (
                     f"{self._who} jumped by {way_m:.2f} m and "
-                    f"{math.degrees(_turn_rad(last, placed)):.0f} deg: another body may be taken "
-                    "for it; its poses are rejected until it is seen near its last accepted pose"
+                    f"{math.degrees(_turn_rad(last, placed)):.0f} deg: another body may have been "
+                    "mistaken for it; its poses are rejected until it is seen near its last "
+                    "accepted pose"
                 )
                 return None
         self._believed, self._stranger, self.problem = placed, None, None

@@ -189,7 +189,7 @@ class TargetFeed:
         off_m = float(np.linalg.norm(place.position_m - then.position_m))
         if not off_m <= GATE_M + GATE_MPS * silent_s + GATE_SIGMAS * sigma_m:
             self._beside_m = off_m
-            return f"the target places the vehicle {off_m:.2f} m from its estimate"
+            return f"the target places the vehicle {off_m:.2f} m from its estimated position"
         return ""
 
     def _learn_place(self, pose: MarkerPose, then: VehicleState) -> None:

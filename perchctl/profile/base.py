@@ -49,7 +49,8 @@ class Section(BaseModel):
         kind = cls.model_fields[info.field_name or ""].annotation
         if _takes_numbers(kind) and _holds_switch(value):
             raise ValueError(
-                "found true or false (as YAML also reads yes, no, on and off); write a number"
+                "found true or false (YAML reads yes, no, on and off in the same way); write a "
+                "number"
             )
         return value
 

@@ -72,7 +72,7 @@ def _allowed_of(kind: dict[str, Any]) -> str:
             span = _span(parts[0])
             return f"{text}, each {span}" if span else text
         case "array":
-            return f"any number, each of {_allowed_of(kind['items'])}"
+            return f"any number of items, each {_allowed_of(kind['items'])}"
         case "object":
             return "name: number"
         case "boolean":

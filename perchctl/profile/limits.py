@@ -77,7 +77,7 @@ _IMPOSSIBLE = {
         "telemetry would be too old to prove a contact or a landing"
     ),
     "link.telemetry_period_s < safety.telemetry_hold_s": (
-        "telemetry would always be too old, so the vehicle would always hold"
+        "telemetry would always be too old, so the vehicle would always hold its position"
     ),
     "link.telemetry_period_s < safety.telemetry_land_s": (
         "telemetry would always be too old, so the vehicle would land"
@@ -103,10 +103,10 @@ _DOUBTFUL = {
         # 3.7 V is what a full battery still gives while a light vehicle hovers (docs/firmware.md,
         # "Thrust to PWM").
         "safety.min_load_v < 3.7": (
-            "hovering takes even a full battery down to it, so the vehicle would land as "
+            "hovering lowers even a full battery to this voltage, so the vehicle would land as "
             "soon as it takes off"
         ),
-        "safety.min_rest_v < 4.35": "no battery rests at this voltage, so no flight would begin",
+        "safety.min_rest_v < 4.35": "no battery has this voltage at rest, so no flight would begin",
     },
     "time limits": {
         f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
@@ -119,12 +119,14 @@ _DOUBTFUL = {
         ),
         f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
         " < planner.landing.timeout_s": (
-            "from there a descent takes more than half of the timeout, after which the "
-            "firmware lands the vehicle"
+            "a descent from the maximum height takes more than half of the timeout, and after "
+            "half of it the firmware lands the vehicle"
         ),
-        "safety.camera_hold_s < safety.camera_land_s": "the vehicle would land before it holds",
+        "safety.camera_hold_s < safety.camera_land_s": (
+            "the vehicle would land before it holds its position"
+        ),
         "safety.telemetry_hold_s < safety.telemetry_land_s": (
-            "the vehicle would land before it holds"
+            "the vehicle would land before it holds its position"
         ),
     },
     "thresholds": {
@@ -132,7 +134,7 @@ _DOUBTFUL = {
             "near the target the vehicle would alternate between ALIGN and ASCEND"
         ),
         "planner.perch.contact_z_m < planner.ascend.standoff_m": (
-            "the vehicle would settle as close to the target as at contact"
+            "the vehicle would settle at a distance that already counts as contact"
         ),
         f"{AscendConfig.near_speed_mps:g} <= planner.ascend.speed_mps": (
             "the vehicle would climb faster near the target than far from it"

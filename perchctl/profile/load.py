@@ -49,7 +49,7 @@ def find_profile(name: str) -> Path:
     found = data_file("profiles", name)
     if found is None:
         if note := kind_note(Path(name), "a profile"):
-            raise InvalidValue(f"{name} is no profile{note}; profiles are .yaml files")
+            raise InvalidValue(f"{name} is not a profile{note}; profiles are .yaml files")
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found
 
@@ -111,7 +111,7 @@ def target_keys(path: Path) -> dict[str, Any]:
     """
     target = _resolved(path, read_yaml(path), seen=()).get("target")
     if not isinstance(target, dict):
-        raise InvalidValue(f"{path}: has no section target, which says where the target is")
+        raise InvalidValue(f"{path}: has no section target, which gives the position of the target")
     return target
 
 
@@ -154,7 +154,7 @@ def _read_weights(name: str) -> WeightsConfig:
     held = weights if isinstance(weights, dict) else {}
     missing = [axis for axis in WeightsConfig.model_fields if axis not in held]
     if missing:
-        raise InvalidValue(f"{path}: weights.{missing[0]} is missing; needed are x, y, z and yaw")
+        raise InvalidValue(f"{path}: weights.{missing[0]} is missing; x, y, z and yaw are needed")
     try:
         return MergeConfig.model_validate({"weights": weights}).weights
     except ValidationError as error:
@@ -212,8 +212,8 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     if share > MOST_MASKED_SHARE:
         covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_MASKED_SHARE, 0)
         raise InvalidValue(
-            f"camera.mask: {path} covers {covers} % of the image, at most {allowed} % are "
-            "allowed: white marks what the vehicle covers, black is free"
+            f"camera.mask: {path} covers {covers} % of the image, but at most {allowed} % is "
+            "allowed: white marks what the vehicle covers, and black what is free"
         )
     if share == 0.0:
         raise InvalidValue(

@@ -121,11 +121,11 @@ class PerchConfig(Section):
     """Speed at which the setpoint rises into the press, m/s."""
     contact_dwell_s: float = key(0.25, "time for which the contact must persist", gt=0, lt=3)
     contact_z_m: float = key(
-        0.05, "maximum vertical distance to the target in contact", gt=0, le=0.3
+        0.05, "maximum vertical distance to the target to count as contact", gt=0, le=0.3
     )
     contact_xy_m: float = key(
         0.025,
-        "maximum horizontal distance to the target in contact; this is the magnet's radius",
+        "maximum horizontal distance to the target to count as contact: the magnet's radius",
         gt=0,
         le=0.5,
     )
@@ -208,9 +208,7 @@ class LandingConfig(Section):
     handover_m: float = key(
         0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
-    undershoot_m: float = key(
-        0.05, "distance below the ground at which the landing aims", ge=0, le=1
-    )
+    undershoot_m: float = key(0.05, "depth of the landing's goal below the ground", ge=0, le=1)
     drift_mps: ClassVar[float] = 0.012  # assumed drift of the estimated height
     timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)
 
@@ -260,7 +258,7 @@ class CorridorConfig(Section):
     home_m: tuple[float, float] = key(..., "take-off position: x, y")
     target_m: tuple[float, float] = key(..., "position under the target: x, y")
     radius_m: float = key(
-        ..., "maximum distance from the line between these positions", gt=0, le=50
+        ..., "maximum distance from the line between home and target", gt=0, le=50
     )
     way_top_m: float = key(..., "maximum height above the ground along the corridor", gt=0, le=20)
     target_top_m: float = key(..., "maximum height above the ground under the target", gt=0, le=20)
@@ -333,14 +331,14 @@ class SafetyConfig(Section):
     # time for which the vehicle holds after a jump before it lands
     jump_hold_s: ClassVar[float] = 0.5
     max_height_m: float = key(
-        3.0, "maximum height above the ground; if the vehicle is higher, it lands", gt=0, le=20
+        3.0, "maximum height above the ground; the vehicle lands if it is higher", gt=0, le=20
     )
     fence_radius_m: float = key(
         2.0, "distance from the take-off point beyond which the vehicle lands", gt=0, le=50
     )
     corridor: CorridorConfig | None = key(
         None,
-        "corridor of a vehicle in a fleet; the vehicle lands if it leaves it; set by the fleet",
+        "corridor of a vehicle in a fleet, set by the fleet; a vehicle that leaves it lands",
     )
     max_tilt_deg: float = key(55.0, "tilt above which perchctl cuts the motors", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # time for which the vehicle must be tilted

@@ -25,7 +25,7 @@ def _known_system(system: str) -> str:
     known, colon, _host = system.partition(":")
     if colon and known.lower() in SYSTEMS:
         raise ValueError(
-            f"{system!r} is {known.lower()} and a host: write system and host as two keys"
+            f"{system!r} is {known.lower()} with a host: write system and host as two keys"
         )
     raise ValueError(
         f"{system!r} is unknown; allowed are {', '.join(SYSTEMS)}, or my_module:MySource"
@@ -107,7 +107,8 @@ class PositioningConfig(Section):
     rate_hz: float = key(100.0, "maximum rate at which positions are sent", ge=10, le=100)
     latency_s: float = key(
         0.01,
-        "your best estimate of the time from the motion-capture cameras' exposure to arrival",
+        "time from the exposure of the motion-capture cameras to the arrival of the frame, as "
+        "accurately as you know it",
         ge=0,
         le=MOST_CAPTURE_LATENCY_S,
     )
@@ -171,8 +172,8 @@ class PositioningConfig(Section):
         given = self.model_fields_set - {"decks"}
         if self.by == "deck" and (self.host if "by" in given else given):
             raise ValueError(
-                "there are keys for motion capture, but by is deck: write by: mocap, or only "
-                "positioning: deck"
+                "there are keys for motion capture, but positioning.by is deck: write by: mocap, "
+                "or only positioning: deck"
             )
         return self
 
@@ -180,9 +181,9 @@ class PositioningConfig(Section):
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(
-                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) "
-                f"and a period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to "
-                "spare: otherwise a position is stale before the next one arrives"
+                f"hold_s ({self.hold_s:g}) must exceed the sum of latency_s ({self.latency_s:g}) "
+                f"and one period of rate_hz ({self.rate_hz:g}) by more than {SPARE_S:g} s: "
+                "otherwise a position is stale before the next one arrives"
             )
         if self.land_s <= self.hold_s:
             raise ValueError(

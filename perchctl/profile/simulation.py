@@ -51,7 +51,8 @@ class SimulationConfig(Section):
     )
     camera_analogue: float = key(
         0.0,
-        "jittering, torn and lost lines of analogue video; at 1, the video is nearly lost",
+        "amount of jittering, torn and lost lines in analogue video; at 1, the video is nearly "
+        "lost",
         ge=0,
         le=1,
     )

@@ -74,8 +74,8 @@ class Mounting(Section):
     )
     rpy_deg: Vector3 = key(
         (0.0, 0.0, 0.0),
-        "rotation of the camera; at 0 0 0, the right of the image is forward and "
-        "its bottom is left",
+        "rotation of the camera; at 0 0 0, the right side of the image faces forward and "
+        "its bottom faces left",
     )
 
     @field_validator("rpy_deg")
@@ -163,7 +163,7 @@ class CameraConfig(Section):
             return latency_s
         raise ValueError(
             f"found {latency_s!r}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), or "
-            "the word measured to have each flight measure it"
+            "the word measured, to have each flight measure the latency"
         )
 
     @property
@@ -186,7 +186,8 @@ class MarkerConfig(Section):
     id: int = key(..., "id of the marker in its dictionary", ge=0)
     side_m: float = key(
         ...,
-        "side of the printed black square; the small one must be less than half the large one",
+        "side of the printed black square; the small marker's must be less than half of the "
+        "large one's",
         ge=0.004,
         le=2.0,
     )
@@ -228,7 +229,7 @@ class TargetConfig(Section):
 
     expected_xy_m: tuple[_InARoom, _InARoom] | None = key(
         None,
-        "where to expect the target, in the world frame of the state estimate; if there are "
+        "expected position of the target, in the world frame of the state estimate; if there are "
         "several targets, the nearest one is used",
     )
     expected_within_m: float = key(
@@ -244,8 +245,8 @@ class TargetConfig(Section):
         given = self.model_fields_set
         if "expected_within_m" in given and "expected_xy_m" not in given:
             raise ValueError(
-                "expected_within_m is set, but expected_xy_m is not: set that too, or remove "
-                "expected_within_m"
+                "expected_within_m is set, but expected_xy_m is not: set expected_xy_m too, or "
+                "remove expected_within_m"
             )
         return self
 
@@ -382,5 +383,5 @@ class MergeConfig(Section):
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:
         if not self.z3_m < self.z2_m:
-            raise ValueError("z3_m < z2_m must hold (metres)")
+            raise ValueError("z3_m must be less than z2_m (both in metres)")
         return self

@@ -59,7 +59,7 @@ def to_exact_json(value: Any) -> Any:
         if value.dtype == np.float64 and value.ndim == 1:
             return flat
         return {"dtype": value.dtype.str, "shape": list(value.shape), "data": flat}
-    raise TypeError(f"{type(value).__name__} has no exact form in a flight log")
+    raise TypeError(f"{type(value).__name__} cannot be stored exactly in a flight log")
 
 
 def _exact_fields(value: Any) -> dict[str, Any]:

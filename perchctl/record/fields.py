@@ -44,7 +44,7 @@ def _axes(name: str, meaning: str) -> dict[str, str]:
 DUTY_FIELDS = tuple(f"duty_m{motor}" for motor in (1, 2, 3, 4))
 _DUTIES = (
     "duty cycles of the motors front right (M1), back right, back left and front left, 0..65535, "
-    "as old as the battery voltage"
+    "of the same age as the battery voltage"
 )
 FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",
@@ -56,7 +56,7 @@ FIELDS: dict[str, str] = {
     "attempts": "failed perching attempts so far",
     # the vehicle's own state estimate, world axes
     **_axes("{}_m", "position of the body in the world frame of the state estimate, z up"),
-    **_axes("v{}_mps", "velocity of the body, world axes"),
+    **_axes("v{}_mps", "velocity, world axes"),
     "roll_rad": "roll, right-handed about body x",
     "pitch_rad": "pitch, right-handed about body y: positive is nose down",
     "yaw_rad": "heading, right-handed about world z",
@@ -67,9 +67,8 @@ FIELDS: dict[str, str] = {
     "battery_state": "pm.state; 3 is low power",
     "battery_rest_v": "resting voltage according to the energy model",
     "battery_used_mah": "charge used, according to the summed thrust and the assumed battery",
-    "battery_left_s": (
-        "hover time left until row `battery-low` lands the vehicle, according to the energy model"
-    ),
+    "battery_left_s": "hover time left until row `battery-low` lands the vehicle, according to the "
+    "model",
     "battery_attempts": "further attempts that the battery allows, with enough left for a landing",
     "supervisor": "supervisor bits",
     "vel_var_m2ps2": "largest of the estimator's velocity variances",
@@ -77,7 +76,7 @@ FIELDS: dict[str, str] = {
     "height_var_m2": "the estimator's variance of the height",
     "tel_age_s": "age of the telemetry sample",
     # external positions, as sent to the vehicle; None if its decks measure the position
-    "pos_age_s": "age of the last external position sent, counted from its exposure",
+    "pos_age_s": "age of the last external position sent, measured from its exposure",
     "pos_note": "why no external position is sent now",
     **_axes("pos_{}_m", "last external position sent, in the world frame of the state estimate"),
     # the camera frame; None in a tick without a new frame

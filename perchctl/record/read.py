@@ -277,7 +277,9 @@ class FlightLog:
         try:
             return from_exact_json(CameraModel, self.header["camera"])
         except ValueError as error:
-            raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
+            raise InvalidValue(
+                f"the log's header contains no valid calibration: camera: {error}"
+            ) from None
 
     @property
     def has_position_variance(self) -> bool:
@@ -296,7 +298,7 @@ class FlightLog:
             bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
             return bits[: width * height].reshape(height, width).astype(bool)
         except (ValueError, TypeError, zlib.error) as error:
-            raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+            raise InvalidValue(f"the log's header contains no valid mask: mask: {error}") from None
 
     @property
     def computer_differences(self) -> str:
@@ -419,7 +421,7 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
 def _checked(record: dict[str, Any]) -> dict[str, Any]:
     kind = record.get("kind")
     if kind not in KINDS:
-        raise ValueError(f"kind {kind!r}, allowed are {', '.join(KINDS)}")
+        raise ValueError(f"kind {kind!r} is unknown; allowed are {', '.join(KINDS)}")
     t_s: Any = record.get("t_s")
     is_time = type(t_s) in (int, float) and abs(t_s) < math.inf
     if not is_time and kind not in ("summary", "recording"):

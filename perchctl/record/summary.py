@@ -185,10 +185,10 @@ class FlightSummary:
             lines.append(("note", note))
         if self.miss_m is not None:
             lines.append(
-                ("miss", f"{self.miss_m * 1e3:.1f} mm off centre, by the simulator's truth")
+                ("miss", f"{self.miss_m * 1e3:.1f} mm off centre, according to the simulator")
             )
         if self.contact is not None:
-            source = ", by the camera's estimate" if math.isfinite(self.contact.sigma_m) else ""
+            source = ", estimated from the camera" if math.isfinite(self.contact.sigma_m) else ""
             lines.append(("contact", f"{self.contact.text}{source}"))
         if self.hover is not None:
             lines.append(("hover", self.hover.text))

@@ -160,7 +160,7 @@ class Board:
     def cv2_board(self) -> Any:
         """A `cv2.aruco.CharucoBoard` for a detector. Raises ValueError for a chessboard."""
         if self.kind != "charuco" or self.marker_m is None or self.dictionary is None:
-            raise ValueError("only a charuco board is one of OpenCV's own")
+            raise ValueError("only a charuco board has an equivalent in OpenCV")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         size = (self.columns, self.rows)
         board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
@@ -173,7 +173,10 @@ def _check_markers(board: Board, text: str) -> None:
     largest_m = 0.95 * board.square_m
     needed = board.columns * board.rows // 2
     if board.marker_m is not None and board.marker_m > largest_m:
-        raise _wrong(text, f"the marker needs a white margin: at most {mm_text(largest_m)} mm")
+        raise _wrong(
+            text,
+            f"the marker needs a white margin: its side may be at most {mm_text(largest_m)} mm",
+        )
     try:
         held = dictionary_size(str(board.dictionary))
     except ValueError as error:

@@ -137,8 +137,8 @@ class PrintCheck:
         few frames, it is not reported as wrong."""
         if not self.has_enough_frames:
             return PrintVerdict(
-                f"print not checked: both markers were seen in only {len(self._ratios)} frames "
-                f"of {MIN_FRAMES} needed"
+                f"print not checked: both markers were seen in only {len(self._ratios)} of "
+                f"{MIN_FRAMES} frames needed"
             )
         values, biases = np.array(self._ratios).T
         value = float(np.median(values))
@@ -148,8 +148,8 @@ class PrintCheck:
         total = math.hypot(sigma, float(np.median(biases)))
         nominal = self.target.small.side_m / self.target.large.side_m
         ratio_text = (
-            f"the small marker is {value * nominal:.4f} of the large one, and the profile "
-            f"says {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
+            f"the small marker is {value * nominal:.4f} times as large as the large one, and the "
+            f"profile says {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
         )
         if abs(off) <= max(SIGMAS * total, MIN_ERROR):
             return PrintVerdict(f"print correct within the noise: {ratio_text}")

@@ -164,7 +164,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     if _cells_apart(large, small) < MIN_DISTANCE:
         raise InvalidValue(
             f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} "
-            "have nearly the same pattern, so one marker would be taken for the other: "
+            "have nearly the same pattern, so one marker could be mistaken for the other: "
             "choose another id for one of them"
         )
     seen = ArucoReader(target).read(draw_target(target).bitmap(_READ_SIDE_PX / large.side_m))

@@ -142,7 +142,7 @@ def parse_page(text: str) -> tuple[float, float]:
         for number in match.groups()[:2]
     )
     if max(width, height) > MOST_PAGE:
-        raise InvalidValue(f"page {text!r} is too large: at most {MOST_PAGE:g} mm a side")
+        raise InvalidValue(f"page {text!r} is too large: at most {MOST_PAGE:g} mm per side")
     return width, height
 
 

@@ -239,12 +239,12 @@ class BlindRange:
     def text(self) -> str:
         """Both ranges in words."""
         left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
-        return f"{left} (with whole markers only: {whole}), the gear under the target's centre"
+        return f"{left} (with whole markers only: {whole}), with the gear under the target's centre"
 
 
 def _blind_words(nearest_m: float | None) -> str:
     if nearest_m is None:
-        return f"blind over the whole last {1e2 * FROM_M:g} cm"
+        return f"blind over all of the last {1e2 * FROM_M:g} cm"
     return "never blind" if nearest_m == 0.0 else f"blind from {1e3 * nearest_m:.0f} mm to contact"
 
 

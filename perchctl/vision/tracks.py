@@ -173,7 +173,7 @@ LOCK_TIMEOUT_S = 10.0
 MIN_ESTABLISHED_TRACK_FRAMES = 5
 """Number of frames below which a lock yields to a rival that was seen more often."""
 
-_ESTIMATE_JUMPED_TEXT = "the state estimate jumped, the target did not"
+_ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the last pose: that pose may have been wrong"
 )

@@ -118,7 +118,7 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
     (height, width). Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue(
-            "the picture is None: cv2.imread returns None if it cannot read a file as a picture"
+            "the picture is None: cv2.imread returns None if it cannot read a file as an image"
         )
     shape: tuple[int, ...] = getattr(image, "shape", ())
     kind = getattr(image, "dtype", None)

@@ -102,8 +102,8 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
     if missing:
         raise InvalidValue(
             f"{path}: line 1: column {missing[0]} is missing, or appears twice"
-            f"{kind_note(path)}; needed are "
-            f"{HEADER}, separated by commas"
+            f"{kind_note(path)}; the columns "
+            f"{HEADER} are needed, separated by commas"
         )
     pick = operator.itemgetter(*(header.index(name) for name in NEEDED))
     numbers, lines = array("d"), array("q")
@@ -136,7 +136,7 @@ def _check_cells(
         "position must be a whole number, and t_s must be finite",
     )
     for source, pose in poses.items():
-        refuse(np.isinf(pose).any(axis=1), f"the {source} pose has an infinite number")
+        refuse(np.isinf(pose).any(axis=1), f"the {source} pose contains an infinite number")
         refuse(
             np.abs(pose[:, YAW_COLUMN]) > 2.0 * np.pi + 1e-6,
             f"{source}_yaw_rad looks like degrees: radians are needed",
@@ -157,8 +157,8 @@ def _check_positions(data: Measurements) -> None:
     places = np.unique(data.position[data.has_both_markers])
     if len(places) < 2:
         raise InvalidValue(
-            f"{data.name}: {len(places)} positions show both markers; frames of one "
-            "position are not independent, so at least 2 are needed (10 are typical)"
+            f"{data.name}: {len(places)} positions show both markers; frames from one "
+            "position are not independent, so at least 2 positions are needed (10 are typical)"
         )
     for place in places:
         rows = data.has_both_markers & (data.position == place)

@@ -78,9 +78,7 @@ def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
     Errors: NotFound, InvalidValue.
     """
     if test is not None and same_file(path, test):
-        raise InvalidValue(
-            f"{test} is the data that the weights are fitted to, so it cannot test them"
-        )
+        raise InvalidValue(f"the weights are fitted to {test}, so it cannot be used to test them")
     errors = marker_errors(read_data(path))
     fits = fit_by_each_method(errors)
     other = None
@@ -178,7 +176,7 @@ def report_text(result: FitResult) -> str:
             for name, square in found.squares.items()
             if name not in FITTED
         }
-        title = f"gain of {LABELS[result.method]} in RMS error {where} over"
+        title = f"reduction in RMS error with {LABELS[result.method]} {where}, compared with"
         parts.append(_table(f"RMS error {where}, 95 % interval", _HEADS, rms))
         parts.append(_table(title, _HEADS, gains))
     weights = {

@@ -72,10 +72,10 @@ def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
     text, record = show_text(flight), show_record(flight)
     assert text.startswith("PERCHED: hanging still with the motors off\n")
     offset = GearToTargetDistance(0.0032, 0.0034)
-    assert ("contact", "3.2 +- 3.4 mm off centre, by the camera's estimate") in replace(
+    assert ("contact", "3.2 +- 3.4 mm off centre, estimated from the camera") in replace(
         flight.summary, contact=offset
     ).rows()
-    assert "\nmiss:      3.1 mm off centre, by the simulator's truth\n" in text
+    assert "\nmiss:      3.1 mm off centre, according to the simulator\n" in text
     assert max(map(len, text.splitlines())) <= COLUMNS
     assert "a ?[31mnote" in text
     assert "\x1b" not in text

@@ -191,7 +191,7 @@ REFUSED = [
     ),
     (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
     ("extends: sim\n", "has no vehicles, so it is not a fleet file: list them under vehicles"),
-    (two(first=", name: west"), "line 4: key name appears twice, first in line 4: keep one"),
+    (two(first=", name: west"), "line 4: key name appears twice, first on line 4: keep only one"),
 ]
 
 

@@ -82,7 +82,7 @@ STILL, SMALL = noise(0), noise(0)[:24, :32]
 @pytest.mark.parametrize(("bad", "words"), [
     (lambda f: replace(f, t_s=f.t_s - 0.5), "old"),
     (lambda f: replace(f, image=STILL), "is frozen"),  # the receiver repeats an old picture
-    (lambda f: replace(f, image=SMALL + f.index % 7), "32x24 px, but the calibration was made at 64x48"),
+    (lambda f: replace(f, image=SMALL + f.index % 7), "32x24 px, but the calibration was made at"),
 ], ids=["late", "frozen", "of another size"])  # fmt: skip
 def test_a_bad_picture_is_no_measurement(bad: Callable[..., Any], words: str) -> None:
     """Nothing is raised in the air: the camera counts as gone, is named, and landed for."""

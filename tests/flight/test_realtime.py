@@ -84,7 +84,7 @@ def test_fly_perches_in_real_time_through_cflib(tmp_path: Path) -> None:
     path, log = the_log(tmp_path), read_log(the_log(tmp_path))
     assert code == 0, err
     assert "PERCHED: hanging still" in err
-    miss = re.search(r"^miss: +(\d+\.\d) mm off centre, by", err, re.MULTILINE)
+    miss = re.search(r"^miss: +(\d+\.\d) mm off centre, according", err, re.MULTILINE)
     assert miss is not None
     assert float(miss[1]) < 20.0
 

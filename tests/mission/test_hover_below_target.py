@@ -172,9 +172,9 @@ def hovers_at(below_m: float, **safety: float) -> Profile:
 
 
 @pytest.mark.parametrize(("profile", "words"), [
-    (hovers_at(1.9), "1.9 m below the target is 0.27 m above the ground; the vehicle hovers 0.3 "),
-    (hovers_at(0.5, max_height_m=1.7), "0.5 m below the target is 1.67 m above the ground; "
-     "the vehicle hovers 0.3 to 1.65 m above the ground: change the distance"),
+    (hovers_at(1.9), "1.9 m below the target is 0.27 m above the ground, but the vehicle hovers "),
+    (hovers_at(0.5, max_height_m=1.7), "0.5 m below the target is 1.67 m above the ground, but "
+     "the vehicle hovers only 0.3 to 1.65 m above the ground: change the distance"),
 ])  # fmt: skip
 def test_a_hover_near_the_ground_or_the_limit_is_refused_in_a_sentence(
     profile: Profile, words: str

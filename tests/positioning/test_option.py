@@ -24,7 +24,7 @@ def fly(*words: str) -> Result:
 
 
 @pytest.mark.parametrize(("section", "words"), [
-    ("{host: lab}", "but by is deck: write by: mocap"), ("{by: deck, host: lab}", "but by is deck"),
+    ("{host: lab}", "by is deck: write by: mocap"), ("{by: deck, host: lab}", "but positioning.by"),
     *((f"{{by: mocap, host: '{host}'}}", f"found '{host}'")
       for host in ("http://lab", "lab:0", "lab:x", "lab/1", "a b")),
 ])  # fmt: skip

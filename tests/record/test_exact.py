@@ -222,7 +222,7 @@ def test_a_log_keeps_its_keys_whatever_the_program_calls_a_field() -> None:
 
 @pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()])])
 def test_what_has_no_exact_form_is_refused(value: Any) -> None:
-    with pytest.raises(TypeError, match="no exact form"):
+    with pytest.raises(TypeError, match="cannot be stored exactly"):
         to_exact_json([value])
 
 

@@ -46,7 +46,7 @@ def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
     [
         ({"room": 110_000}, "No space left on device", False),
         ({"free": recording_module.RESERVE_BYTES - 1}, "are reserved for the log", True),
-        ({"max_mb": 0.15}, "log.max_mb of the profile, 0.15", True),
+        ({"max_mb": 0.15}, "log.max_mb in the profile, 0.15", True),
         ({"tick": {"t_s": 1.9, "phase": object()}}, "TypeError", False),
     ],
 )

@@ -238,7 +238,7 @@ def test_exact_corners_give_the_exact_ratio(scale: float) -> None:
 
 def claimed(text: str) -> tuple[float, float]:
     """The ratio of the sides and its sigma, a share."""
-    found = re.search(r"is ([0-9.]+) of the large one.*sigma ([0-9.]+) %", text)
+    found = re.search(r"is ([0-9.]+) times as large.*sigma ([0-9.]+) %", text)
     assert found is not None, text
     return float(found[1]), float(found[2]) / 100
 

@@ -261,7 +261,7 @@ REFUSALS = [
     (["--magnet", "20mm"], 30, "exceeds the magnet"),
     (["--page", "150x150mm"], 30, "use --page a4"),
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
-    (["--page", "9x9m"], 30, "too large: at most 5000 mm a side"),
+    (["--page", "9x9m"], 30, "too large: at most 5000 mm per side"),
     (["-o", "target.txt"], 30, "must end in .pdf"),
     (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),

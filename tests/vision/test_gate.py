@@ -277,7 +277,7 @@ def test_an_estimate_that_jumps_while_frames_are_missed_loses_no_target(
     outputs = watch.show(10)
     assert all(measured(outputs))
     if jump_m in LARGE_JUMPS_M:
-        assert outputs[0].lock_note == "the state estimate jumped, the target did not"
+        assert outputs[0].lock_note == "the state estimate jumped, but the target did not"
         for output in outputs:
             assert np.abs(output.target.world_m - TARGET_M - jump_m).max() < 0.015
 

@@ -115,7 +115,7 @@ BAD: list[tuple[str, slice, Edit, str]] = [
         "like degrees",
     ),
     ("position", slice(1, None), lambda r: "1", "1 positions show both markers"),
-    ("large_x_m", slice(8, 9), lambda r: "1e999", "line 9: the large pose has an infinite"),
+    ("large_x_m", slice(8, 9), lambda r: "1e999", "line 9: the large pose contains an inf"),
     ("large_x_m", slice(99, 100), lambda r: "abc", "line 100: could not convert"),
     (
         "small_y_m",

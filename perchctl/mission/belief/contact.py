@@ -504,7 +504,7 @@ MOTORS_OFF_AS_COMMANDED = Condition(
 )
 """The motors are off, and the last command does not let them turn."""
 MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
-    "motors off despite an order",
+    "motors off despite a thrust command",
     _are_motors_off_despite_thrust_command,
     required_data=RequiredData.TELEMETRY,
 )
@@ -547,10 +547,10 @@ SUPPORT_CONDITIONS = (
 class Support(Enum):
     """What supports the vehicle."""
 
-    AIR = "nothing: it flies"
-    PRESSED_SURFACE = "the target or an obstacle, against which it presses"
+    AIR = "nothing: the vehicle flies"
+    PRESSED_SURFACE = "the target or an obstacle, against which the vehicle presses"
     MAGNET = "the target's magnet"
-    HELD_BY_OTHER_OBJECT = "something away from the target, on which it hangs or stands"
+    HELD_BY_OTHER_OBJECT = "something away from the target, on which the vehicle hangs or stands"
     FLOOR = "the floor"
     UNKNOWN = "unknown"
 

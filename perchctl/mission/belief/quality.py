@@ -111,8 +111,8 @@ def position_loss_text(b: Belief) -> str:
         why = why or NO_ESTIMATE_CORRECTION_TEXT
     if b.obs.rejected_sighting_to_estimate_m > 0.0:
         why = (
-            f"the target shows the vehicle {b.obs.rejected_sighting_to_estimate_m:.2f} m from its "
-            f"estimate"
+            f"the target places the vehicle {b.obs.rejected_sighting_to_estimate_m:.2f} m from its "
+            f"estimated position"
         )
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
     return f"{text}: {why}" if why else text
@@ -128,7 +128,7 @@ def excessive_variance_text(b: Belief) -> str:
         variance, most, unit = b.worst_axis_position_variance_m2, safety.flight_variance_m2, "m^2"
     if math.isinf(variance):
         return f"the {what}'s variance is unknown"
-    return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"
+    return f"the {what}'s variance is {variance:.2g} {unit}, but at most {most:g} is allowed"
 
 
 def no_picture_reason(b: Belief) -> str:

@@ -94,8 +94,8 @@ def unsafe_hover_reason(c: Context) -> str:
     assert height_m is not None
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
     return (
-        f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground; the vehicle "
-        f"hovers {MIN_HELD_SETPOINT_HEIGHT_M:g} to {highest_m:g} m above the ground: "
+        f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground, but the "
+        f"vehicle hovers only {MIN_HELD_SETPOINT_HEIGHT_M:g} to {highest_m:g} m above the ground: "
         f"change the distance below the target"
     )
 

@@ -107,7 +107,7 @@ def left_hover_position_reason(c: Context) -> str:
     )
     return (
         f"moved {aside_m:.2f} m to the side and {abs(below_m):.2f} m "
-        f"{'down' if below_m > 0.0 else 'up'} from its place"
+        f"{'down' if below_m > 0.0 else 'up'} from its hover position"
     )
 
 

@@ -306,7 +306,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Half-size search",
         requirements_text="both markers expected, those in view with sides above 60 px",
-        cost_text="5 ms, including the measurement of what it finds",
+        cost_text="5 ms, including the measurement of the markers found",
         run_condition_text="the edge fit was tried and found no marker",
         should_run=_has_edge_fit_found_nothing,
         find=_search_half_size,
@@ -342,10 +342,9 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Search",
         requirements_text="a marker whose bits can be read",
-        cost_text="4 to 9 ms, including the measurement of what it finds",
-        run_condition_text="nothing was found, unless the target was cut off and still is; or "
-        "an expected marker with sides above 13 px is missing; after a loss, in three of four "
-        "images",
+        cost_text="4 to 9 ms, including the measurement of the markers found",
+        run_condition_text="nothing was found, unless the target was cut and still is; or an "
+        "expected marker with sides above 13 px is missing; after a loss, in three of four images",
         should_run=_should_search,
         find=_search,
     ),

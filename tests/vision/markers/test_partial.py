@@ -318,7 +318,7 @@ WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
         (None, NotFound, "does not exist"),
         ("legs", InvalidValue, "cannot be read as an image"),
         (WHITE[:240, :320], InvalidValue, "320x240 px, but the calibration was made at 640x480"),
-        (WHITE, InvalidValue, "covers 100 % of the image, at most 75 %"),
+        (WHITE, InvalidValue, "covers 100 % of the image, but at most 75 %"),
         (BLACK, InvalidValue, "covers nothing"),
     ],
 )
