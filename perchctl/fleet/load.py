@@ -335,5 +335,5 @@ def _in_words(key: str, reason: str) -> str:
 
 _NEEDED = {
     "name": "give each vehicle a name",
-    "home_m": "measure where it stands before take-off, x and y in metres",
+    "home_m": "measure the vehicle's position before take-off, x and y in metres",
 }

@@ -115,7 +115,7 @@ def check_uris(uris: Sequence[str]) -> None:
     """Raise InvalidValue unless these are radio URIs of different vehicles on one dongle."""
     for uri in uris:
         if check_uri(uri) != "radio":
-            raise InvalidValue(f"{uri} is not a radio URI: a hub shares only a Crazyradio")
+            raise InvalidValue(f"{uri} is not a radio URI: a hub can share only a Crazyradio")
     dongles = {dongle_of(uri): uri for uri in uris}
     if len(dongles) != 1:
         raise InvalidValue(

@@ -378,7 +378,7 @@ def start_block(
     try:
         log.add_config(block)
     except (KeyError, AttributeError) as error:
-        raise NotFound(f"log block {name} is refused by {uri}: {error}") from None
+        raise NotFound(f"log block {name} cannot be added to {uri}: {error}") from None
     block.data_received_cb.add_callback(on_data)
     block.start()
     return block

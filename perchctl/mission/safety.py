@@ -391,7 +391,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "heading-lost",
         PRE_CONTACT_PHASES,
         lambda c: c.belief.is_heading_lost,
-        "the estimated heading jumped: descending level by thrust alone",
+        "the estimated heading jumped: descending level on thrust alone",
     ),
     land_row(
         "position-astray",
@@ -404,7 +404,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "position-lost",
         FREE_AIR_PHASES | {Phase.PERCH},
         is_position_lost,
-        lambda c: f"{position_loss_text(c.belief)}; descending level by thrust alone",
+        lambda c: f"{position_loss_text(c.belief)}; descending level on thrust alone",
     ),
     land_row(
         "estimator-jump",

@@ -124,7 +124,7 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
     if not within:
         return f"visible only to a camera that looks up; the axis of this one {axis}"
     return (
-        f"at most {highest_m:.1f} m above the camera, its centre within "
+        f"at most {highest_m:.1f} m above the camera, with its centre within "
         f"{', '.join(within)} of the camera's axis, which {axis}"
     )
 

@@ -194,7 +194,7 @@ def _verdict(result: FitResult) -> str:
     if not any(result.is_proven_better):
         return _wrapped(
             "not recommended: on no axis are these weights better than the better single "
-            "marker by more than the 95 % interval; take more positions, or fly with "
+            "marker by more than the 95 % interval; measure more positions, or fly with "
             "merge.method: joint"
         )
     lines = [f"recommended weights of the large marker ({LABELS[result.method]})"]

@@ -179,7 +179,7 @@ REFUSED = [
         two().replace(", target_m: [3.2, 0]", ""),
         "vehicle east: the position of its target is missing",
     ),
-    (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure where it"),
+    (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure the"),
     (two(second=", target: none.yaml"), "vehicle east: target: "),
     (
         two(", frame: room", defaults=", positioning: target"),

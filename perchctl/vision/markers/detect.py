@@ -297,7 +297,7 @@ def _search_blurred(
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
-        requirements_text="an expected marker, whole, with cells of 2.5 px and straight sides",
+        requirements_text="an expected, whole marker with cells of 2.5 px and straight sides",
         cost_text="0.7 ms",
         run_condition_text="the target is expected; after a loss, in three of four images",
         should_run=_is_target_expected,
@@ -313,8 +313,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Partial-view fit",
-        requirements_text="an expected marker with cells of 4 px, 60 % of its cells and four of "
-        "its edges",
+        requirements_text="an expected marker with cells of 4 px, of which 60 % of the cells and "
+        "four edges are visible",
         cost_text="3 ms for each marker",
         run_condition_text="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
@@ -323,7 +323,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Photometric fit",
-        requirements_text="a whole marker with sides of 7 px, and corners to within 0.3 sides",
+        requirements_text="a whole marker with sides of 7 px, and approximate corners, to within "
+        "0.3 sides",
         cost_text="1.3 ms for each marker",
         run_condition_text="the edge fit was tried, and no marker's edges suffice: its cells are "
         "smaller than 6 px or than six times the blur; not if the half-size search found one",
