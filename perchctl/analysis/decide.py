@@ -27,7 +27,7 @@ FieldDifference = tuple[str, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class ReplayedDecision:
-    """Result of replaying the planner on one turn (one iteration of the flight loop).
+    """Result of replaying the planner for one turn (one iteration of the flight loop).
 
     Attributes:
         tick: number of turns flown before this one.
@@ -77,7 +77,8 @@ def replay_decisions(
 
     `observation_of` returns a turn's observation (default: as recorded), or None to skip the turn.
     Only turns that were flown advance the planner's state. Like a flight, the replay ends at the
-    first turn on which the planner raises an exception. The default `comparison` is bit for bit.
+    first turn in which the planner raises an exception. By default, `comparison` compares values
+    bit for bit.
     """
     comparison = comparison or Comparison()
     state: PlannerState | None = None
@@ -181,7 +182,7 @@ class Comparison:
 
     def _tolerance(self, name: str) -> float:
         last = name.rpartition(".")[2].partition("[")[0]
-        to_the_bit = -1.0  # negative, so that even 0.0 and -0.0 count as different
+        to_the_bit = -1.0  # negative: even 0.0 and -0.0 differ
         return self.tolerances.get(last, self.tolerances.get("", to_the_bit))
 
 

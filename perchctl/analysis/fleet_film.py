@@ -1,7 +1,8 @@
-"""Make a film of a fleet that shows the room from above, all heights, and each camera's image.
+"""Make a film of a fleet that shows the room from above, each vehicle's height, and each camera's
+image.
 
 Each vehicle's log has its own clock. The logs are aligned on the fleet's clock: each flight has a
-start time and a pace on it, because simulated time may run slower than the wall clock.
+start time and a pace on that clock, because simulated time may run slower than the wall clock.
 """
 
 from __future__ import annotations

@@ -136,8 +136,8 @@ class FlightAnalysis:
     @cached_property
     def position_holds(self) -> tuple[Hold, ...]:
         """Periods in which the mission paused, each within one phase and for one reason.
-        The numbers in the reason may change meanwhile; the text is the one at the end of the
-        period."""
+        If the numbers in the reason change during a pause, its text is the one from the end of the
+        pause."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -272,9 +272,9 @@ def _known(value: float) -> float | None:
 # --- commands from senders other than the flight loop ---
 
 APART_S = 2.0
-"""Time between two commands from one sender above which they belong to different series, s."""
+"""Time between two commands from one sender above which the second one starts a new series, s."""
 _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
-"""Two words of a class's name."""
+"""Matches the boundary between two words in a class name such as ``PositionSetpoint``."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ class Takeover:
 
     @property
     def text(self) -> str:
-        """The kinds of commands and their numbers: ``position setpoint (14), land (2)``."""
+        """Each kind of command, and how many were sent: ``position setpoint (14), land (2)``."""
         return ", ".join(f"{name} ({count})" for name, count in self.commands.items())
 
 

@@ -36,13 +36,15 @@ BEFORE_LAST_SIGHT_S = 5.0
 """Time before the last frame with the target at which the close-up starts, s. Larger: the end of
 the approach is drawn smaller."""
 AFTER_LAST_SIGHT_S = 0.5
-"""Time after that frame at which the close-up ends, s."""
+"""Time after the last frame with the target at which the close-up ends, s."""
 LEAST_SPAN_MM = 5.0
-"""Least range to each side of zero. Smaller: the noise of a still approach fills the plot."""
+"""The close-up's error axis extends at least this far to each side of zero. Smaller: the noise of a
+steady approach fills the plot."""
 Span = tuple[str, float, float]
 """A phase's name, and its start and end on the time axis."""
 NAME_GAP = 0.02
-"""Share of the time axis between the names of two phases, so that they do not overlap."""
+"""Smallest distance between the names of two phases that does not make them overlap, as a share of
+the time axis."""
 LOST_SHARE = 0.05
 """Share of a panel's height in which lost frames are marked."""
 FULL_THRUST_PERCENT = 1 / 655.35
@@ -132,7 +134,7 @@ def _draw_raw_and_filtered(
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, marker, markersize=3, color=colour, label=text)
     filtered = flight.tracked_values(f"e{key}")
-    if key == "yaw_rad":  # a gap, not a line across the panel, where it wraps
+    if key == "yaw_rad":  # where the angle wraps, leave a gap
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
     ax.plot(log.t_s, filtered, color=BLACK, linewidth=1.1, label="filtered")

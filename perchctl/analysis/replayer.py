@@ -124,7 +124,8 @@ class Replay:
         """Dotted names of the fields that the log does not contain and that are therefore not
         compared."""
         names = (field.path.removeprefix("observation.") for field in self.log.unknown_fields)
-        # Samples below `taken` have the same fields as the others, so their names are not repeated.
+        # The telemetry samples in `taken` have the same fields as the observation's telemetry, so
+        # their names are not repeated.
         return [name for name in names if not name.startswith("taken.")]
 
     @property

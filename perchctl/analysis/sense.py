@@ -56,7 +56,7 @@ class _Given:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = delay_s
         self._pictures = _readable(pictures)
-        self._name: str | None = None  # name of the flown source, once it has ended
+        self._name: str | None = None  # name of the source in flight, set at its end
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = TickInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
@@ -126,7 +126,7 @@ class _Given:
                 return image
             if index > seen.index:
                 break
-            # An image of a smaller index belongs to a frame that no turn used, and is skipped.
+            # An image with a smaller index belongs to a frame that no turn used, and is skipped.
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 

@@ -139,7 +139,7 @@ _MEASURES = (
         "at most {telemetry_age_p99_s} ms old",
     ),
 )
-"""Name of each line, the figure without which it is left out, and the line itself."""
+"""Name of each line, the figure that must be known for the line to be printed, and its text."""
 
 
 def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:

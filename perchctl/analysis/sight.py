@@ -17,8 +17,8 @@ from perchctl.record import FlightLog, PhaseSpan
 BLIND_PHASE = "COMPLETE"
 """Phase at the ceiling, in which no frames are searched."""
 GAP_PERIODS = 2.5
-"""Number of median periods up to which a gap may be a late frame, since frames arrive
-irregularly."""
+"""Number of median periods up to which a gap may be a late frame rather than a missing one, since
+frames arrive irregularly."""
 
 
 def percentile(values: Array, percent: float) -> float:
@@ -35,7 +35,7 @@ class Frames:
     """Timing of the camera frames that the pipeline processed, oldest first.
 
     Attributes:
-        t_s: (n,) exposure times, measured from the first iteration in which it was flown.
+        t_s: (n,) exposure times, measured from the first iteration in which the vehicle was flown.
         has_target: (n,) bool, True for the frames that showed the target.
         gaps_s: (k, 2) start and end of each gap without a usable frame.
         rate_hz: 1 over the median time between two frames; NaN if unknown.
@@ -144,14 +144,14 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     """When the loss ended; None without a loss."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
-    at_s = start_s + LEAST_LOSS_S / 2  # last seen perhaps just before the phase
+    at_s = start_s + LEAST_LOSS_S / 2  # the target may have been last seen just before the phase
     phase = next((s.phase for s in reversed(stays) if s.start_s <= at_s), "")
     left = next(
         (s for s in stays if s.start_s > start_s and s.phase not in NEEDED_IN | {"SEARCH"}), None
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":
-            return None  # expected: so close that no marker fits into the image
+            return None  # expected: no marker fits into the image this close
         end_s = left.start_s
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None

@@ -44,36 +44,38 @@ WIND_ARM_M = 0.047
 recorded flights of a Crazyflie 2.1."""
 DRAG_LEVER_M = 0.002
 """Distance from the centre of mass at which the force of a draught may act, m, one standard
-deviation: an estimate from the usual offset of the centre of mass. Larger: wider intervals of yaw.
-Smaller: intervals that are too narrow in a draught."""
+deviation: an estimate from the usual offset of the centre of mass. Larger: wider intervals for the
+yaw imbalance. Smaller: in a draught, the intervals are too narrow."""
 YAW_TORQUE_M = 0.006
-"""Reaction torque of a motor per thrust, N.m per N."""
+"""Reaction torque of a motor per unit of thrust, N.m per N."""
 UNSEEN_LEAN_RAD = math.radians(0.3)
-"""Lean against a draught that a bias of the estimated lean may hide, rad, one standard deviation.
-Larger: wider intervals. Smaller: a draught passes for an imbalance."""
+"""Lean into a draught that the bias of the estimated lean may hide, rad, one standard deviation.
+Larger: wider intervals. Smaller: a draught is taken for an imbalance."""
 HOVER_CLEARANCE_M = 0.3
-"""Smallest distance from the floor and from the target, m. Smaller: ground or ceiling effect
-disturbs the estimate."""
+"""Smallest distance from the floor and from the target at which samples are used, m. Smaller:
+ground or ceiling effect disturbs the estimate."""
 HOVER_SPEED_MPS = 0.15
-"""Largest level speed of a hover, m/s. Larger: more samples, but the airspeed adds a moment."""
+"""Largest horizontal speed that counts as a hover, m/s. Larger: more samples, but the airspeed adds
+a moment."""
 HOVER_CLIMB_MPS = 0.3
-"""Largest vertical speed of a hover, m/s; all motors feel it alike."""
+"""Largest vertical speed that counts as a hover, m/s; it affects all motors equally."""
 HOVER_LEAN_RAD = math.radians(4.0)
-"""Largest lean of a hover, rad. Larger: samples in which the vehicle changes its speed."""
+"""Largest lean that counts as a hover, rad. Larger: samples in which the vehicle accelerates are
+used too."""
 SAMPLE_PERIOD_S = 0.1
 """Period of the log packets with duty cycles, s (`perchctl.link.telemetry`, `SLOW_PERIOD_S`)."""
 LEAST_SAMPLES = 20
-"""Least number of samples for an estimate: 2 s of hover. Smaller: more flights have an estimate,
+"""Smallest number of samples for an estimate: 2 s of hover. Smaller: more flights have an estimate,
 but with wide intervals."""
 CORRELATED_SAMPLES = 10
 """Number of samples after which two samples are independent: 1 s, a few oscillations of the
-attitude. Larger: the intervals are less certain. Smaller: they are too narrow."""
+attitude. Larger: the intervals are less certain. Smaller: the intervals are too narrow."""
 HARMLESS_SHIFT_M = 0.0025
-"""Shift of the centre of mass up to which no advice is given, m: recorded vehicles flew with up to
-2.4 mm."""
+"""Shift of the centre of mass up to which no advice is given, m: recorded vehicles flew with shifts
+of up to 2.4 mm."""
 HARMLESS_YAW = 0.06
-"""Yaw imbalance up to which no advice is given: of two recorded vehicles, one flew with 0.058 and
-one with 0.165."""
+"""Yaw imbalance up to which no advice is given: one of two recorded vehicles flew with an imbalance
+of 0.058, the other with 0.165."""
 
 MOTOR_PLACES = ("front right", "back right", "back left", "front left")
 """Positions of M1..M4."""
@@ -158,7 +160,7 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
     packets = np.flatnonzero(is_known & is_new)
     motor_v = duties[packets] / MOST_DUTY * volts[packets, np.newaxis]
     asked_n = np.vectorize(thrust_n, otypes=[np.float64])(motor_v)
-    is_turning = np.all(asked_n > 0.0, axis=1)  # not idling on the ground
+    is_turning = np.all(asked_n > 0.0, axis=1)  # False while idling on the ground
     packets, asked_n = packets[is_turning], asked_n[is_turning]
     in_hover = _is_hovering(log)[packets]
     if np.count_nonzero(in_hover) < LEAST_SAMPLES:
@@ -194,10 +196,10 @@ def mean_and_margin(series: Array, chosen: NDArray[np.bool_]) -> tuple[float, fl
 
     The variance of the mean follows Newey and West (Econometrica 55, 1987), with autocovariances up
     to `CORRELATED_SAMPLES` and linearly decreasing weights. In a short series this variance is too
-    small, which the quantile of Kiefer and Vogelsang compensates for (Econometric Theory 21, 2005,
-    table 1). The interval is never narrower than Student's for independent values, although
-    attitude control makes successive values negatively correlated. It is too narrow for noise with
-    a longer correlation time. `chosen`: (n,) booleans, at least `LEAST_SAMPLES` of them True.
+    small; Kiefer and Vogelsang's quantile compensates for this (Econometric Theory 21, 2005, table
+    1). The interval is never narrower than Student's for independent values, although attitude
+    control makes successive values negatively correlated. The interval is too narrow for noise that
+    is correlated over more samples. `chosen`: (n,) booleans, at least `LEAST_SAMPLES` of them True.
     """
     count = int(np.count_nonzero(chosen))
     mean = float(np.mean(series[chosen]))

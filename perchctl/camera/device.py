@@ -62,7 +62,7 @@ def configure_capture(
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size_px[1])
     if config is not None and config.rate_hz is not None:
         capture.set(cv2.CAP_PROP_FPS, config.rate_hz)
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # waiting old frames would add latency
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # queued frames would add latency
 
 
 class DeviceSource(LiveSource):
@@ -100,7 +100,7 @@ class DeviceSource(LiveSource):
                         self._put(image)
                         failures = 0
                         continue
-                except Exception as error:  # any error that a damaged image causes in OpenCV
+                except Exception as error:  # whatever OpenCV raises for a damaged image
                     why = f"delivers pictures that cannot be decoded ({describe_error(error)})"
                     self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1

@@ -36,7 +36,7 @@ class RecordedSource:
         self._name = name
         self._latency_s = latency_s
         self._index = 0
-        # one image ahead, so that the image size and the end are known before they are needed
+        # read one image ahead, so that the image size and the end are known before they are needed
         self._ahead = self._read()
         if self._ahead is None:
             raise InvalidValue(

@@ -29,11 +29,11 @@ FROZEN_AFTER_S = 0.4
 UNIFORM_SIGMA = 1.5
 """Standard deviation below which an image shows nothing: a blank screen has less than 1."""
 DARK_LEVEL = 30.0
-"""Level below which an image is dark: mean plus two standard deviations."""
+"""Level below which an image is dark, compared with its mean plus two standard deviations."""
 SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
-"""Thresholds for snow: its standard deviation, the difference of lines two rows apart relative to
-unrelated lines (1), and that of columns, which is smaller because a receiver's bandwidth smooths
-along lines."""
+"""Thresholds above which an image is snow: its standard deviation; the mean square difference of
+lines two rows apart, relative to that of unrelated pixels (1); and the same for columns two pixels
+apart, where it is smaller because a receiver's bandwidth smooths along lines."""
 
 
 class FrameHealth:
@@ -85,7 +85,7 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 # --- Images that a receiver repeats because no new one has arrived ---
 # If a receiver gets 25 images per second but outputs 60, it repeats each image two or three times.
-# A repetition is not a new measurement, and its time is that of the first copy.
+# A repetition is not a new measurement, and keeps the time of the first copy.
 
 
 Grey = NDArray[np.uint8]

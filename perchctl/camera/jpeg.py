@@ -16,17 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PICTURE_BYTES = 8_000_000
-"""Largest size of an image in a stream, bytes. An image that has not ended by then is dropped."""
+"""Largest size of an image in a stream, bytes. An image that is longer is dropped."""
 MOST_STREAM_PX = 4096 * 4096
 """Largest number of pixels of an image in a stream: more than any flying camera has, and decoded
 within 0.2 s."""
 
 _SCAN_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
-"""The first marker after entropy-coded bytes, in which FF is followed by 00 or a restart marker."""
+"""Matches the first marker after entropy-coded data; within the data, FF is only followed by 00 or
+is part of a restart marker."""
 _START, _END = b"\xff\xd8\xff", b"\xff\xd9"
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 _FRAME_HEADER_CODES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Codes of a frame header: its length and precision are followed by height and width."""
+"""Marker codes of a frame header, which contains length, precision, height and width, in this
+order."""
 
 
 def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
@@ -91,7 +93,7 @@ class JpegSplitter:
             # The damage may be the beginning of the next image, so the search continues from there.
             del self._buffer[:end]
         else:
-            del self._buffer[:-2]  # the next start marker may be cut in half here
+            del self._buffer[:-2]  # half a start marker may be left at the end
         self._bound()
         return pictures
 
@@ -103,7 +105,7 @@ class JpegSplitter:
 
 SENSOR_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 """OpenCV's flags for a grey image on the sensor's grid. A camera stores how it was held as an
-orientation for viewers; if it were applied, the calibration would no longer fit the image."""
+orientation tag for viewers; an image rotated by this tag would no longer fit the calibration."""
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:

@@ -35,7 +35,7 @@ from perchctl.errors import NotFound
 READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _NOT_MENDED = (401, 403, 404, 410)
-"""Status codes that another attempt would not change."""
+"""HTTP status codes after which another attempt would fail as well."""
 _NAME_AND_PASSWORD = "add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
 _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 
@@ -100,7 +100,7 @@ class MjpegSource(LiveSource):
         passwords.add_password(None, request.full_url, *self._name_and_password)
         handler = HTTPDigestAuthHandler(passwords)
         for digest in digests:
-            with suppress(ValueError, URLError):  # an algorithm that the library does not know
+            with suppress(ValueError, URLError):  # the library lacks the algorithm
                 challenge = parse_keqv_list(parse_http_list(digest))
                 return f"Digest {handler.get_authorization(request, challenge)}"
         return None
@@ -140,10 +140,11 @@ MAX_DAMAGED = 100
 """Number of successive packets that cannot be decoded before the source reconnects."""
 DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""Relative rate by which a camera's clock may run slow before its images seem to become older."""
+"""Relative rate by which a camera's clock may run slow; if it is slower, its images seem to grow
+older and older."""
 
 _OPTIONS = {
-    "rtsp_flags": "prefer_tcp",  # by UDP, a lost packet spoils all images up to the next keyframe
+    "rtsp_flags": "prefer_tcp",  # over UDP, a lost packet spoils all images until a keyframe
     "fflags": "nobuffer",
     "flags": "low_delay",
     "max_delay": "0",
@@ -169,8 +170,8 @@ class TransferDelay:
         )  # arrival times with their transfer times `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
-        """The transfer time in excess of the fastest image's, s; 0 if `camera_s`, the camera's
-        timestamp, is None."""
+        """How much longer this image's transfer took than the fastest one's, s; 0 if `camera_s`,
+        the camera's timestamp, is None."""
         if camera_s is None:
             return 0.0
         if camera_s < self._camera_s:
@@ -178,7 +179,7 @@ class TransferDelay:
         self._camera_s = camera_s
         way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
-            self._ways.pop()  # sliding minimum: none of these can become the minimum any more
+            self._ways.pop()  # sliding minimum: the newest value is smaller
         self._ways.append((arrival_s, way_s))
         while self._ways[0][0] < arrival_s - DELAY_WINDOW_S:
             self._ways.popleft()
@@ -202,7 +203,7 @@ class RtspSource(LiveSource):
         self._url = url
 
     def _connection(self) -> str:
-        import av  # imported late, since most flights have another camera
+        import av  # imported late, since most flights use another camera
         import av.error
 
         try:
@@ -258,7 +259,7 @@ _FINAL = (
     "HTTPBadRequestError",
     "DecoderNotFoundError",
 )
-"""PyAV's errors that another attempt would not solve, by name."""
+"""Names of PyAV's errors after which another attempt would fail as well."""
 _REASONS = {
     "HTTPUnauthorizedError": "the camera rejects this user name and password (401)",
     "OSError": "the host cannot be reached, or its name cannot be resolved",

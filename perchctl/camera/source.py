@@ -152,16 +152,16 @@ class LiveSource:
         self._clock = clock
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._first = threading.Event()  # set by the first frame, or by a failure before it
+        self._first = threading.Event()  # set at the first frame or a failure before it
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
         self._arrived = 0  # number of images, including a receiver's repetitions
         self._why_silent = ""
-        # problem of the newest connection, and advice, until an image arrives
+        # the newest connection's problem and advice, kept until an image arrives
         self._found = ("", "")
         self._is_connected = False
-        self._dropped = 0  # number of images that arrived since the last good one
+        self._dropped = 0  # number of unusable images since the last good one
         self._why_dropped = ""
         self.connections = 0
         self.failure: PerchError | None = None
@@ -259,7 +259,8 @@ class LiveSource:
         self._note(_SILENT, self.silent_advice)
 
     def _note(self, finding: str, advice: str = "") -> None:
-        """Record what this connection has delivered instead of an image, and advice."""
+        """Record what this connection has delivered instead of an image, with advice for the
+        user."""
         self._found = (finding, advice)
 
     def _drop(self, why: str) -> None:
@@ -335,14 +336,14 @@ class WrappedSource:
 
 
 class GuardedSource:
-    """Checks your own camera. An error that it raises, or an invalid frame, counts as a lost
-    camera; a live frame that is not newer than the last one is dropped."""
+    """Checks the frames from your own camera class. An error that it raises, or an invalid frame,
+    counts as a lost camera; a live frame that is not newer than the last one is dropped."""
 
     def __init__(self, source: FrameSource, name: str, clock: Clock) -> None:
         self._source, self._name, self._clock = source, name, clock
         self._first: Frame | None = None
         self._newest_s, self._count = -math.inf, 0
-        self._empty_since_s: float | None = None  # first poll without a frame since the last one
+        self._empty_since_s: float | None = None  # time of the first poll after the last frame
         self._failure: str | None = None
         self.live, self.size_px = bool(source.live), source.size_px
 
@@ -452,7 +453,7 @@ def _without_name(rest: str) -> str:
     if "@" in host:
         return f"{host.rpartition('@')[2]}{slash}{path}"
     before, _, after = rest.rpartition("@")
-    return after if ":" in before else rest  # a slash within the password
+    return after if ":" in before else rest  # the password contains a slash
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:

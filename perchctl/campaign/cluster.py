@@ -42,13 +42,14 @@ _LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
 names, is compared separately."""
 
 
-# --- What each worker must have ---
+# --- Requirements on each worker ---
 
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What each worker of a campaign must have; sent with each flight. `campaign_id` is unique.
-    `environment` contains versions and hashes by name, which must equal those of this computer."""
+    """The software and files that each worker of a campaign must have; sent with each flight.
+    `campaign_id` is unique. `environment` contains versions and hashes by name, which must equal
+    those of this computer."""
 
     campaign_id: str
     profiles: tuple[Profile, ...]

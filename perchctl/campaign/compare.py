@@ -39,8 +39,8 @@ def fly_variants(
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
 ) -> list[FlightResult]:
-    """Fly each seed with all profiles before the next seed; for the other parameters, see
-    `fly_all`."""
+    """Fly each seed with all profiles before going on to the next seed; for the other parameters,
+    see `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
@@ -70,19 +70,19 @@ def results_by_seed(
 
 Pair = tuple[FlightResult, FlightResult]
 Comparison = dict[str, Any]
-"""What is known of two flights a seed, A's and B's, ready for JSON, in SI; `better` is "A", "B", or
-None where nothing is proven:
+"""The comparison of profiles A and B, which both flew each seed, as values for JSON in SI units.
+`better` is "A", "B", or None if the difference is not significant:
 
-- `flights`;
-- `success` (perched, neither locked nor fallen): the rates of `A` and `B`; the seeds of which only
-  one succeeded, `only_a` and `only_b`; the chance `p` that they split so unevenly, times the
-  questions that were asked; `better`;
-- for each figure the `pairs` that have it, its means `a` and `b`, their `difference` (B's less
-  A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
+- `flights`: the number of seeds;
+- `success` (perched, neither locked nor fallen): the rates of `A` and `B`; `only_a` and `only_b`,
+  the numbers of seeds for which only A or only B succeeded; `p`, the probability of so uneven a
+  split by chance, times the number of questions asked; and `better`;
+- for each figure: the number of `pairs` in which both flights have it, the means `a` and `b`, their
+  `difference` (B minus A) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
 """
 FEWEST_PAIRS = 20
-"""Number of pairs below which no interval is given, since only the mean of many is nearly
-normal."""
+"""Number of pairs below which no interval is given, since only the mean of many pairs is nearly
+normally distributed."""
 _ROUNDING_RATIO = 1e-9
 """Relative difference below which two values differ only by rounding."""
 NOT_PROVEN = "no significant difference"
@@ -91,8 +91,8 @@ FIGURES = {
     "time_s": ("flight time [s]", "s", 1.0),
     "attempts": ("attempts", "", 1.0),
 }
-"""The figures of a flight, which are better when smaller: fields of `FlightResult`, each with its
-name, its unit, and the number of units in one of SI."""
+"""The figures of a flight, all better when smaller: fields of `FlightResult`, each with its name,
+its display unit, and how many of these units make one SI unit."""
 MISS = ("miss_m",)
 
 

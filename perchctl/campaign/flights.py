@@ -33,7 +33,7 @@ from perchctl.sim import Scenario, draw_scenario
 
 R = TypeVar("R")
 K = TypeVar("K", bound=Hashable)
-"""A seed, or another key of one flight; its text names the flight in messages."""
+"""A seed, or any other key that identifies one flight; its text names the flight in messages."""
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -71,8 +71,8 @@ def run_measured(job: Callable[[], R]) -> R:
 
 
 def _give_back_memory() -> None:
-    """Free a flight's memory at once; its objects refer to each other, so Python would free them
-    late."""
+    """Free a flight's memory at once; its objects refer to each other, so Python would not free
+    them until its next garbage collection."""
     gc.collect()
     if not gc.get_freeze_count():
         # The remaining objects are used by all flights; scanning them each time takes as long as 30
@@ -85,7 +85,7 @@ def fly_seed(
 ) -> FlightResult:
     """Fly one seed of the profile's scenario. Any executor can send this function to a worker.
 
-    `record`: store the images next to the log. A refused flight also gives a result, without a log.
+    `record`: store the images next to the log. A refused flight has a result too, but no log.
     Errors: NotFound, InvalidValue (calibration, log).
     """
 
