@@ -1,8 +1,8 @@
 """The corridor of one vehicle, and exact distances between corridors.
 
-A vehicle flies in three parts: a column over the place where it takes off, a column under its
-target, and the way between them. Seen from above, they form one shape: all points within a radius
-of the straight line from home to target:
+A vehicle's flight has three parts: a column above its take-off position, the path to the target,
+and a column under the target. Seen from above, they form one shape: all points within a radius of
+the straight line from home to target:
 
            .-----------------------------.
           /                               \\

@@ -17,7 +17,8 @@ from typing import Any
 from perchctl.errors import InvalidValue, NotFound, PerchError
 
 PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
-"""A module, dotted if it is in a package; a colon; a name in it."""
+"""Matches a module's name (dotted if the module is in a package), a colon, and a name in that
+module."""
 _PACKAGE = Path(__file__).parent
 
 
@@ -30,7 +31,7 @@ def has_extension_form(text: str, schemes: Collection[str]) -> bool:
 
 
 def is_extension(text: str) -> bool:
-    """True for ``my_module:MyCamera`` if the module exists. Does not load it."""
+    """True for ``my_module:MyCamera`` if the module exists. Does not load the module."""
     if re.match(PATTERN, text) is None:
         return False
     package = re.split("[.:]", text)[0]

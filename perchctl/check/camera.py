@@ -40,7 +40,7 @@ RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 GAP_WARN = 0.4
 """Longest gap between images before the check warns, as a share of `safety.camera_hold_s`."""
 SEEN_WARN = 0.5
-"""Share of the images that must show the target, below which the check warns."""
+"""Share of images that show the target, below which the check warns."""
 LEAST_RATED = 10
 """Number of images below which no rate can be computed."""
 _AGAIN = {
@@ -58,7 +58,7 @@ _RESTART, _NETWORK = (
     "switch the camera off and on again",
     "check the network between this computer and the camera",
 )
-"""Advice for all other kinds of sources."""
+"""Advice for all other kinds of camera sources."""
 _LIGHT = "add light, lengthen the exposure, or take off the lens cap"
 _ADVICE = {
     "frozen": _RESTART,
@@ -79,7 +79,7 @@ def failed_camera_rows(error: PerchError, source: str, profile: Profile) -> list
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
-    """Compare the image size (None: unknown) with that of the calibration."""
+    """Compare the image size (None: unknown) with the size in the calibration."""
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")

@@ -2,15 +2,15 @@
 body, rate, noise and axes. Pure.
 
 Let R_own be the vehicle's attitude as estimated by the vehicle, and R_seen as measured by the
-motion-capture system. Let A be the rotation of the system's world frame, and B that of the rigid
-body's axes; both should be the identity:
+motion-capture system. Let A be the rotation from the vehicle's world frame to the system's, and B
+the rotation from the rigid body's axes to the vehicle's; both should be the identity:
 
     R_seen = A R_own B
 
-Between two times, the vehicle rotates by a rotation vector. If the vehicle measures it as ``w`` in
-its world frame, the system measures ``A w`` in the system's. If the vehicle measures it as ``v`` in
-its body axes, it is ``B^T v`` in those of the rigid body. A and B are therefore found as the
-rotations that align two sets of vectors.
+Take the vehicle's rotation between two times as a rotation vector. If the vehicle measures this
+vector as ``w`` in its own world frame, the system measures ``A w`` in the system's world frame. If
+the vehicle measures the vector as ``v`` in its body axes, it is ``B^T v`` in the rigid body's axes.
+A and B are therefore found as the rotations that align two sets of vectors.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ NOISE_FAIL = 4.0
 """Noise above which the row fails, in units of the `positioning.position_sigma_m` that the vehicle
 assumes."""
 WILD_M = 0.1
-"""Spread above which positions must be in millimetres, m, because no capture is that noisy."""
+"""Spread of a resting body's positions, m, above which the positions must be in millimetres,
+because no motion-capture system is that noisy."""
 
 
 @dataclass(frozen=True)
@@ -212,8 +213,8 @@ HOW_TO_TURN = (
 )
 POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
-"""Range of rotations between two moments: smaller ones are noise, and larger ones have no certain
-axis."""
+"""Range of the rotations between two times that are used: a smaller rotation may be noise, and the
+axis of a larger one is uncertain."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 BODY_STILL_RAD = math.radians(4.0)
 """Rotation up to which the rigid body counts as still, rad. Larger: a moving body counts as
@@ -221,24 +222,24 @@ still."""
 BODY_STILL_M = 0.03
 """Displacement up to which the rigid body counts as still, m."""
 MANY_SHARE = 0.9
-"""Share of the rotations that deviate from one axis by less than `LEAST_STEP_RAD`, above which all
-count as rotations about this axis."""
+"""If at least this share of the rotations deviate from one axis by at most `LEAST_STEP_RAD`, all of
+them count as rotations about this axis."""
 WORLD_TILT_DEG = 25.0
-"""Angle between the motion-capture system's z axis and the vertical above which its world is wrong,
-deg. Larger: a tilted world passes."""
+"""If the angle between the motion-capture system's z axis and the vertical is larger than this, the
+system's world frame is wrong, deg. Larger: a tilted world passes."""
 BODY_WARN_DEG = 5.0
 """Angle between the axes of rigid body and vehicle above which the row warns, deg."""
 BODY_FAIL_DEG = 15.0
-"""Angle above which the row fails, deg. Larger: a body whose axes are rotated passes with a
-warning."""
+"""Angle between the axes of rigid body and vehicle above which the row fails, deg. Larger: a body
+with rotated axes passes with a warning."""
 LEAST_RISE_M = 0.12
 """Least displacement of a lift that shows the vertical direction, m. Larger: a short lift is not
 sufficient."""
 HAND_REACH_M = 5.0
 """Largest possible lift by hand, m. If a body moved further, its positions are in another unit."""
 STRANGER = 0.4
-"""Mean share of a rotation that A and B leave unexplained above which the motion-capture system
-tracks another body."""
+"""If the alignment A and B leaves a larger mean share of a rotation unexplained than this, the
+motion-capture system tracks another body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,8 +268,8 @@ class FrameAlignment:
     """Rotations A and B with R_capture = A R_vehicle B.
 
     Attributes:
-        R_world: A, from the vehicle's world to the motion-capture system's.
-        R_body: B, from the system's body axes to the vehicle's.
+        R_world: A, from the vehicle's world frame to the motion-capture system's.
+        R_body: B, from the rigid body's axes to the vehicle's.
         residual_share: mean share of a rotation that A and B leave unexplained.
     """
 
@@ -395,7 +396,8 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
     """Find what is wrong with the motion-capture system's world frame: it may be tilted or
-    mirrored, or its axes may be swapped. Positions may be in other axes than attitudes."""
+    mirrored, or its axes may be swapped. The system may report positions in other axes than
+    attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
         found, axis = (

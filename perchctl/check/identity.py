@@ -7,9 +7,10 @@ body     the motion capture sees its rigid body at this home
 target   its camera sees its target where it must be as seen from this home
 ```
 
-Each of them is compared with the home, so none can belong to another vehicle. If another vehicle's
-camera would show the same image, or if the target is not in view, perchctl asks the user to cover
-the lens, and identifies the camera whose image goes dark. Nothing is armed, and no motor turns.
+The vehicle, its rigid body and the target in its camera's view are each compared with the home, so
+none of them can belong to another vehicle. If another vehicle's camera would show the same image,
+or if the target is not in view, perchctl asks the user to cover the lens, and identifies the camera
+whose image goes dark. Nothing is armed, and no motor turns.
 """
 
 from __future__ import annotations
@@ -268,7 +269,7 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
 
 
 def _target_place(rehearsal: Rehearsal) -> Point | None:
-    """Return where the target was measured; None if it was not."""
+    """Return where the target was measured; None if it was not measured."""
     places = [place_m[:2] for _, place_m in rehearsal.target_places]
     if not places:
         return None

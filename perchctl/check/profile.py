@@ -117,7 +117,8 @@ def _camera_turn(plan: _Plan) -> Finding:
 
 
 def _standoff(plan: _Plan) -> Finding:
-    """`settled` counts only images with the small marker."""
+    """Check that the small marker is in view at the stand-off, because an ascent only settles while
+    the camera sees that marker."""
     standoff_m = plan.profile.planner.ascend.standoff_m
     shown = f"at {mm_text(standoff_m)} mm below the target the small marker is"
     if sees_small_marker(plan.camera, plan.profile, standoff_m):

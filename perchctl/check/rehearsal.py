@@ -30,7 +30,7 @@ from perchctl.vision import (
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
-"""Number of first frames that are not timed, because libraries are still being loaded."""
+"""Number of frames at the start that are not timed, because libraries are still being loaded."""
 KEPT_FRAMES = 12
 TRACK_SETTLES_S = 0.5
 
@@ -63,8 +63,8 @@ class Rehearsal:
             target.
         silent_s: time without an image at the end.
         target: the final estimate; None if the target was not in view.
-        target_places: time and place of the target, m, in each image that measured it since the
-            vehicle came to rest.
+        target_places: time and position of the target, m, in each image in which it was measured
+            since the vehicle came to rest.
         prints: the comparison of both markers; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
         scheme: the kind of source, such as ``camera``, on which the advice depends.
@@ -90,8 +90,8 @@ class Rehearsal:
 
     @property
     def target_moved_m(self) -> float:
-        """Distance by which the target has moved according to the detections since its track
-        settled; 0 if unknown."""
+        """Distance, m, by which the target has moved since its track settled, according to the
+        detections; 0 if unknown."""
         places = self.target_places
         settled_m = [m for t_s, m in places if t_s - places[0][0] >= TRACK_SETTLES_S]
         return float(np.linalg.norm(settled_m[-1] - settled_m[0])) if settled_m else 0.0
@@ -157,7 +157,7 @@ def rehearse(
             _note(done, frame, senses, prints, work_s, began_s)
         due_s += period_s
         if due_s < clock.now():
-            due_s = clock.now()  # as in the flight loop, missed iterations are not made up for
+            due_s = clock.now()  # as in the flight loop, do not make up for missed iterations
         clock.wait_until(due_s)
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""

@@ -15,11 +15,12 @@ class Verdict(StrEnum):
 
     PASS = "pass"
     WARN = "warn"
-    """Can fly, but not as well as it could."""
+    """The vehicle can fly, but not as well as it could."""
     FAIL = "fail"
-    """Must not fly like this."""
+    """The vehicle must not fly in this state."""
     SKIPPED = "skipped"
-    """Could not be checked; `found` says why. This never counts as a pass."""
+    """The check could not be carried out; `found` says why. A skipped check never counts as
+    passed."""
 
 
 @dataclass(frozen=True)

@@ -89,8 +89,8 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
 def start_if_simulated(
     options: FlyOptions, calibrated: CameraModel, scope: CheckScope, stack: contextlib.ExitStack
 ) -> tuple[str, str, Profile]:
-    """Return the URI, camera source and profile to connect with: those of the options or, until
-    `stack` closes, those of a simulated vehicle that is started."""
+    """Return the URI, camera source and profile to connect with: those in the options, or those of
+    a simulated vehicle, which is started here and runs until `stack` closes."""
     uri, spec, profile = options.uri, options.source, options.profile
     if options.simulated:
         scope.announce("starting the simulated vehicle")
@@ -105,8 +105,8 @@ def start_if_simulated(
 
 
 MocapOrError = CaptureSource | PerchError | None
-"""Return an open motion capture, or why it could not be opened; None if decks measure the
-position."""
+"""An open connection to the motion-capture system, or the error for which it could not be opened;
+None if the profile uses no motion capture."""
 
 
 def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:

@@ -54,7 +54,7 @@ LINK_ADVICE = {
     "udp": "check the network between this computer and the vehicle",
     "sim": "close other programs: the simulated vehicle runs on this computer",
 }
-"""Advice against lost and slow packets, by the scheme of the vehicle's URI."""
+"""Advice if packets are lost or slow, keyed by the scheme of the vehicle's URI."""
 ADDRESS_ADVICE = {
     "radio": "switch the vehicle on; perchctl check --scan lists the vehicles that answer",
     "usb": "plug the vehicle in and switch it on; perchctl check --scan lists the vehicles that "
@@ -77,8 +77,8 @@ def unanswered_row(error: ConnectionFailed, uri: str) -> Row:
 BUSY_ADVICE = "close other programs, or use a faster computer"
 WAKE_PERIOD_S = 0.005
 BUSY_SHARE = 0.5
-"""Share of a packet's delay that this computer's own lateness must explain to be a possible cause
-of it."""
+"""This computer is a possible cause of slow packets if its own lateness is more than this share of
+their delay."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,8 @@ class VehicleStatus:
     `device_type`: the vehicle type reported by the firmware; None if it does not answer.
     `missing_variables`: log variables that the firmware lacks. `round_trips_s`: round-trip times of
     test packets, infinite if lost. `wake_delays_s`: how late a sleeping thread on this computer
-    woke up meanwhile. `telemetry`: newest sample, `age_s` old. `displacement_m`: drift at rest.
+    woke up during these tests. `telemetry`: newest sample, `age_s` old. `displacement_m`: drift at
+    rest.
     `samples`: all samples received, oldest first.
     """
 
@@ -276,7 +277,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not profile.positioning.source.is_deck:
         if not vehicle.position_decks(profile):
             return skipped(BY_FLY)
-        judged = profile.with_({"positioning.by": "deck"})  # positions are sent only by fly
+        judged = profile.with_({"positioning.by": "deck"})  # only fly sends positions
     criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:

@@ -43,7 +43,8 @@ SHOWN = {
     checks.Verdict.SKIPPED: "skip",
 }
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
-"""Exit codes of failing rows; all other failing rows have that of `SafetyAbort`."""
+"""Exit codes by the name of the failing row; any other failing row has the exit code of
+`SafetyAbort`."""
 
 app = new_app()
 
@@ -81,7 +82,7 @@ def check(
 ) -> int:
     """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
-    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl check arms
+    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl arms
     nothing, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not
     answer, 20 if the camera gives no image, and 52 if any other check fails.
     """

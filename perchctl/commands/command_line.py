@@ -45,7 +45,7 @@ _REFUSED: dict[int | None, str] = {
     errno.ENAMETOOLONG: "choose another place",
     errno.ENOTDIR: "choose another place",
 }
-"""Why the operating system refuses a path, and what to do."""
+"""Advice to the user for each error with which the operating system refuses a path."""
 _LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {
@@ -87,8 +87,8 @@ class Group(TyperGroup):
         # For shell completion, do not insert the main subcommand, so that all subcommands are
         # offered.
         if not ctx.resilient_parsing and (not args or args[0] not in named):
-            # A word of letters only is meant as a subcommand; a file or source has other
-            # characters.
+            # A word that consists only of letters must be meant as a subcommand; the name of a file
+            # or source contains other characters.
             word = args[0] if args and args[0].isalpha() and not os.path.exists(args[0]) else ""
             if meant := difflib.get_close_matches(word, self.commands, 1, _CLOSE):
                 raise UsageError(
@@ -261,7 +261,8 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        # Without a path, a full disk is that of stdout; any other refusal may concern a device.
+        # If the error names no path and a disk is full, it is the disk that stdout is written to;
+        # any other refusal may concern a device.
         is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
         if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:

@@ -205,8 +205,8 @@ def _collect_with_person(
 
 
 def _open_capture(profile: profiles.Profile, target_body: str) -> weights.MocapPoses:
-    """Connect to the profile's motion-capture system and return it. Errors: UsageError, and those
-    of connecting."""
+    """Connect to the profile's motion-capture system and return it. Errors: UsageError, and the
+    errors of `open_capture`."""
     if not profile.positioning.source.is_mocap:
         raise UsageError(
             "--truth mocap needs a profile with motion capture, as in "

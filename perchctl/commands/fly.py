@@ -120,7 +120,7 @@ def plan_or_fly(
     options: flights.FlyOptions, *, dry_run: bool, yes: bool, as_json: bool, view: bool
 ) -> int:
     """Show the plan for a flight, or fly it; return the exit code. Errors: UsageError if there is
-    no terminal for the confirmation, and those of the flight."""
+    no terminal for the confirmation, and the errors of the flight."""
     if dry_run:
         refused = plan_problem(options)
         print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))

@@ -63,7 +63,7 @@ def ask(question: str) -> str:
     EOFError at the end of the input."""
     if sys.stdin.isatty() and sys.stdout.isatty():
         with contextlib.suppress(ImportError):
-            import readline  # noqa: F401  its import gives input() the keys of line editing
+            import readline  # noqa: F401  importing it enables line editing in input()
         *above, last = question.rstrip().split("\n")
         if above:
             print("\n".join(above), file=sys.stderr, flush=True)

@@ -124,7 +124,7 @@ MEASURES: dict[str, tuple[str, float]] = {
     "ceiling": ("m", 1.0),
     "safety.fence_radius_m": ("m", 1.0),
 }
-"""The unit in which users answer, and its value in the unit of the key."""
+"""The unit in which users answer, and the factor that converts an answer to the key's unit."""
 EDGES_AND_CEILING = ("front", "left", "ceiling")
 """Questions that are not keys of the profile."""
 BACK = "back"
@@ -134,8 +134,8 @@ OVER_THE_CEILING_M = 0.4
 """Distance of the height limit above the ceiling, so that a drifting estimate does not end a
 flight."""
 FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
-"""The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
-higher and there is room."""
+"""The search climbs to `FAR_SIGHT_M` below the ceiling, or to a height of `LOW_SEARCH_M` if that is
+higher, but no closer to the ceiling than `NEAR_SIGHT_M`."""
 SHOWN_KEYS = (
     "target.large.dictionary",
     "target.large.id",
@@ -155,7 +155,7 @@ HEAD = """\
 """
 
 Answers = dict[str, str]
-"""Texts by question, or by another key of the profile."""
+"""The text of each answer, keyed by question or by another key of the profile."""
 
 
 @command(
@@ -215,8 +215,8 @@ def new(
 
 
 def _with_near_calibration(profile: profiles.Profile, output: Path) -> profiles.Profile:
-    """Return the profile with a relative path to the calibration if that is in the folder of
-    `output` or below it, so that both can be moved together."""
+    """Return the profile with a relative path to the calibration if the calibration file is in the
+    folder of `output` or below it, so that both can be moved together."""
     path, folder = Path(profile.camera.calibration), output.absolute().parent.resolve()
     if not (path.is_absolute() and path.is_relative_to(folder)):
         return profile
@@ -236,7 +236,7 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "left":
         return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
-        with contextlib.suppress(ValueError):  # a large side that is not a number is refused later
+        with contextlib.suppress(ValueError):  # an invalid large side is refused later
             return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
     return QUESTIONS[name]
 

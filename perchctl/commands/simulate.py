@@ -44,8 +44,8 @@ from perchctl.errors import (
 )
 
 CAMPAIGN_SAME_PRESS_S = 0.5
-"""Time after the first Ctrl-C from which a second one counts, s. Presses that are closer together
-count as one."""
+"""Shortest time after the first Ctrl-C at which a second one counts, s. Presses that are closer
+together count as one."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
@@ -324,8 +324,9 @@ def run_campaign(
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
     results, and the error if there is one. `earlier` results are counted as well; `store_result`
-    writes each new one. `find_error` returns an error of the results as a whole, or None. Errors:
-    PerchError if none was flown.
+    writes each new result. `find_error` returns an error that concerns the results as a whole, or
+    None.
+    Errors: PerchError if no flight was flown.
     """
     from perchctl.commands.progress import progress_bar
 

@@ -20,14 +20,14 @@ from perchctl.display.serve import Page
 from perchctl.mission import Phase
 
 EVENTS_SHOWN = 200
-"""Number of event lines on the page. More: larger answers to the browser. Fewer: a page that is
-opened late does not show the beginning of a long flight."""
+"""Number of event lines on the page. Larger: the browser receives more data. Smaller: a page that
+is opened late does not show the beginning of a long flight."""
 PICTURE_TIMEOUT_S = 0.5
 """Timeout for a vehicle's process to deliver an image, s. Longer: a hanging process delays the
 other tiles. Shorter: images are missing if the computer is busy."""
 LARGEST_PICTURE_BYTES = 2_000_000
-"""Largest JPEG, bytes. Larger: invalid data may fill the memory. Smaller: cameras with large images
-show none."""
+"""Largest JPEG, bytes. Larger: invalid data may fill the memory. Smaller: large images are not
+shown."""
 
 
 class FleetPage(Page):

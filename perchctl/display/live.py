@@ -137,7 +137,7 @@ _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
 _OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
 AXES_OF_SIDE = 0.5
-"""Length of the drawn axes, in sides of the large marker."""
+"""Length of the drawn axes, as a multiple of the large marker's side."""
 _DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would overflow
 
 

@@ -25,9 +25,9 @@ finer trace, but larger messages."""
 Past = tuple[float, float | None, float | None]
 """The time of a tick in s, and the target's lateral offset and distance above in m."""
 PERCH_STEPS = [phase.value for phase in tuple(Phase)[:7]]
-"""The paper's seven phases, in the order in which a flight has them."""
+"""The paper's seven phases, in the order in which they are flown."""
 HOVER_STEPS = [*PERCH_STEPS[:5], Phase.HOVER.value]
-"""The phases of a mission that hovers, in their order."""
+"""The phases of a hover mission, in the order in which they are flown."""
 
 
 class FlightPage:

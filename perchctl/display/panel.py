@@ -113,7 +113,7 @@ class FlightPanel(TerminalDisplay):
     name = "the panel"
     problem: str | None = None
     help: tuple[str, str] = ("", "")
-    """Sentences in the panel's frame, at most 60 columns each: below, and above."""
+    """Sentences in the panel's lower and upper border, at most 60 columns each."""
 
     def __init__(self, stream: TextIO) -> None:
         self._tick: Tick | None = None

@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 READS_S, LAST_READ_S = 2.5, 1.0
-"""If a browser has polled within the first time, s, it gets the second time, s, to read the final
-state before the page closes."""
+"""If a browser has polled in the last `READS_S` seconds, it gets `LAST_READ_S` seconds to read the
+final state before the page closes."""
 
 
 class Page:
@@ -28,8 +28,8 @@ class Page:
 
     Args:
         title: heading of the page.
-        orders: the function that each button calls, keyed by the button's name, in a thread of the
-            page. ``land`` and ``cut`` concern all vehicles; if both are None, there are no buttons.
+        orders: the functions that the buttons call in a thread of the page, keyed by the button's
+            name. ``land`` and ``cut`` concern all vehicles; if both are None, there are no buttons.
 
     `url` contains the token that the buttons need.
     """
@@ -37,7 +37,7 @@ class Page:
     HTML: ClassVar[str]
     """The page's file, with placeholders for the style and script that all pages share."""
     HAS_STREAM: ClassVar[bool] = False
-    """True if `jpeg_after` gives images."""
+    """True if the page streams images, which `jpeg_after` returns."""
 
     def __init__(
         self,
@@ -120,8 +120,8 @@ class Page:
         }
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image with this name as a JPEG; None if there is currently none. May wait a
-        second."""
+        """The newest image with this name as a JPEG; None if there is currently none. The call may
+        block for a second."""
         return None
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
@@ -130,7 +130,7 @@ class Page:
         return None
 
     def has_button(self, name: str) -> bool:
-        """True if the page may have a button of this name."""
+        """True if the page may have a button with this name."""
         return name in self._orders
 
     def may_order(self, token: str) -> bool:
@@ -161,11 +161,11 @@ class Page:
         self._thread.join(2.0)
 
 
-# --- HTTP of the live page: only on loopback, and only under the names of loopback ---
+# --- HTTP server of the live page: only on the loopback interface, and only under its names ---
 # A website open in the same browser can also send requests to 127.0.0.1. Therefore the Host header
 # must name this machine (a rebound DNS name does not), and a button needs the token from the
 # printed address, in a header that a foreign site cannot send. No response header permits a foreign
-# site to read the answers.
+# site to read the responses.
 
 
 HOSTS = ("127.0.0.1", "localhost", "::1")

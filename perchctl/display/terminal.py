@@ -23,7 +23,8 @@ PANEL_PERIOD_S = 0.1
 PANEL_CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
 PANEL_COLUMNS = 78
-"""Columns, of 80: a terminal echoes ^C after the panel, which must not wrap."""
+"""Width of a panel, in columns, on a terminal of 80: the terminal echoes ^C after the panel, and
+this line must not wrap."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 
