@@ -10,7 +10,7 @@ import cv2
 
 _LOCK = threading.Lock()
 _users = 0  # number of current users of `one_thread`
-_threads = 0  # number of OpenCV's threads before the first of them
+_threads = 0  # number of OpenCV's threads before the first user
 
 
 @contextlib.contextmanager

@@ -30,7 +30,8 @@ class _Loader(yaml.SafeLoader):
         try:
             return super().construct_object(node, deep)
         except (ValueError, LookupError, AttributeError) as error:
-            # PyYAML converts a scalar unchecked: a date without a month, `!!bool 7`.
+            # PyYAML does not check scalars before it converts them: a date without a month, `!!bool
+            # 7`.
             if not isinstance(node, yaml.ScalarNode):
                 raise
             kind = node.tag.rpartition(":")[2]

@@ -18,7 +18,7 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 def render_template(package: str, name: str, **values: Any) -> Markup:
     """Render a template from the package's folder `templates`.
 
-    A template of a whole page extends ``report.html``, which brings the style sheet and `POLICY`.
+    A template of a whole page extends ``report.html``, which provides the style sheet and `POLICY`.
     Text in `values` is escaped. Raises jinja2.UndefinedError if a value is missing.
     """
     template = _environment(package).get_template(name)

@@ -16,8 +16,8 @@ else:
 
     class cached_property(functools.cached_property):
         """A `functools.cached_property` without the lock that Python 3.11 takes for each value,
-        which costs more than most of the values. Two threads may both compute a value, with the
-        same result."""
+        which takes longer than computing most of the values. Two threads may both compute a value,
+        with the same result."""
 
         def __get__(self, instance: Any, owner: type | None = None) -> Any:
             if instance is None:
@@ -26,7 +26,7 @@ else:
             return value
 
     _NAMES: dict[type, tuple[str, ...]] = {}
-    """Names of the fields of each class; empty if its own `__init__` has to build it."""
+    """Names of a class's fields; empty if the class has to be built by its own `__init__`."""
 
     def replace(value: Any, /, **changes: Any) -> Any:
         """Return a copy of the dataclass with these changes, like `dataclasses.replace`. For a

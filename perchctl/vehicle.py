@@ -37,10 +37,10 @@ class Telemetry:
 
     `t_s` is on the loop's clock; `thrust` is the commanded thrust, 0..65535; `acc_x_g`, `acc_y_g`
     and `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
-    `behind_s` is how much older than `t_s` position and velocity are, which arrive in a separate
-    packet; `battery_behind_s` and `variance_behind_s` are the same for battery and variances, and
-    infinite before their first packet. `start` is how often the vehicle has restarted since its
-    first packet arrived.
+    `behind_s` is how much older than `t_s` the position and velocity are, which arrive in a
+    separate packet; `battery_behind_s` and `variance_behind_s` are the same for the battery and the
+    variances, and infinite before their first packet. `start` is how often the vehicle has
+    restarted since its first packet arrived.
 
     The variances are those reported by the vehicle's estimator; None if it reports none. With a
     deck that only measures the speed over ground, as a Flow deck does, nothing measures the
@@ -48,8 +48,8 @@ class Telemetry:
     "Variances"); only `height_variance_m2` is meaningful then.
 
     `motor_duty` is the duty cycle of M1 (front right), M2 (back right), M3 (back left) and M4
-    (front left), 0..65535, as old as the battery; None if the vehicle does not report it. No
-    decision in a flight depends on it.
+    (front left), 0..65535, as old as the battery reading; None if the vehicle does not report it.
+    No decision in a flight depends on it.
     """
 
     t_s: float

@@ -552,7 +552,7 @@ FAULTS: tuple[Fault, ...] = (
 )
 
 NO_FAULT = Fault("none", "no fault", (), ())
-"""The effects in a flight without a fault, in a campaign in which other flights have faults."""
+"""Stands for no fault in a flight of a campaign in which other flights have faults."""
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 
@@ -560,8 +560,8 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 class Case:
     """One fault in one flight: its `effects` begin `moment_s` seconds into `phase`.
 
-    To reach the phase LANDING, the operator lands `landed_after_s` seconds into the phase
-    `landed_from`. To reach RECOVER, the magnet holds only the share `first_hold_ratio` of the
+    To reach the phase LANDING, the operator commands a landing `landed_after_s` seconds into the
+    phase `landed_from`. To reach RECOVER, the magnet holds only the share `first_hold_ratio` of the
     weight at the first contact.
     """
 

@@ -90,14 +90,16 @@ SNOW_STREAM = 512
 INJECTED_SNOW_SIGMA = 60.0
 DARK_GAIN = 0.06
 SHEET_SIGMA = 6.0
-"""The camera's own noise."""
+"""Standard deviation of the noise, in grey levels, while a sheet covers the target: the camera's
+own noise."""
 LOST = 0.2
 
 
 @dataclass(frozen=True)
 class CameraFault:
     """A camera fault that lasts for `for_s`. `kind`: silent, frozen, snow, dark, covered, lossy,
-    out-of-order, mirrored, late (by `late_s`), or sooner (by `late_s` than the profile expects)."""
+    out-of-order, mirrored, late (by `late_s`), or sooner (than the profile expects, by
+    `late_s`)."""
 
     kind: str
     for_s: float
@@ -222,7 +224,7 @@ class FaultyClock:
 
     def now(self) -> float:
         if self.killed_s is not None:
-            raise ProgramKilled  # it can no longer rescue the vehicle or report anything
+            raise ProgramKilled  # a killed program cannot rescue the vehicle or report
         return self._link.now_s
 
     def wait_until(self, t_s: float) -> None:

@@ -251,7 +251,7 @@ OF_THE_SCENARIO = (magnet_holds, room)
 
 
 def apply_to_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """Return the scenario with those of the `effects` applied that last from the start of the
+    """Return the scenario after applying those of the `effects` that act from the start of the
     flight."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:

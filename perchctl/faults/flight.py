@@ -58,7 +58,7 @@ AFTER_PROGRAM_END_S = 6.0
 """Time for which the vehicle is watched after the program has ended, s. Smaller: a later fall is
 missed."""
 AFTER_IN_THE_AIR_S = 10.0
-"""The same for a vehicle that is still in the air when the program ends, s."""
+"""Time for which a vehicle is watched if it is still in the air when the program ends, s."""
 LONGEST_FLIGHT_S = 240.0
 END_OF = {
     Phase.PERCHED: "perched",
@@ -66,7 +66,8 @@ END_OF = {
     Phase.ABORTED: "aborted",
 }
 PROBE = Packet(Port.LINK, 0, b"")
-"""A packet without effect, which arrives whenever any packet would."""
+"""A packet without effect that probes the radio: it arrives whenever any other packet would
+arrive."""
 
 
 class FaultyFlight:
@@ -76,7 +77,7 @@ class FaultyFlight:
 
     Args:
         on_sample: called with the vehicle's time every `e.SAMPLE_S` of the flight, after the oracle
-            has been updated. The flights of a fleet wait for each other in it.
+            has been updated. In a fleet, the flights wait for each other in this function.
         others: (name, position m) of each other rigid body that the motion-capture system tracks;
             None: as drawn from the seed.
     """

@@ -33,7 +33,7 @@ FLAGS: dict[Flag, str] = {
 """The flags and their meanings, the most serious first."""
 
 LEAST_FALL_HEIGHT_M = 0.1
-"""Below this height nothing counts as a fall."""
+"""Height up to which no motion counts as a fall, m."""
 OFF_S = 0.1
 WEIGHTLESS_G = 0.2
 """Specific force below which a vehicle falls freely. Larger: a descent with little thrust counts as
@@ -43,38 +43,41 @@ WEIGHTLESS_S = 0.15
 TOUCHDOWN_MPS, TOUCHDOWN_ASIDE_MPS = 0.8, 0.5
 UNPOWERED_G = 0.5
 FAST_MPS = 0.45
-"""Sink rate above any that is commanded, m/s: the vehicle falls until it is slower again."""
+"""Sink rate above which the vehicle counts as falling until it is slower again, m/s; no commanded
+descent is this fast."""
 FALL_CAUGHT_MPS = 0.05
-"""Sink rate below which a fall is over at once."""
+"""Sink rate below which a fall is over at once, m/s."""
 SLOW_AGAIN_S = 0.3
-"""Time below `FAST_MPS` that also ends a fall, s. Larger: the descent that follows counts as a part
-of the fall."""
+"""A fall also ends once the sink rate has been below `FAST_MPS` for this time, s. Larger: the
+descent that follows counts as a part of the fall."""
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
-"""A vehicle that bounces off the ceiling for less than `RELEASED_S` still presses."""
+"""A vehicle that bounces off the ceiling for less than `RELEASED_S` still counts as pressing."""
 ASTRAY_M, TOO_HIGH_M = 1.0, 0.3
 ALONE_S = 5.0
 TILT_WITHIN_DEG = 10.0
-"""A claim of excess tilt is accepted from this much below the limit."""
+"""A claim of excess tilt is accepted if the tilt came at least this close to the limit."""
 CLAIM_S = 0.5
 """Time within which a claim must become true, s. Motors are cut 25 ms after the command."""
 SAY_OFF: frozenset[Claim] = frozenset(
     {"held off the target", "hangs", "stands", "hangs or stands", "motors off"}
 )
 SEEN_S = 6.0
-"""Time for which the telemetry of a vehicle at rest must arrive before the program must have
-noticed it, s."""
+"""Once telemetry of a vehicle at rest has arrived for this time, s, the program must have noticed
+that the vehicle is at rest."""
 STOP_S = 0.5
-"""Time after the command to cut the motors at which they must be off, s."""
+"""Time after the command to cut the motors within which they must be off, s."""
 SECOND_PRESS_S = 0.3
-"""A second press counts from this long after the first (docs/safety.md)."""
+"""A second press only counts if it comes at least this long after the first, s (docs/safety.md)."""
 KEY_HELD_S = 1.0
-"""A key that repeats is one press until this long after the first."""
+"""The presses of a repeating key count as one press until this long after the first, s."""
 REPEAT_WITHIN_S = 0.23
-"""A second press does not count if another follows within this time, as a key repeats."""
+"""A second press does not count if a third follows within this time, s, as it does when a key
+repeats."""
 REPEAT_SPREAD_S = 0.021
 """Largest difference between the intervals of a key that repeats, s: the simulated clock delivers a
-press up to 10 ms early or late. Larger: a hand counts as a key, and its stop need not be obeyed."""
+press up to 10 ms early or late. Larger: presses by hand are taken for a repeating key, and the stop
+that they command need not be obeyed."""
 
 
 class Sample(NamedTuple):
@@ -390,10 +393,10 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
     Outcome.EMERGENCY: {"motors off"},
     Outcome.ENDED_BY_OPERATOR: {"hangs or stands"},
 }
-"""The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
+"""The claims implied by the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
-"""The transitions that end a flight without knowing whether the vehicle hangs or stands, or whether
-it came down at all."""
+"""Two transitions that end a flight while perchctl does not know whether the vehicle hangs or
+stands, or whether it came down at all."""
 RESCUE_CLAIMS: dict[RestState, Claims] = {
     RestState.STANDS: {"stands"},
     RestState.HANGS: {"hangs"},
@@ -401,7 +404,7 @@ RESCUE_CLAIMS: dict[RestState, Claims] = {
     RestState.UNKNOWN: {"hangs or stands"},
     RestState.END_UNCONFIRMED: {"not seen down"},
 }
-"""The claims in the note of a rescue, by its finding."""
+"""The claims in a rescue's note, keyed by what the rescue found."""
 REFUSAL_CLAIMS: Claims = {"stands"}
 """A refusal claims that no motor has started."""
 

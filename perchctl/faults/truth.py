@@ -28,7 +28,7 @@ from perchctl.vision import CameraModel
 MAX_RAW_THRUST = 60000.0
 """The largest raw thrust that is commanded (docs/firmware.md, "Raw thrust")."""
 PRESSING_WEIGHT_RATIO = 1.02
-"""Share of the weight that the rotors must lift to press against the ceiling or the floor."""
+"""Multiple of the weight that the rotors must lift to press against the ceiling or the floor."""
 
 
 class WatchedVehicle(SimulatedVehicle):
@@ -93,14 +93,15 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
 
 
 LEAST_LIFT = 1.02
-"""The ratio of lift to weight that keeps a vehicle in the air."""
+"""Smallest ratio of lift to weight that keeps a vehicle in the air."""
 CUT_S = 1.9
 """Silence above which the firmware cuts the motors, s (2.0 s after the last setpoint)."""
 LOCKS_S = 0.1
-"""Time after the cut at which the lock shows, s. Packets that arrive meanwhile prevent nothing."""
+"""Time from the cut until the lock shows, s. Packets that arrive in this time cannot prevent the
+lock."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
-"""Time within which motors that stood still have not regained control, s, and the tilt at which the
-vehicle has turned over meanwhile, as the z component of its body's z axis."""
+"""Time within which stopped motors cannot have regained control, s, and the tilt beyond which the
+vehicle has turned over in this time, as the z component of its body's z axis."""
 WATCH_WITHIN_S = 0.1
 """Longest delay until the telemetry shows that a vehicle hangs, s."""
 
@@ -227,7 +228,7 @@ class FactsRecorder(Facts):
 
 
 Place = tuple[float, float]
-"""On the floor, world axes, m."""
+"""A position on the floor (x, y) in world axes, m."""
 
 UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE, Phase.HOVER})
 STEERED_BY_TARGET = UNDER_TARGET | {Phase.ESTIMATE, Phase.ALIGN}
@@ -241,26 +242,27 @@ seen."""
 NO_SIGHT = (*NO_PICTURE, "covered")
 NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
-"""If a loss ends this soon after its limit, it is acceptable that the vehicle kept waiting, s."""
+"""If a loss ends within this time after its limit, the vehicle need not have landed, s."""
 REACTION_S = 1.0
 """Longest time from the profile's limit to the descent, s: the delay of one loop iteration, and the
 time for the thrust to decrease."""
 WATCHED_S, SUNK_M = 2.0, 0.15
-"""Time after that, s, and the height that the vehicle must have lost by then, m, at less than a
-third of the landing speed."""
+"""Time after `REACTION_S`, s, and the height that the vehicle must have lost by then, m, which
+takes less than a third of the landing speed."""
 COMING_DOWN_MPS = 0.1
-"""Sink rate at which the vehicle also counts as coming down, m/s."""
+"""Sink rate above which the vehicle counts as coming down in any case, m/s."""
 HANDED_OVER_M = 0.3
 """Height at which a landing is handed over to the firmware and slows down, m."""
 
 
 class PositionBound:
-    """The horizontal region in which the vehicle must be in each phase. During take-off, that is
-    its start (or `planner.approach_xy_m`); during search, estimate, alignment and recovery, the
+    """The horizontal region in which the vehicle must be in each phase. During take-off, the region
+    is the start (or `planner.approach_xy_m`); during search, estimate, alignment and recovery, the
     line between start and target; during ascent, press and completion, the place under a target.
-    From the beginning of a landing on, the region is the one at that time.
+    From the beginning of a landing on, it is the point of the region that was nearest to the
+    vehicle at that time.
 
-    A target that looks like the vehicle's own counts as well.
+    A target that looks like the vehicle's own also counts as a target.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:

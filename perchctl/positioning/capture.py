@@ -27,16 +27,17 @@ from perchctl.positioning.feed import BodyPose, CaptureFrame, CaptureSource, Pos
 from perchctl.profile import PositioningConfig
 
 CAPTURE_SILENT_S = 0.3
-"""Time without a frame that is a problem, s."""
+"""Time without a frame after which the system counts as silent, s."""
 LATE_S = 0.5
-"""Time after a burst of late frames during which it explains why no frame is used, s."""
+"""Time after a burst of late frames during which the burst is reported as the reason why no frame
+is used, s."""
 KEPT = 64
 """Largest number of frames that wait to be read; older ones are dropped."""
 LONGEST_LINE = 300
 """Largest number of bytes read from one line of the child's output."""
 UP_TIMEOUT_S = 15.0
-"""Timeout for the start of the child's Python, s. It is separate so that a slow computer is not
-mistaken for a silent motion capture."""
+"""Timeout for the start of the child's Python, s. The start has a timeout of its own, so that a
+slow computer is not mistaken for a silent motion-capture system."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
 CAPTURE_PROGRAM = "from perchctl.positioning.capture import serve_parent; serve_parent()"

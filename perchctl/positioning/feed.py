@@ -266,7 +266,8 @@ STALE_FRAME_S = 0.05
 UNIT_WITHIN = 0.01
 """Tolerance of a quaternion's length; single precision is accurate to 1e-6."""
 NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)
-"""Largest change of a pose between two frames without motion of the body."""
+"""Largest change of a pose between two frames that measurement noise may cause without any
+motion."""
 FASTEST_FALL_MPS = 5.0
 """Largest plausible speed just after an accepted pose, m/s: that of a fall from 1.3 m. Smaller: the
 positions of a falling vehicle are rejected."""
@@ -277,8 +278,8 @@ AT_FASTEST_S = 0.02
 """Time after an accepted pose from which `HELD_MPS` and `HELD_RADPS` apply instead, s. Larger: a
 pose that jumped is accepted."""
 HELD_MPS, HELD_RADPS = 0.5, 1.0
-"""Largest plausible speed, m/s, and rotation rate, rad/s, from then on: without positions, the
-vehicle holds its position and drifts."""
+"""Largest plausible speed, m/s, and rotation rate, rad/s, more than `AT_FASTEST_S` after an
+accepted pose: without positions, the vehicle holds its position and drifts."""
 
 
 @dataclass(frozen=True, eq=False)

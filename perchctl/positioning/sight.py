@@ -48,10 +48,11 @@ LEARN_NEAR_M = 0.3
 """Distance to the target below which the difference between estimate and sightings is learned with
 the time constant `LEARN_NEAR_S`, m."""
 LEARN_FAR_M = 1.0
-"""Distance above which it is learned with `LEARN_FAR_S`, m: more slowly, because a pixel is a
-larger distance."""
+"""Distance to the target above which this difference is learned with `LEARN_FAR_S`, m: more slowly,
+because a pixel covers a larger distance."""
 LEARN_NEAR_S = 0.3
-"""Time constant near the target, s. Smaller: the result follows the noise of single sightings."""
+"""Time constant near the target, s. Smaller: the learned difference follows the noise of single
+sightings."""
 LEARN_FAR_S = 1.0
 """Time constant far from the target, s. Larger: a change of the difference is learned later."""
 NOWHERE = Place(np.zeros(3), 0.0)

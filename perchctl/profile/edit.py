@@ -149,7 +149,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
                 raise ValueError(f"{section} has no keys and values")
         old = place.get(key)
         if isinstance(old, list) and isinstance(value, tuple) and len(old) == len(value):
-            for index, number in enumerate(new):  # one by one, so that their comments are kept
+            for index, number in enumerate(new):  # one by one, to keep their comments
                 old[index] = number
         else:
             place[key] = new
@@ -157,7 +157,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     stream = io.StringIO()
     yaml.dump(document, stream)
     written = stream.getvalue()
-    if _values_of(written) != wanted:  # also if another key refers to an anchor
+    if _values_of(written) != wanted:  # differs, for example, if another key refers to an anchor
         raise ValueError("the values cannot be written into this file's layout")
     return written
 

@@ -100,7 +100,7 @@ _DOUBTFUL = {
     },
     "battery limits": {
         "safety.min_load_v < safety.min_rest_v": "the vehicle would land as soon as it takes off",
-        # 3.7 V is what a full battery still gives while a light vehicle hovers (docs/firmware.md,
+        # A full battery still delivers 3.7 V while a light vehicle hovers (docs/firmware.md,
         # "Thrust to PWM").
         "safety.min_load_v < 3.7": (
             "hovering lowers even a full battery to this voltage, so the vehicle would land as "

@@ -1,4 +1,4 @@
-"""The profile's keys for the mission: the seven phases, the two ways down, and safety."""
+"""The profile's keys for the mission: the seven phases, recovery, landing, hover, and safety."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class PerchConfig(Section):
     thrust: int = key(60000, "thrust with `mode: raw`", ge=1000, le=65535)
     press_m: ClassVar[float] = 0.25  # distance of the setpoint above the contact
     climb_mps: ClassVar[float] = 0.2
-    """Speed at which the setpoint rises into the press, m/s."""
+    """Speed at which the setpoint rises during the press, m/s."""
     contact_dwell_s: float = key(0.25, "time for which the contact must persist", gt=0, lt=3)
     contact_z_m: float = key(
         0.05, "maximum vertical distance to the target to count as contact", gt=0, le=0.3
@@ -138,10 +138,11 @@ class PerchConfig(Section):
 class CompleteConfig(Section):
     """Phase 7. The thrust is released in two stages, before the motors stop.
 
-    First by lowered position setpoints, `steps` in `release_s`: the magnet must hold for
-    `hold_dwell_s` with the thrust below `hold_ratio` of the hover thrust. Then by raw thrust,
-    in `ramp_s` down to standing motors while setpoints continue: the whole weight must hang
-    for `hang_s`. The vehicle is monitored for `watch_s` after the stop.
+    In the first stage, the position setpoint is lowered in `steps` steps within `release_s`; the
+    magnet must hold for `hold_dwell_s` with the thrust below `hold_ratio` of the hover thrust. In
+    the second stage, setpoints of raw thrust decrease to zero within `ramp_s`, until the motors
+    stand still; the whole weight must then hang for `hang_s`. The vehicle is monitored for
+    `watch_s` after the motors have been stopped.
     """
 
     steps: ClassVar[int] = 5
@@ -200,9 +201,9 @@ takes over."""
 
 
 class LandingConfig(Section):
-    """A landing by position setpoints at `speed_mps` to `handover_m`, then by the firmware, whose
-    goal is `undershoot_m` plus `drift_mps` times the flight's time below the estimated ground,
-    so that the vehicle reaches the floor in spite of drift."""
+    """A landing by position setpoints at `speed_mps` down to `handover_m`, and then by the
+    firmware. The firmware aims below the estimated ground, by `undershoot_m` plus `drift_mps` times
+    the flight's duration, so that the vehicle reaches the floor in spite of drift."""
 
     speed_mps: float = key(0.3, "descent speed during landing", gt=0, le=1)
     handover_m: float = key(
@@ -248,7 +249,7 @@ class PlannerConfig(Section):
     )
     integral_per_s: float = key(0.4, "integral gain of the horizontal control", ge=0, le=5)
     integral_limit_m: ClassVar[float] = 0.08
-    """Limit of that integral while the vehicle moves."""
+    """Limit of the horizontal control's integral while the vehicle moves, m."""
 
 
 class CorridorConfig(Section):

@@ -69,19 +69,19 @@ class PositionSource(Enum):
 
 
 _SOURCES = {source.value: source for source in PositionSource}
-"""Sources by name. This is read in each tick, and `PositionSource(name)` would take ten times as
+"""Sources by name. Every tick looks one up, and `PositionSource(name)` would take ten times as
 long."""
 
 
 class PositioningConfig(Section):
     """The source of the vehicle's position.
 
-    `deck`: its own decks. `mocap`: a motion-capture system measures a rigid body on the vehicle,
-    and perchctl sends its position to the vehicle. `target`: perchctl sends the position that the
-    camera measures from the printed target.
+    `deck`: the vehicle's own decks measure it. `mocap`: a motion-capture system measures a rigid
+    body on the vehicle, and perchctl sends its position to the vehicle. `target`: perchctl sends
+    the position that the camera measures from the printed target.
 
-    The body's frame, as the system defines it, is turned by `body_rpy_deg` and lies at
-    `body_position_m`, both in the vehicle's body axes.
+    The rigid body's frame, as the system defines it, is rotated by `body_rpy_deg` and has its
+    origin at `body_position_m`, both in the vehicle's body axes.
     """
 
     by: Literal["deck", "mocap", "target"] = key("deck", "source of the vehicle's position")

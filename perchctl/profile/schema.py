@@ -1,7 +1,7 @@
 """The profile as a whole: every key, its unit, its default and its bounds.
 
 Profiles are checked here and nowhere else; `perchctl.profile.load` reads them from their files.
-`perchctl.profile.vision`, `perchctl.profile.mission` and `perchctl.profile.simulation` hold the
+`perchctl.profile.vision`, `perchctl.profile.mission` and `perchctl.profile.simulation` contain the
 larger sections.
 """
 

@@ -79,7 +79,7 @@ class SimulationConfig(Section):
         0.0, "maximum accelerometer bias on each horizontal axis, if there is no deck", ge=0, le=0.2
     )
     draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
-    magnet_force_n: ClassVar[float] = 1.2  # what the magnet holds, as a multiple of the weight
+    magnet_force_n: ClassVar[float] = 1.2  # holding force as a multiple of the weight
     first_contact_fails: float = key(
         0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )
@@ -97,9 +97,10 @@ class SimulationConfig(Section):
         None, "ids of the neighbours' large and small markers; none: those of the vehicle's target"
     )
     camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
-    """Number of frames lost in succession."""
+    """Range of the time at which the burst of lost frames begins, s."""
     first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
-    """Share of the weight that a first contact carries if it does not hold."""
+    """Range of the magnet's holding force at a first contact that fails, as a share of the
+    weight."""
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained when the rotors are at the ceiling"
     )

@@ -63,10 +63,9 @@ def check_marker_id(dictionary: str, marker_id: int) -> None:
 class Mounting(Section):
     """The camera's mounting: its position in body axes and its rotation from them.
 
-    With ``rpy_deg: [0, 0, 0]`` the camera looks up, the image's right is the
-    vehicle's forward and the image's bottom its left. `rpy_deg` are rotations
-    about body x, y, z (``Rz Ry Rx``, right-handed): ``[0, 0, 90]`` turns the
-    image's right to the vehicle's left.
+    With ``rpy_deg: [0, 0, 0]`` the camera looks up, the right of the image is the vehicle's front,
+    and the bottom of the image is its left. `rpy_deg` are rotations about body x, y, z (``Rz Ry
+    Rx``, right-handed): ``[0, 0, 90]`` turns the right of the image to the vehicle's left.
     """
 
     position_m: BodyVector3 = key(
@@ -81,8 +80,8 @@ class Mounting(Section):
     @field_validator("rpy_deg")
     @classmethod
     def _in_degrees(cls, rpy_deg: Vector3) -> Vector3:
-        """Reject angles that are probably in radians, because all would then be multiples of 45
-        deg."""
+        """Reject angles that are probably in radians: in radians, all of them would be multiples of
+        45 deg."""
         turned = [(angle, _eighths(abs(angle))) for angle in rpy_deg if angle]
         if turned and all(eighths for _, eighths in turned):
             angle, eighths = turned[0]
@@ -113,8 +112,8 @@ START_LATENCY_S = 0.1
 """Latency at the start of a flight that measures it, s. It is the middle of the usable range, so
 until the flight knows more, images are at most 0.1 s newer or older than assumed."""
 USED_LATENCY_S = (0.02, 0.2)
-"""Latencies that such a flight uses, s. No camera is faster, and later images are useless for
-control."""
+"""Range of latencies that a flight may use if it measures its latency, s. No camera is faster, and
+later images are useless for control."""
 
 
 class CameraConfig(Section):
@@ -206,9 +205,10 @@ _InARoom = Annotated[float, Field(ge=-FARTHEST_IN_A_ROOM_M, le=FARTHEST_IN_A_ROO
 class TargetConfig(Section):
     """The printed target, and standard deviations of the print.
 
-    `size_sigma`: common relative error of all printed sizes; printers err by some 0.3 %, so it
-    is 0.5 % until they are measured. `curl_per_m`: a point at r from the sheet's centre is off
-    its plane by this times r^2, the corners of a 150 mm marker by 0.3 mm.
+    `size_sigma`: common relative error of all printed sizes; printers err by about 0.3 %, so it is
+    0.5 % until the printed sizes are measured. `curl_per_m`: a point at distance r from the sheet's
+    centre is out of the sheet's plane by `curl_per_m` times r^2; for the corners of a 150 mm
+    marker, this is 0.3 mm.
     """
 
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
@@ -303,12 +303,12 @@ class PoseConfig(Section):
 class KalmanConfig(Section):
     """The paper's filter, and its noise.
 
-    `noise`: ``fixed`` takes k1 for every measurement and k2 for every step, as the paper does:
-    variances in cm^2 and deg^2, as its error vector is in centimetres and degrees.
-    ``measured`` takes each pose's own covariance, and accelerations as process noise: in
-    the level frame `acceleration_mps2` of the camera or target and `turn_radps2` of the
-    camera's attitude and heading, in the world `drift_mps2` of the state estimate. A constant
-    error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens the estimate's spread.
+    `noise`: ``fixed`` uses the variances k1 for every measurement and k2 for every step, as the
+    paper does; they are in cm^2 and deg^2, because the paper's error vector is in centimetres and
+    degrees. ``measured`` uses each pose's own covariance, and accelerations as process noise: in
+    the level frame, `acceleration_mps2` of the camera or target and `turn_radps2` of the camera's
+    attitude and heading; in the world frame, `drift_mps2` of the state estimate. A constant error
+    of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens the estimate's spread.
 
     `drift_mps`: largest drift of the state estimate. The target stands still, so while it is not
     measured, it moves in the world of the state estimate only by this drift.

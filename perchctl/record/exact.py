@@ -269,10 +269,10 @@ def encode_line(record: Mapping[str, Any]) -> bytes:
 _ENCODER = json.JSONEncoder(
     ensure_ascii=False,
     allow_nan=False,
-    check_circular=False,  # not needed: the conversion fails for a value that contains itself
+    check_circular=False,  # cycles already fail in the conversion to JSON types
     separators=(",", ":"),
 )
-"""Created once, because `json.dumps` would create one for each line."""
+"""The encoder of all lines; `json.dumps` would create a new one for each line."""
 
 
 def json_line(values: Mapping[str, Any]) -> bytes:

@@ -1,8 +1,8 @@
 """The keys that one tick of the loop writes to the flight log, with their units and meanings.
 
 The record is flat, and each key ends with its unit. Values are in SI units and radians, in the
-frames of `perchctl.geometry`. A missing value is None; it is left out of the file and None again
-when the file is read. `FIELDS` is copied into the header of each log, so that a log explains
+frames of `perchctl.geometry`. A missing value is None: it is left out of the file, and is None
+again when the file is read. `FIELDS` is copied into the header of each log, so that a log explains
 itself.
 """
 

@@ -17,7 +17,7 @@ CLASS_KEYS: dict[str, str] = {
     "TickInputs": "TurnInputs",
     "TickRecord": "Turn",
 }
-"""The name of a dataclass in the log's ``turn_fields``, by its name in the program."""
+"""The name of a dataclass in the log's ``turn_fields``, keyed by its name in the program."""
 FIELD_KEYS: dict[str, dict[str, str]] = {
     "CameraImuMismatch": {
         "camera_latency_error_s": "later_s",
@@ -130,13 +130,14 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "acceleration_bias_world_xy_mps2": "bias_mps2",
     },
 }
-"""The key of a field in the log, by the names of the dataclass and the field in the program."""
+"""The key of a field in the log, looked up by the names of the dataclass and of the field in the
+program."""
 
 
 @dataclass(frozen=True)
 class LogNames:
-    """The names of a dataclass in a log: that of the class, and for the name of each field in the
-    program, its key in the log."""
+    """The names that a log uses for a dataclass: the name of the class, and each field's key, keyed
+    by the field's name in the program."""
 
     owner: str
     keys: dict[str, str]

@@ -1,8 +1,8 @@
 """Build the messages in a flight's recording from the records of its log.
 
-They are Foxglove's protobuf messages, as defined in Foxglove's package. Values for which Foxglove
-has no message are JSON. Frames: `world` (that of the state estimate), `body`, `gear`, `camera`
-(OpenCV's axes, which Foxglove also uses), `target` and `setpoint`.
+The messages are Foxglove's protobuf messages, as defined in Foxglove's package. Values for which
+Foxglove has no message are JSON. Frames: `world` (that of the state estimate), `body`, `gear`,
+`camera` (OpenCV's axes, which Foxglove also uses), `target` and `setpoint`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TICK = "/tick"
 
 NS = 1_000_000_000
 PNG_LEVEL = 1
-"""A fast compression level. The next levels take twice the time and save 5 % of the size."""
+"""A fast compression level. The next higher levels take twice the time and save 5 % of the size."""
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")

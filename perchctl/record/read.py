@@ -59,7 +59,7 @@ class PhaseSpan:
         reason: why the phase was entered.
         row: the row of the mission's transition table that led to the phase.
         severity: severity in the log's event.
-        simulated: the event in the simulated scenario that led to the phase. Empty texts if
+        simulated: the event in the simulated scenario that led to the phase. The texts are empty if
             unknown.
     """
 
@@ -130,7 +130,7 @@ class FlightLog:
         been None.
         """
         names: dict[str, set[str]] = {}
-        if self.turns:  # raises an error if they are unreadable
+        if self.turns:  # raises an error if turns are unreadable
             for record in self.turn_records:
                 collect_written_names(TickRecord, _whole_turn(record), names)
         for each in exact_fields(TickRecord):
@@ -323,7 +323,8 @@ first iteration in which the vehicle was flown."""
 
 
 def read_log(path: Path | str) -> FlightLog:
-    """Read a flight log, compressed by gzip or not. An unreadable tail is ignored and counted.
+    """Read a flight log, compressed by gzip or not. An unreadable tail is ignored, and its length
+    is recorded.
 
     Raises NotFound if there is no such file, and InvalidValue, with the line number, if it is not a
     flight log or is damaged anywhere but at its end.
@@ -378,7 +379,7 @@ def wrap_log_errors(path: Path) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Read the lines of a file. Return none for a file that cannot be a log, since it may be a
+    """Read the lines of a file. Return no lines for a file that cannot be a log, since it may be a
     video of several gigabytes. The end of a truncated compressed file is lost."""
     lines: list[bytes] = []
     try:
@@ -457,8 +458,8 @@ def parse_turn(record: dict[str, Any]) -> TickRecord:
 
 
 def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record with the observation's telemetry filled in. A line contains it only once,
-    among the samples."""
+    """Return the record with the observation's telemetry filled in: a line in the log contains this
+    telemetry only once, among the samples."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
         samples = taken.get("late") or taken.get("samples")

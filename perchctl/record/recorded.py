@@ -23,7 +23,8 @@ from perchctl.record.messages import FRAME, IMAGE
 from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
-"""A flight's chunk contains 4 MB and one image; a longer record has a damaged length."""
+"""A chunk in a flight's recording contains 4 MB and one image; if a record claims to be longer than
+this limit, its length is damaged."""
 _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 """Exceptions that the libraries raise for a truncated or damaged record, including lz4's."""
 

@@ -52,8 +52,8 @@ TURN_BYTES = 10_000
 """Size of a turn without its image, bytes."""
 FLUSH_PERIOD_S = 1.0
 RESERVE_BYTES = 200_000_000
-"""Space that the recording leaves free on the disk, bytes. The flight log needs it, without which
-the vehicle may have to land."""
+"""Space that the recording leaves free on the disk, bytes. If the flight log runs out of space, the
+vehicle may have to land."""
 
 
 class Recorder:
@@ -111,7 +111,7 @@ class Recorder:
 
     def write_frame(self, frame: Frame) -> None:
         """Record a frame from the source. Never raises an exception."""
-        self._hand_over()  # before take-off there are no ticks, which do this otherwise
+        self._hand_over()  # in flight, ticks do this; before take-off, there are none
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
         # A repeated frame also contains its image.
@@ -157,7 +157,7 @@ class Recorder:
                 why = error.strerror or str(error)
             self._end(why)
             with suppress(OSError):
-                self._stream.close()  # close it without an index, after its last complete record
+                self._stream.close()  # no index: the file ends with its last complete record
 
     def _write_frame(self, frame: Frame) -> None:
         number = frame.index & 0xFFFFFFFF

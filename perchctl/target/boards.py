@@ -53,7 +53,7 @@ class Board:
         marker_m, dictionary: the markers' side and dictionary; None on a chessboard.
         scale: measured over nominal size of the print, along width and height.
         legacy: True for a charuco board with an even number of rows whose top left square is white,
-            as in OpenCV before 4.6. All other boards have only one layout, and False here.
+            as in OpenCV before 4.6. All other boards have only one layout, and `legacy` is False.
     """
 
     kind: BoardKind
@@ -91,7 +91,7 @@ class Board:
     def corners_m(self) -> Array:
         """The inner corners (n, 3) in metres, row by row from the top left one; x right, y down.
 
-        The origin is the top left corner of the print, as that of
+        The origin is the top left corner of the print, as in
         `cv2.aruco.CharucoBoard.getChessboardCorners`; on a chessboard it is the first corner.
         """
         first = 1 if self.kind == "charuco" else 0

@@ -37,11 +37,11 @@ class TargetDesign:
     Attributes:
         blur_px: sigma of the image's blur.
         large_px, small_px: smallest sides, px, that the detector finds in blurred trial images.
-        z1_m, z2_m: farthest range of the large and of the small marker, at any turn.
-        z3_m: nearest range of the whole large marker, at any turn; z3_upright_m: with its sides
-            parallel to the image's.
+        z1_m, z2_m: farthest range of the large and of the small marker, in any rotation.
+        z3_m: nearest range of the whole large marker in any rotation; z3_upright_m: the same with
+            the marker's sides parallel to the sides of the image.
         small_nearest_m: nearest range from the gear's tip to the target at which the small marker
-            is whole at any turn, the gear right under the target's centre.
+            is whole in any rotation, with the gear directly under the target's centre.
         start_range_m: from the camera to the target at the start of the search, at the height
             `start_height_m` (0: on the ground); None if the ceiling's height is unknown.
         standoff_m: distance from the gear to the target before contact.
@@ -156,8 +156,8 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
 ) -> TargetDesign:
-    """The design for a profile and a ceiling at `ceiling_m` over the floor (None: unknown):
-    far ranges by trials of the detector, near ones by geometry."""
+    """The design for a profile and a ceiling `ceiling_m` above the floor (None: unknown). Far
+    ranges are found by trials of the detector, near ones from the geometry."""
     f = focal_px(camera)
     view = FieldOfView(camera)
     ahead = (np.eye(3), np.zeros(3))

@@ -221,14 +221,14 @@ def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
 
 MAX_SCALE_ERROR = 0.1
 NOTABLE_SCALE_ERROR = 0.01
-"""Relative size error from which a viewer must have scaled the page; printers themselves err by
+"""Relative size error above which a viewer must have scaled the page; printers themselves err by
 about 0.3 %."""
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*")
 
 
 def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float:
-    """The metres of ``150mm``, ``15cm`` or ``0.15m``.
+    """Convert a length such as ``150mm``, ``15cm`` or ``0.15m`` to metres.
 
     `what` names the value in the error; a number without a unit is in `bare_unit`, or is refused if
     that is None. Raises InvalidValue.

@@ -66,8 +66,8 @@ _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the image
 def smallest_side_px(
     target: TargetConfig, marker: str, blur_px: float, picture_px: int
 ) -> float | None:
-    """The smallest side, px, at which the marker, facing the camera at any turn, is found in
-    `FOUND_RATE` of the images; None if even `SIDE_RANGE_PX[1]` is too small.
+    """The smallest side, px, at which the marker, facing the camera in any rotation, is found in a
+    share `FOUND_RATE` of the images; None if even `SIDE_RANGE_PX[1]` is too small.
 
     Args:
         blur_px: sigma of lens, focus and link together.
@@ -134,8 +134,8 @@ def sample_pictures(
 
 
 MIN_DISTANCE = 3
-"""Number of cells in which two patterns of one size must differ: one more than the wrong bits that
-are corrected in both."""
+"""Number of cells in which two patterns of the same size must differ: one more than the number of
+wrong bits that are corrected in both together."""
 _READ_SIDE_PX = 480.0
 
 

@@ -29,15 +29,16 @@ PAGES_MM: dict[str, tuple[float, float]] = {
     "letter": (215.9, 279.4),
     "a3": (297.0, 420.0),
 }
-"""Named page sizes, portrait, in the order in which a fitting one is proposed."""
+"""Named page sizes, in portrait; if a page is too small, the first of these that fits is
+proposed."""
 MOST_PAGE = 5000.0
-"""Largest side of a page, mm: a PDF's pages end at 5.08 m."""
+"""Largest side of a page, mm: a page in a PDF can be at most 5.08 m long."""
 UNPRINTABLE = 5.0
 """Width of the unprintable margin of many printers, mm."""
 MIN_QUIET_CELLS = 0.5
-"""Least white margin around the large marker, in its cells. One cell is printed if the page has
-room for it. Down to half a cell, the range stays the same (the marker is found from 32 px on; with
-0.3 cells, from 36 px on)."""
+"""Smallest white margin around the large marker, in cells of this marker. One cell is printed if
+the page has room for it. Down to half a cell, the detection range stays the same (the marker is
+found from 32 px on; with 0.3 cells, from 36 px on)."""
 
 _PT_PER_MM = 72.0 / 25.4
 RULER = 100.0
@@ -88,8 +89,8 @@ def target_pdf(
 
 
 def board_pdf(board: Board, page: str) -> bytes:
-    """A board in the middle of the page, in portrait or landscape as it fits, with rulers, as a
-    PDF; `page` as in `target_pdf`. Raises InvalidValue if the board does not fit."""
+    """A board in the middle of the page, in portrait or landscape, whichever fits, with rulers, as
+    a PDF; `page` as in `target_pdf`. Raises InvalidValue if the board does not fit."""
     width, height = (1e3 * side for side in board.size_m)
     side = UNPRINTABLE + _RULER_DEPTH
     needed = (max(width, 2 * _RULER_REACH) + 2 * side, max(height, 2 * _RULER_REACH) + 2 * side)
@@ -235,7 +236,8 @@ class _Paper(FPDF):
         self.set_margin(0.0)
         self.set_title(title)
         self.set_producer("perchctl")
-        day = date or datetime.date(2000, 1, 1)  # never the current time
+        # Never the current time, so that the same target gives the same bytes.
+        day = date or datetime.date(2000, 1, 1)
         self.set_creation_date(datetime.datetime.combine(day, datetime.time(), datetime.UTC))
         # Portrait pages are turned about their long edge, which is the vertical one.
         duplex = "DuplexFlipLongEdge" if height >= width else "DuplexFlipShortEdge"

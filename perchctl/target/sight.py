@@ -77,7 +77,7 @@ def square_outline(side_m: float) -> Array:
 
 
 def circle_outline(side_m: float) -> Array:
-    """Return points (n, 2) of the circle through the corners of a square with that side."""
+    """Return points (n, 2) of the circle through the corners of a square with the side `side_m`."""
     a = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
     return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
 
@@ -91,12 +91,12 @@ def outline_points_3d(outline_m: Array, z_m: float) -> Array:
 
 
 SURE_PX = 18.0
-"""Side of a marker that the search finds reliably, px: it finds 15 px in all rendered images, and
-a fifth is added."""
+"""Side of a marker that the search finds reliably, px: it finds markers of 15 px in all rendered
+images, and a fifth is added as a margin."""
 BLURRED = 1.15
 """Factor on the smallest side that a plain search can read despite a measured blur."""
 STRAIGHT_DEG = 2.0
-"""Tilt below which it is not reported, deg."""
+"""Tilt of the camera's axis below which no tilt is reported, deg."""
 LEAST_UP = 0.2
 """Least vertical component of the view's direction: a camera that looks farther to the side cannot
 see a target above it."""
@@ -132,8 +132,9 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """Return how far off the axis of a camera, `height_m` below, a marker of `side_m` is wholly in
-    the image in any rotation; None if not even on the axis, or if the camera does not look up."""
+    """Return the largest distance from the camera's axis at which a marker with the side `side_m`,
+    `height_m` above the camera, is wholly in the image in any rotation; None if it is not even on
+    the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -228,9 +229,10 @@ _STEP_M = 0.0005
 
 @dataclass(frozen=True)
 class BlindRange:
-    """Ranges from gear tip to target, m, below which the target is no longer measured: `whole_m` by
-    whole markers only, `left_m` by visible parts too. 0 means that it is measured down to contact,
-    None that it is not measured at all in the last 10 cm."""
+    """Ranges from gear tip to target, m, below which the target is no longer measured: `whole_m` if
+    only whole markers are measured, `left_m` if visible parts are measured as well. 0 means that
+    the target is measured down to contact, and None that it is not measured at all in the last 10
+    cm."""
 
     whole_m: float | None
     left_m: float | None
@@ -249,7 +251,7 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
-    """The blind range of a level target right above the gear, for the profile's mounting."""
+    """The blind range of a level target directly above the gear, for the profile's mounting."""
     R, offset = camera_rotation_and_gear(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]

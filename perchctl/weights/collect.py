@@ -47,9 +47,9 @@ MOST_WANDER_PX = 1.0
 """Largest drift and largest jitter of the target's image within a position, px."""
 MOST_MISMATCH_M = 0.03
 """Difference from the camera's pose above which an actual pose is a mistake, m. Larger: a mistake
-is taken for an error of the camera."""
+is taken for an error in the camera's pose."""
 MOST_MISMATCH_RAD = math.radians(10.0)
-"""The same difference of the yaw, rad."""
+"""Difference from the camera's yaw above which an actual yaw is a mistake, rad."""
 SAMPLES = 30
 """Number of motion-capture frames whose median is the actual pose. They must arrive within
 `WITHIN_S`."""

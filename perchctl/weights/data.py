@@ -1,4 +1,5 @@
-"""The data for a fit: read and check a CSV file with one row per frame. Errors name the line.
+"""The data for a fit: read and check a CSV file with one row per frame. Error messages name the
+line.
 
 The columns are ``position`` (a whole number: the place where the row was taken), ``t_s``, then x,
 y, z in metres and yaw in radians with each of the prefixes ``large_``, ``small_`` and ``actual_``.

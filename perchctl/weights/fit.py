@@ -99,7 +99,8 @@ def marker_errors(data: Measurements) -> MarkerErrors:
 
 
 def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return False at outliers by `OUTLIER_SIGMAS`, (n, 4); positions begin at rows `starts`."""
+    """Return an array (n, 4) that is False at outliers according to `OUTLIER_SIGMAS`; positions
+    begin at rows `starts`."""
     use = np.ones(error.shape, dtype=bool)
     if len(starts) * LEAST_ROWS > len(error):
         return use  # too few rows per position to recognise outliers
@@ -136,10 +137,10 @@ def closed_form_weights(sums: Array) -> Array:
 
 START_STEP = 0.02
 LEAST_RUN_ROWS, LEAST_PASSES = 40_000, 3
-"""Least number of rows to process, in as many passes as necessary, and least number of passes, so
-that a few rows suffice."""
+"""Smallest number of rows to process, in as many passes as necessary, and smallest number of
+passes; a data file with few rows is therefore sufficient."""
 MOST_ROWS = 100_000
-"""Largest number of rows; of more rows, evenly spaced ones are processed."""
+"""Largest number of rows to process; if there are more, evenly spaced ones are processed."""
 _LMS_STREAM = (0, 601)
 
 

@@ -29,8 +29,8 @@ _SESSION_STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A place of the camera. `actual` (x, y, z, yaw): pose of the target relative to the gear in
-    the level frame."""
+    """A placement of the camera. `actual` (x, y, z, yaw): pose of the target relative to the gear
+    in the level frame."""
 
     T_world_cam: Array
     actual: Array
