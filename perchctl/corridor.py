@@ -31,8 +31,8 @@ class Corridor:
     Attributes:
         home_m: the take-off position.
         target_m: the position below the target.
-        radius_m: horizontal distance from the line between them. Larger: fewer vehicles fit into a
-            room. Smaller: a draught may carry the vehicle out of the corridor.
+        radius_m: largest horizontal distance from the line between them. Larger: fewer vehicles fit
+            into a room. Smaller: a draught may carry the vehicle out of the corridor.
         way_top_m: height above the ground up to which the whole corridor may be used.
         target_top_m: height up to which the column under the target may be used.
     """

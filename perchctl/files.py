@@ -136,8 +136,8 @@ def atomic_write(path: Path, mode: int | None = None) -> Iterator[Path]:
 
     The temporary path has the suffix of `path`, because some libraries choose the format by the
     suffix. The folder is created if necessary. A file that is replaced keeps its permissions; a new
-    one gets `mode`, by default the system's. Raises InvalidValue if the system refuses one of these
-    steps.
+    file gets the permissions `mode`, by default the system's. Raises InvalidValue if the system
+    refuses one of these steps.
     """
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     made = [folder for folder in path.parents if not folder.exists()]

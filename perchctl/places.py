@@ -48,6 +48,6 @@ def user_folder(kind: Literal["config", "cache", "state", "runtime"]) -> Path:
     profiles and calibrations, `cache` for data that can be recreated, `state` for results,
     `runtime` for locks."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # if the system defines none, another folder is used
+        warnings.simplefilter("ignore")  # if the system defines no such folder, another one is used
         find = getattr(platformdirs, f"user_{kind}_dir")
         return Path(find("perchctl", appauthor=False))

@@ -50,7 +50,7 @@ def fly(
     record: bool | None = None,
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
-    **It arms without a question.** Ctrl-C works if you call it in the main thread. Press Ctrl-C to
+    **It arms without asking.** Ctrl-C works if you call it in the main thread. Press Ctrl-C to
     land. Press it again to cut the motors. Warnings of the checks, and an incomplete log, are
     Python warnings (`perchctl.errors.Note`).
 
@@ -61,8 +61,8 @@ def fly(
         on_tick: called 50 times a second with a `Tick`: telemetry, target, planner's state and
             command; it must return within milliseconds. If it raises an exception, it is not called
             again, the flight continues, and a warning is issued.
-        on_event: called with each new phase and each note. An error in it is treated in the same
-            way.
+        on_event: called with each new phase and each note. An error in `on_event` is treated in the
+            same way as one in `on_tick`.
         should_stop: called in each tick; once it returns True or raises an exception, the vehicle
             lands.
         rows: your own transitions, in addition to those of the profile. A replay does not use them.

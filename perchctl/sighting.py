@@ -108,8 +108,8 @@ def track(
         calibration: the camera's calibration, or its file; by default that of the profile.
         attitude: the vehicle's attitude, or a function that returns it for a frame's `t_s`; needed
             for `T_level_target`.
-        rate_hz: frame rate, if the arrays are a stream. Without it, and for ``images:``, each image
-            is searched thoroughly and independently.
+        rate_hz: frame rate, if the arrays are a stream. Without a rate, and for ``images:``, each
+            image is searched thoroughly and independently.
 
     Raises:
         NotFound: there is no such source, profile or calibration. InvalidValue: an image is None,

@@ -32,7 +32,7 @@ def is_command_line() -> bool:
 
 
 def exit_at_ctrl_c() -> None:
-    """Exit at Ctrl-C from now on, unless Ctrl-C is ignored or has another handler already."""
+    """Exit on Ctrl-C from now on, unless Ctrl-C is ignored or has another handler already."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 

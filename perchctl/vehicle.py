@@ -39,8 +39,8 @@ class Telemetry:
     and `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
     `behind_s` is how much older than `t_s` the position and velocity are, which arrive in a
     separate packet; `battery_behind_s` and `variance_behind_s` are the same for the battery and the
-    variances, and infinite before their first packet. `start` is how often the vehicle has
-    restarted since its first packet arrived.
+    variances, and infinite before their first packet. `start` is the number of times that the
+    vehicle has restarted since its first packet arrived.
 
     The variances are those reported by the vehicle's estimator; None if it reports none. With a
     deck that only measures the speed over ground, as a Flow deck does, nothing measures the

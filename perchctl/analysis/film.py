@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ARM_M = 0.046
 """Distance from the vehicle's centre to a motor, m."""
 BESIDE_M, ABOVE_M = 0.25, 0.12
-"""Margins of the side view beside and above the flight, m."""
+"""Margins in the side view, to the left and right of the flight and above it, m."""
 LEAST_ASIDE_M = 0.05
 """Horizontal distance of the start from the target below which it does not define the direction of
 the view, m."""

@@ -209,7 +209,8 @@ def _render(name: str, **values: Any) -> Markup:
 
 
 def mission_phases(log: FlightLog) -> list[str]:
-    """The phases of the mission in a log, in order: the paper's seven, or those of a hover."""
+    """The phases of the mission in a log, in order: the paper's seven phases, or the phases of a
+    hover."""
     seven = [phase.value for phase in tuple(Phase)[:7]]
     planner = (log.header.get("profile") or {}).get("planner") or {}
     return [*seven[:5], Phase.HOVER.value] if planner.get("hover") else seven

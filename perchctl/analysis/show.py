@@ -48,7 +48,7 @@ def _times(part: Any) -> dict[str, Any]:
 
 
 def show_text(flight: FlightAnalysis) -> str:
-    """Return outcome, figures, phases, holds and takeovers of a flight as text for a terminal."""
+    """Return a flight's outcome, figures, phases, holds and takeovers as text for a terminal."""
     lines = [*_end_lines(flight), *_named("record", _origin(flight.log)), *_measure_lines(flight)]
     lines += _trim_lines(flight)
     phases = flight.log.phases

@@ -32,7 +32,7 @@ ACTIONS = {
 }
 FINAL_PHASE_TEXTS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was aborted"}
 SIGHTED = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "HOVER"})
-"""Phases whose sentence says where the target was when they began."""
+"""Phases whose sentence says where the target was when the phase began."""
 MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
 
 

@@ -33,7 +33,8 @@ MAX_PACKET_BYTES = 1022
 """Largest packet length, bytes: the size of the deck's buffers (its MTU)."""
 MOST_SIDE_PX = 1024
 
-# A small buffer: data that waits in it while the reader stalls gets too late a time stamp.
+# Keep the buffer small, because data that waits in it while the reader stalls is time-stamped too
+# late.
 _RECEIVE_BYTES = 131072
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
@@ -83,9 +84,9 @@ class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG images.
 
     An image's time is the arrival time of its first byte minus `latency_s`, because the deck sends
-    the header at the exposure; the transfer of a raw image takes 60 ms or more. Its arrival time is
-    that of the last byte. Incomplete images are dropped; an invalid packet ends the connection, and
-    the source reconnects.
+    the header at the exposure; the transfer of a raw image takes 60 ms or more. An image's arrival
+    time is the arrival time of its last byte. Incomplete images are dropped; an invalid packet ends
+    the connection, and the source reconnects.
     """
 
     unreached_advice = (
@@ -180,8 +181,8 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 
 
 LEAST_MOSAIC_SHARE = 0.04
-"""Least difference between the mean greys of the filters, relative to their mean. A grey sensor has
-less than 1 %, a mosaic 20 % and more."""
+"""Smallest difference between the mean grey levels of the filters, relative to their mean, that
+shows a mosaic. A grey sensor has less than 1 %, a mosaic 20 % or more."""
 LEAST_MOSAIC_LEVELS = 1.5
 PICTURES_IN_A_ROW = 3
 _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)

@@ -237,8 +237,8 @@ class LiveSource:
                     return
                 reason = str(error)
             except Exception as error:
-                # Any error that damaged bytes cause in a library: a new connection may bring intact
-                # ones.
+                # Any error that damaged bytes cause in a library: a new connection may deliver
+                # intact bytes.
                 reason = describe_error(error)
                 is_unreached = isinstance(error, OSError)
             self._why_silent = reason
@@ -277,7 +277,7 @@ class LiveSource:
     ) -> None:
         """Keep an image that has arrived now.
 
-        `waited_s`: by how much its transfer took longer than usual. `began_s`: arrival time of its
+        `waited_s`: how much longer than usual its transfer took. `began_s`: arrival time of its
         first byte, from which the latency is subtracted. `encoded`: as in `Frame`.
         """
         arrival_s = self._clock()

@@ -159,7 +159,7 @@ def _connected(address: str) -> Client:
             f"no dask scheduler answers at {address} within {SCHEDULER_TIMEOUT_S:.0f} s "
             f"({type(error).__name__}): start a dask scheduler there, or correct the address"
         )
-    gc.collect()  # close a client that did not connect while its event loop still runs
+    gc.collect()  # close a client that could not connect, before its event loop ends
     raise problem
 
 

@@ -15,7 +15,7 @@ from perchctl.sim import Scenario
 
 FlightEnd = Literal["perched", "refused", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
-"""Ends of a flight, from best to worst."""
+"""The ways in which a flight can end, from best to worst."""
 WORST_FLIGHTS = 5
 """Number of bad flights that the table lists."""
 

@@ -77,8 +77,8 @@ class Stand:
 
 def identity_rows(options: FlyOptions, stand: Stand, scope: CheckScope, ask: Ask) -> Iterator[Row]:
     """Yield the rows about a vehicle as soon as they are known: address, vehicle, body (with motion
-    capture), camera and target. A row that fails leaves that part unidentified. Errors: those of
-    `perchctl.check.check`.
+    capture), camera and target. A row that fails leaves that part unidentified. Errors: the same as
+    for `perchctl.check.check`.
 
     For a simulated vehicle, which has its own simulator and camera, perchctl asks nothing.
     """

@@ -128,7 +128,7 @@ def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) 
 class VehicleChecks:
     """Checks of a vehicle and of its motion-capture system, if any.
 
-    `uri`: the given address; `probe` may open that of a simulated vehicle instead.
+    `uri`: the given address; `probe` may open a simulated vehicle's address instead.
     """
 
     probe: ProbeLink

@@ -17,7 +17,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays

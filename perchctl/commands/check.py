@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import camera as cameras
 from perchctl import check as checks
 from perchctl.commands.command_line import (

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import campaign as campaigns
 from perchctl import check as checks
 from perchctl import fleet as fleets
@@ -391,7 +391,7 @@ def convert(
     """Make a fleet file from Crazyswarm2's or cfcli's list of Crazyflies.
 
     perchctl copies names, URIs and, from Crazyswarm2, initial positions and motion-capture bodies.
-    These lists contain no targets and cameras: add them to the fleet file.
+    These lists contain no targets or cameras: add them to the fleet file.
     """
     check_output(output, (".yaml", ".yml"), force, "a fleet file")
     say_on_terminal(f"reading {file}")

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import display as displays
 from perchctl import fleet as fleets
 from perchctl import flight as flights

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import flight as flights
 from perchctl import profile as profiles
 from perchctl.commands.command_line import (

@@ -9,7 +9,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import analysis
 from perchctl import fleet as fleets
 from perchctl import profile as profiles

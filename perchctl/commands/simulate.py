@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import analysis
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-# Import whole packages: their contents load on first use, so that a command starts at once.
+# Import packages, not names: their contents load on first use, so the command starts at once.
 from perchctl import calibration as calibrations
 from perchctl import camera as cameras
 from perchctl import display as displays

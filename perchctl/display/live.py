@@ -138,7 +138,7 @@ _OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, as a multiple of the large marker's side."""
-_DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would overflow
+_DRAWABLE_PX = 8000.0  # a line that ends beyond this is not visible, and would overflow OpenCV
 
 
 @dataclass(frozen=True, eq=False)

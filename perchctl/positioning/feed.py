@@ -2,7 +2,7 @@
 
 The vehicle's estimator treats each position as current, even if it is late or a duplicate.
 Therefore no position is repeated or queued, and positions that the validator rejects are not sent.
-The age of the position then grows, and the planner holds or lands because of it (fault 10).
+The age of the position then grows, which makes the planner hold or land (fault 10).
 """
 
 from __future__ import annotations
@@ -269,10 +269,10 @@ NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)
 """Largest change of a pose between two frames that measurement noise may cause without any
 motion."""
 FASTEST_FALL_MPS = 5.0
-"""Largest plausible speed just after an accepted pose, m/s: that of a fall from 1.3 m. Smaller: the
-positions of a falling vehicle are rejected."""
+"""Largest plausible speed just after an accepted pose, m/s: the speed after a fall from 1.3 m.
+Smaller: the positions of a falling vehicle are rejected."""
 FASTEST_TIP_RADPS = 10.0
-"""Largest plausible rotation rate just after an accepted pose, rad/s: that of a vehicle that is
+"""Largest plausible rotation rate just after an accepted pose, rad/s: the rate of a vehicle that is
 tipped over."""
 AT_FASTEST_S = 0.02
 """Time after an accepted pose from which `HELD_MPS` and `HELD_RADPS` apply instead, s. Larger: a

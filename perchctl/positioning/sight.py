@@ -2,9 +2,9 @@
 position in a world fixed to the target, add the motion of the vehicle's estimate since the
 exposure, and send the result to its estimator.
 
-The world is that of the vehicle at rest on the ground, where its estimate is reset. The world's
-origin is sent until the target has been seen often enough from there; then the target's position is
-fixed. Ground, safety limits and heights therefore keep their meaning.
+This world frame is set by the vehicle at rest on the ground, where its estimate is reset. The
+world's origin is sent until the target has been seen often enough from there; then the target's
+position is fixed. Ground, safety limits and heights therefore keep their meaning.
 
 No exposure is used twice, out of order, or when it is older than `OLDEST_S`. A position is rejected
 if it is farther from the estimate than the errors of both can explain. The age of the position then
@@ -32,7 +32,7 @@ from perchctl.vision import (
 )
 
 GROUND_FRAMES = 15
-"""Number of frames at rest whose median gives the target's position: half a second for a 30 Hz
+"""Number of frames at rest whose median gives the target's position: half a second with a 30 Hz
 camera."""
 OLDEST_S = 0.3
 """Age at which a sighting is no longer sent, s."""

@@ -152,7 +152,8 @@ class CompleteConfig(Section):
     release_drop_m: ClassVar[float] = 0.25
     """Distance of the last setpoint below the contact, m."""
     hold_ratio: ClassVar[float] = 0.6
-    """Share of the hover thrust at which the magnet must hold to be proven."""
+    """Thrust, as a share of the hover thrust, below which the magnet must hold the vehicle to prove
+    its hold."""
     hold_dwell_s: ClassVar[float] = 0.3  # time for which the magnet must hold
     ramp_s: ClassVar[float] = 0.5
     """Time in which the raw thrust decreases from the minimum of position mode to zero, s."""
@@ -161,7 +162,7 @@ class CompleteConfig(Section):
     release_timeout_s: ClassVar[float] = 8.0  # time after which the attempt counts as failed
     slip_m: ClassVar[float] = 0.03  # largest distance below the contact to count as hanging
     slip_mps: ClassVar[float] = 0.12  # sink rate that counts as a slip
-    # duration of a slip before it is answered; a free fall is answered at once
+    # duration of a slip before perchctl reacts; it reacts to a free fall at once
     slip_dwell_s: ClassVar[float] = 0.03
     # specific force below which the vehicle falls freely, or slips even if the estimate contradicts
     # it
@@ -196,8 +197,8 @@ class HoverConfig(Section):
 
 
 OVERDUE_SHARE = 0.5
-"""Share of a landing's time for which it proceeds by setpoints. Then the vehicle's own landing
-takes over."""
+"""Share of a landing's time limit for which it may proceed by setpoints before the vehicle's own
+landing takes over."""
 
 
 class LandingConfig(Section):
@@ -349,11 +350,12 @@ class SafetyConfig(Section):
     """Lateness of the loop at which the vehicle lands, s."""
     estimator_wait_s: ClassVar[float] = 10.0  # waiting time on the ground
     estimator_velocity_variance_m2ps2: ClassVar[float] = 0.01
-    """Variance of the velocity above which take-off is refused. Ranging anchors give up to 0.007;
-    an estimator without positions exceeds the limit within 1 s."""
+    """Variance of the velocity above which take-off is refused. With ranging anchors, the variance
+    is up to 0.007; without positions, it exceeds the limit within 1 s."""
     estimator_variance_m2: ClassVar[float] = 0.01
-    """Variance of the position above which take-off is refused. Ranging anchors give 0.0013. After
-    a reset, it is 1 m^2 in height and 100 m^2 horizontally until the first position."""
+    """Variance of the position above which take-off is refused. With ranging anchors, the variance
+    is 0.0013. After a reset, it is 1 m^2 in height and 100 m^2 horizontally until the first
+    position."""
     ground_z_m: float = key(
         0.0, "height of the ground in the state estimate at take-off", ge=-10, le=10
     )

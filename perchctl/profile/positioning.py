@@ -13,7 +13,7 @@ from perchctl.profile.base import BodyVector3, Section, Vector3, key
 SPARE_S = 0.02
 """Tolerance of the rate, because frames do not arrive exactly on time."""
 MOST_CAPTURE_LATENCY_S = 0.04
-"""Largest delay of a position, s, because the vehicle takes each one as its present position. With
+"""Largest delay of a position, s, because the vehicle treats each position as its present one. With
 positions 40 ms late, it perches within 2 mm. At 50 ms, it may oscillate for a minute and then land
 (tests/flight/test_capture_flights.py)."""
 _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"

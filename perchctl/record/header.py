@@ -68,9 +68,9 @@ def turn_fields() -> dict[str, list[str]]:
     """Return the names of the fields that are written for a turn (one iteration of the flight
     loop), keyed by dataclass.
 
-    They show a later version of perchctl which of its fields did not exist yet when the log was
-    written. Without them, such a field could not be distinguished from a field that is left out
-    because it is None.
+    From these names, a later version of perchctl can tell which of its fields did not exist yet
+    when the log was written. Without the names, such a field could not be distinguished from a
+    field that is left out because it is None.
     """
     names: dict[str, list[str]] = {}
     for field in exact_fields(TickRecord):

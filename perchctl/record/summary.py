@@ -88,8 +88,9 @@ class FlightSummary:
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the flight or, if only its log is incomplete, that of the log. Only for
-        a summary from `LogWatcher.close`, because one that was read back may lack its cause."""
+        """The exit code of the flight or, if only its log is incomplete, the exit code of the log.
+        Only for a summary from `LogWatcher.close`, because one that was read back may lack its
+        cause."""
         code = Outcome(self.cause).exit_code
         return LogIncomplete.exit_code if code == 0 and self.log_problem is not None else code
 
@@ -216,7 +217,7 @@ class FlightSummary:
 
 
 def is_simulated(header: Mapping[str, Any]) -> bool:
-    """True if a log's header is that of a simulated vehicle."""
+    """True if a log's header belongs to a simulated vehicle."""
     return str(header.get("uri", "")).startswith("sim://")
 
 

@@ -49,7 +49,7 @@ Truth = tuple[tuple[float, float, float], float]
 class LogWatcher:
     """Writes the log of one flight and, optionally, its recording.
 
-    Only opening it raises exceptions. Later failures are reported by `problem`, and those of the
+    Only opening it raises exceptions. Later failures are reported by `problem`, and failures of the
     recording by `remarks`.
 
     Attributes:
@@ -59,7 +59,7 @@ class LogWatcher:
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight continues.
         truth: function that returns the true state at a tick; set by a simulation.
-        simulated: True if the header is that of a simulated vehicle.
+        simulated: True if the header belongs to a simulated vehicle.
         recorder: records the camera's frames; None without a recording.
     """
 
@@ -270,7 +270,8 @@ class LogWatcher:
         return None if self.recorder is None else self.recorder.close()
 
     def end(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Append the summary, if any, and close. Never raises; a second call does nothing.
+        """Append the summary, if any, and close. Never raises an exception; a second call does
+        nothing.
 
         Waits at most `LOG_CLOSE_TIMEOUT_S` for the disk."""
         if self._closed:

@@ -2,7 +2,7 @@
 
 Drawing axes: origin in the target's centre, x right and y up *as printed and
 read from the printed side*, metres. They are OpenCV's marker axes. The sheet
-hangs face down on the ceiling; the upward camera reads it un-mirrored.
+hangs face down on the ceiling; the upward-facing camera sees it unmirrored.
 
 Bitmap and PDF come from one raster on a non-uniform grid, whose lines are the
 edges of both markers' cells and of the white ring around the small one.

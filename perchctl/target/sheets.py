@@ -249,7 +249,8 @@ class _Paper(FPDF):
         self.add_page(orientation="portrait", format=self._format)
 
     def fill(self, rectangles: Sequence[Rectangle]) -> None:
-        """Draw black rectangles (m, y up, from the page's centre) as one path: no hair lines."""
+        """Draw black rectangles (m, y up, from the page's centre) as one path, so that viewers draw
+        no hairlines between them."""
         with self.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
             path.style.fill_color = "#000000"
             path.style.stroke_color = None

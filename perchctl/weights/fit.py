@@ -266,8 +266,8 @@ class Evidence:
         return rms, _half_width(influence)
 
     def rms_gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """Return how much lower the RMS error of the weights `name` is than that of the mean
-        squares `other` (g, 4), and half the width of its 95 % interval, (4,) each."""
+        """Return how much lower the RMS error of the weights `name` is than the RMS error from the
+        mean squares `other` (g, 4), and half the width of its 95 % interval, (4,) each."""
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
