@@ -66,7 +66,7 @@ COMMANDS: dict[str, str] = {
         "to fly."
     ),
     "fly": "Fly a perching mission: find the target, align, ascend, perch, stop the motors.",
-    "hover": "Hover below the target for a time, land, and report the position error.",
+    "hover": "Hover below the target for a set time, land, and report the position error.",
     "fleet": "Plan, fly and simulate several vehicles in one room, and import other fleet files.",
     "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
     "log": "Show, plot, compare, export, replay, film or summarise a flight from its log.",

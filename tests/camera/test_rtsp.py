@@ -115,7 +115,7 @@ def test_name_and_password_are_answered_by_digest_and_not_shown(
 
 
 @pytest.mark.parametrize(("who", "path", "sentence"), [
-    ("me:hushhush@", "/live", "(401); write them as in rtsp://NAME:PASSWORD@HOST/PATH"),
+    ("me:hushhush@", "/live", "(401); write the user name and password as in rtsp://NAME:PASSWORD@HOST/PATH"),
     ("me:secret@", "/nowhere", "404"),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_told_at_once(
