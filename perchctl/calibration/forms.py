@@ -1,7 +1,8 @@
 """Calibration files of other programs: recognise the form, and interpret each key.
 
-Confusing two lens models moves the target by centimetres while its standard deviation is
-millimetres, and no later check detects this. Each form therefore has a table of its keys:
+If two lens models are confused, the target's position is wrong by centimetres although its standard
+deviation is a few millimetres, and no later check detects this. Each form therefore has a table of
+its keys:
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must have a neutral value, since any other would change the projection (binning, xi,
@@ -220,7 +221,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     return _camera_lens(values, CAMERA_MESSAGE if is_message else CAMERA_FILE), values
 
 
-# --- Parse text to values ---
+# --- Parse text into values ---
 
 
 def _values(text: str) -> dict[str, Any]:
@@ -494,7 +495,8 @@ def _named_lens(found: _Found) -> str | None:
 
 
 def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float64]]:
-    """Return the lens model and its coefficients, as many as it has, without trailing zeros."""
+    """Return the lens model and its coefficients; zeros beyond the model's number of coefficients
+    are dropped."""
     key, value = found["distortion"][0]
     given = _numbers(key, value)
     model = named
@@ -524,7 +526,8 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
 
 
 def _numbers(key: str, value: Any) -> NDArray[np.float64]:
-    """The numbers of a matrix, (n,): of its ``data``, of a list, or of a list of rows."""
+    """The numbers of a matrix, (n,), which the file contains under ``data``, as a list, or as a
+    list of rows."""
     data = value.get("data") if isinstance(value, dict) else value
     try:
         numbers = np.array([] if data is None else data, dtype=np.float64).ravel()

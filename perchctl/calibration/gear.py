@@ -1,7 +1,7 @@
 """Find the part of the image that the vehicle itself covers, from images taken while it moves.
 
-While you turn the vehicle in your hand, only its own parts stay the same in the image. They are
-connected with the image's edge.
+While you turn the vehicle in your hand, only its own parts stay the same in the image. These parts
+are connected to the image's edge.
 """
 
 from __future__ import annotations

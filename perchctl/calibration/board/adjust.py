@@ -149,8 +149,8 @@ def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
 # --- Outliers ---
 # A corner is rejected if its residual exceeds 0.3 px and 5 times the spread of its view (or of all
 # views, if that is larger). A view is rejected if the RMS of its remaining corners exceeds 0.1 px
-# and 2.5 times that of the median view, if more than a quarter of its corners were rejected, or if
-# fewer than 6 remain. The worst views are rejected first, until nothing changes.
+# and 2.5 times the RMS of the median view, if more than a quarter of its corners were rejected, or
+# if fewer than 6 remain. The worst views are rejected first, until nothing changes.
 
 
 CORNER_FACTOR = 5.0
@@ -159,8 +159,8 @@ VIEW_FACTOR = 2.5
 VIEW_FLOOR_PX = 0.1
 MAX_CORNERS_OUT = 0.25
 MAX_VIEWS_OUT = 1.0 / 3.0
-"""Largest share of rejected views. If more are rejected, the views are not wrong, but the board,
-its size or the lens."""
+"""Largest share of rejected views. If more are rejected, the fault lies not in the views but in the
+board, its size or the lens."""
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median distance of a round Gaussian with spread 1
 _REJECTION_ROUNDS = 10
 
@@ -236,8 +236,8 @@ def _spread_px(residual: Array) -> float:
 SIGMAS_95 = 1.96
 """Standard deviations to each side of a 95 % interval."""
 _LEAST_INFORMATION_SHARE = 1e-10
-"""Share of a parameter's information that is added, so that a parameter that nothing determines
-stays finite."""
+"""Fraction of each parameter's information that is added to it, so that a parameter that no image
+determines stays finite."""
 
 
 def jackknife_covariance(
@@ -246,8 +246,9 @@ def jackknife_covariance(
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """The covariance (p, p) of a least-squares solution: the inverse of the information matrix,
-    with variances enlarged to those of the delete-one-block jackknife where the latter are larger.
+    """Return the covariance (p, p) of a least-squares solution: the inverse of the information
+    matrix, in which each variance is raised to its delete-one-block jackknife estimate if that is
+    larger.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.

@@ -112,11 +112,11 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
 COVERAGE_AXES = ("position x", "position y", "size", "skew")
 """Named as in ROS's camera_calibration."""
 GOALS = {"position x": 0.5, "position y": 0.5, "size": 0.3, "skew": 0.4}
-"""Spread over the views at which each axis counts as covered."""
+"""Spread of the views along each axis at which the axis counts as covered."""
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
 MOST_VIEWS = 40
-"""Number of views that are always enough, regardless of their coverage."""
+"""Number of views that is always enough, whatever they cover."""
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
 
@@ -177,7 +177,7 @@ def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
 _STILL_SHARE = 1.5 / 640.0  # largest motion between two still frames, in image widths
 _BLUR_SHARE = 2.5 / 640.0
 _UNSEEN_EVERY = 15
-"""One in this many frames without the board is kept, to find out which board they show."""
+"""One in this many frames without the board is kept, to find out which board is in use instead."""
 _ADVICE = (
     (0.5, "move the board to the right edge", "move the board to the left edge"),
     (0.5, "move the board to the bottom edge", "move the board to the top edge"),
@@ -185,7 +185,8 @@ _ADVICE = (
     (0.0, "tilt the board's right side away", "tilt the board's left side away"),
     (0.0, "tilt the board's bottom side away", "tilt the board's top side away"),
 )
-"""The middle of each component of a signature, and instructions for more and for less of it."""
+"""The middle of each component of a view signature, and the instructions that increase and decrease
+this component."""
 
 
 def capture_views(
@@ -209,7 +210,7 @@ def capture_views(
                 break
             if frame is None:
                 continue
-            if frame.repeated:  # otherwise it would look still
+            if frame.repeated:  # otherwise the board would seem to be still
                 capture.count_repeated()
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")

@@ -66,8 +66,8 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A rejected view, given by name or, if `corner_ids` is not empty, the rejected corners of a
-    view."""
+    """The rejected view with the name `view` or, if `corner_ids` is not empty, its rejected
+    corners."""
 
     view: str
     reason: str
@@ -193,7 +193,7 @@ def _charuco(image: Grey, board: Board) -> _Corners | str:
     With the wrong layout no corner is found, since neighbouring markers contradict each other.
     """
     numbers, corners, markers = charuco_corners(image, board)
-    # The right layout gives more corners than markers, unless only little of the board is visible.
+    # The right layout gives more corners than markers, unless little of the board is visible.
     if board.has_two_layouts and len(numbers) < markers:
         other = replace(board, legacy=not board.legacy)
         more, places, _ = charuco_corners(image, other)
@@ -272,15 +272,15 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 
 # --- The corner where four squares meet, found by fitting the image around it ---
 # `cv2.cornerSubPix` has a fixed window, which includes neighbouring corners of small squares and
-# the markers of a ChArUco board. Its errors are 0.03 to 0.5 px where those of this fit are 0.02 px.
-# Here the window follows the size and slant of the square, and a model of two crossing blurred
-# edges is fitted to its grey levels:
+# the markers of a ChArUco board. The errors of `cv2.cornerSubPix` are 0.03 to 0.5 px where this fit
+# has errors of 0.02 px. Here the window follows the size and slant of the square, and a model of
+# two crossing blurred edges is fitted to its grey levels:
 #
 #     I = a + gx x + gy y + (c + hx x + hy y) tanh(d1 / w1) tanh(d2 / w2)
 #
 # with d1, d2 the distances from two lines through the corner and w1, w2 the edges' spread,
-# one for each line since motion blurs them unequally. Light that falls off over the corner
-# scales the contrast too (h); without that term it pulls corners by 0.01 px.
+# one for each line since motion blurs them unequally. If the light falls off across the corner, the
+# contrast changes too (h); without that term, corners are shifted by 0.01 px.
 
 
 REACH = 0.42
@@ -288,7 +288,7 @@ REACH = 0.42
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
 WINDOW_SAMPLES = 21  # number of samples across the largest window
 _CORNER_ITERATIONS = 6
-_LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # step: px, rad, and logarithms
+_LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # largest step: px, rad, logarithms
 _MIN_SLOPE_PX = 5.0
 _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
@@ -378,8 +378,8 @@ def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
     """Return the best contrast c (n,) for the state (n, 6), the weighted residuals (n, m), and the
-    derivative of the modelled grey (n, m, 6), from which the part is removed that a, gx, gy, c, hx
-    and hy can absorb."""
+    derivative of the modelled grey (n, m, 6), without the part that a, gx, gy, c, hx and hy can
+    absorb."""
     x = offsets[..., 0] - state[:, 0, None]
     y = offsets[..., 1] - state[:, 1, None]
     parts = []

@@ -1,11 +1,11 @@
 """Convert the error of a calibration to mm at the target.
 
-The solved pose absorbs a part of a wrong calibration. The error at the target is therefore not the
-error of the ray times the distance, but the change of the solved position. For a target at some
-place, let J be the derivative of its corners with respect to its pose, and L their derivative with
-respect to the lens parameters. A lens error d then moves the solved pose by -(J'J)^-1 J'L d. The
-translation of this step is the error at the target's centre, and the covariance of the parameters
-gives its 95 % bound.
+The solved pose absorbs part of the calibration's error. The error at the target is therefore not
+the error of the ray times the distance, but the change of the solved position. For a target at a
+given position, let J be the derivative of its corners with respect to its pose, and L their
+derivative with respect to the lens parameters. A lens error d then moves the solved pose by
+-(J'J)^-1 J'L d. The translation of this step is the error at the target's centre, and the
+covariance of the parameters gives its 95 % bound.
 """
 
 from __future__ import annotations

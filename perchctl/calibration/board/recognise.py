@@ -2,7 +2,7 @@
 
 For chessboards, this is the grid of corners that most images show, at least two. For boards with
 markers, it is the dictionary that decodes most of them, and the layout whose corners OpenCV then
-finds. A board is named only if it is certain.
+finds. A board is named only if it is identified with certainty.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from perchctl.profile import aruco_dictionary
 from perchctl.target import Board, mm_text
 
 MOST_PICTURES = 5
-"""Number of images that are searched for a chessboard, each within some tenths of a second."""
+"""Number of images that are searched for a chessboard; each search takes some tenths of a
+second."""
 MARKER_PICTURES = 3
-"""Number of them that are searched for markers, each within about a second."""
+"""Number of these images that are searched for markers; each search takes about a second."""
 MIN_MARKERS = 4
 """Least number of markers. Fewer may belong to the perching target, or be patterns that look like
 markers."""
 MIN_MARKER_CORNERS = 12
-"""Number of a ChArUco board's corners that a layout must explain to be named."""
+"""Number of corners that must be found with a ChArUco board's layout before the board is named."""
 GRID_START = (5, 4)
-"""Grid from which OpenCV grows the board. From a smaller grid, it stops inside the board. A grid
-that has not grown may be a part of a board, or a keyboard."""
+"""Grid of corners from which OpenCV grows the board. From a smaller grid, it stops inside the
+board. A grid that has not grown may be part of a board, or a keyboard."""
 _SIZES = (50, 100, 250)
-"""Sizes of the dictionaries of one family. Boards have fewer than 250 markers, and the dictionary
-of 1000 would take longer."""
+"""Sizes of the dictionaries of one family. Boards have fewer than 250 markers, and searching with
+the dictionaries of 1000 would take longer."""
 _DICTIONARIES = (
     *(f"DICT_{bits}X{bits}_{_SIZES[-1]}" for bits in (4, 5, 6, 7)),
     "DICT_ARUCO_ORIGINAL",
@@ -132,7 +133,7 @@ def _stem(dictionary: str) -> str:
 
 
 def _layouts(named: Board, markers: int) -> list[Board]:
-    """Return the boards of squares with that many markers."""
+    """Return the ChArUco boards that have this many markers."""
     sizes = [
         (columns, rows)
         for columns in range(3, markers)
@@ -147,8 +148,8 @@ def _layouts(named: Board, markers: int) -> list[Board]:
 
 
 def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
-    """Return the board with the most corners in the image in either layout, the first of several;
-    None if none has enough."""
+    """Return the board with the most corners in the image in either layout, the first one if
+    several have equally many; None if none has enough."""
     best, most = None, MIN_MARKER_CORNERS - 1
     for board in boards:
         for legacy in {board.legacy, board.has_two_layouts}:

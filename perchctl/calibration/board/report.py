@@ -34,15 +34,16 @@ _LONG_SHARE = 0.04
 """Length at which a long residual is drawn, in image widths. Larger: neighbours cross. Smaller:
 their directions cannot be seen."""
 _LONG_PERCENTILE = 95.0
-"""Percentile of the residuals' lengths that counts as a long residual. Larger: a few outliers
-shrink the others. Smaller: the longest ones leave the image."""
+"""Percentile of the residuals' lengths that is used as the length of a long residual. Larger: a few
+outliers shrink the others. Smaller: the longest ones leave the image."""
 _LEAST_RESIDUAL_PX = 1e-3
-"""Length as which shorter residuals are drawn, px: exact corners have none."""
+"""Smallest length that counts as a long residual, px: with exact corners, all residuals are 0."""
 _LEAST_STEPS = 2
-"""Least number of steps of the distance axis, which has up to 2.5 times as many. Larger: labels
+"""Least number of steps on the distance axis; there may be up to 2.5 times as many. Larger: labels
 overlap."""
 _STEPS = (1.0, 2.0, 5.0)
-"""Leading digits of the enlargement, of the key's length and of an axis's steps."""
+"""Leading digits to which the enlargement, the length of the scale arrow and the steps of an axis
+are rounded."""
 
 
 @dataclass(frozen=True, eq=False)

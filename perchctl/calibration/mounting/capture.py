@@ -20,15 +20,17 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame
 
 LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
-"""Least duration of each part's recording, s, even if no motion is missing any more."""
+"""Least duration of each part's recording, s, even if no motion is missing."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5
-"""Age at the start of a part above which an attitude cannot belong to any of its images, s."""
+"""Attitudes that are older than this at the start of a part, s, cannot belong to any of its
+images."""
 MIRRORED_PICTURES = 60
-"""Number of mirrored images, with no others, after which the recording ends."""
+"""The recording ends after this many mirrored images if no image has yielded a pose."""
 SHARE_OVER = 60
-"""Number of newest images over which the displayed share with a target is computed."""
+"""Number of the newest images from which the displayed share of images with a target is
+computed."""
 LEAST_TARGET_SHARE = 0.3
 
 

@@ -138,8 +138,8 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """Return the target's rotation in the world: from the image whose rotation has the smallest
-    median distance to those from the other images."""
+    """Return the target's rotation in the world, taken from the image whose rotation has the
+    smallest median distance to the rotations from the other images."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam
@@ -249,23 +249,24 @@ def interpolate_rotation(gyro: GyroRotation, t_s: Array) -> GyroRotation:
 
 
 def _turns(vectors: Array) -> Array:
-    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    """Convert rotation vectors (..., 3) to rotation matrices (..., 3, 3)."""
     return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
 def _vectors(R: Array) -> Array:
-    """Return rotation vectors (n, 3) of rotation matrices (n, 3, 3)."""
+    """Convert rotation matrices (n, 3, 3) to rotation vectors (n, 3)."""
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
 # --- The camera's rotation and latency without an initial guess ---
-# Between two images, the camera rotates by the same rotation as the body, expressed in its own
-# axes: ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency on a grid, the best
+# Between two images, camera and body undergo the same rotation, each expressed in its own axes:
+# ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency on a grid, the best
 # R_body_cam has a closed-form solution; the latency with the smallest misfit is used.
 
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
-"""Latencies of the grid, s. It contains impossible ones, so that a wrong clock is recognised."""
+"""Latencies of the grid, s. The grid contains impossible latencies too, so that a wrong clock is
+recognised."""
 _SPAN_S = (0.2, 0.5)
 _MOST_PAIRS = 400
 _FIT_ROUNDS = 3
@@ -313,9 +314,9 @@ def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
 
 # --- Robust least squares of misfits (n, 3), and the remaining uncertainty ---
 # The covariance of a pose is assumed to be correct up to a factor. A wrong timestamp adds an error
-# along the vehicle's rotation: the rate times the jitter. Factor and jitter are both estimated from
-# the misfits, which are treated as Student's t with few degrees of freedom, so that wrong poses
-# have little influence.
+# along the vehicle's rotation: the rate times the jitter. The factor and the jitter are both
+# estimated from the misfits, which are assumed to follow Student's t distribution with few degrees
+# of freedom, so that wrong poses have little influence.
 
 
 FREEDOM = 5.0

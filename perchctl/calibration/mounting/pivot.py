@@ -28,7 +28,7 @@ MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
 """Size of a jump, m, and the share of the misfit that it must explain to count as a slip. If the
 tip stays in place, a jump explains 4 % at most."""
-TIP_SIGMA_FLOOR_M = 5e-5  # smallest standard deviation of the tip on its point
+TIP_SIGMA_FLOOR_M = 5e-5  # smallest standard deviation of the tip's position on the pivot point
 _PIVOT_ITERATIONS = 12  # iterations of the least squares for the tip; more: takes longer
 _SPLITS = 19  # number of times at which a slip of the tip is tested; fewer: a slip may be missed
 _SLIP_ITERATIONS = 4  # iterations of the least squares for each of these; more: takes longer
@@ -92,7 +92,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
 
 
 def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
-    """Return the covariance (n, 3, 3) of the tip that each pose's error causes."""
+    """Return the covariance (n, 3, 3) of the tip's position due to the error of each pose."""
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
@@ -129,5 +129,5 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
 
 
 def _size(rows: PoseResiduals) -> float:
-    """Return the total size of all misfits, in which single outliers count little."""
+    """Return the robust mean size of all misfits, in which single outliers count little."""
     return float(np.log1p(rows.chi2 / 3.0).mean())

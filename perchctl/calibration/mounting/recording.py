@@ -48,9 +48,9 @@ class AttitudeSample:
 class TargetPose:
     """The target in the camera's frame.
 
-    `t_s` is the camera's timestamp, not corrected for latency. `covariance` (6, 6) is that of a
-    small rotation in camera axes (rad, multiplied from the left to `rotation_cam_target`), then of
-    the position (m).
+    `t_s` is the camera's timestamp, not corrected for latency. `covariance` (6, 6) refers first to
+    a small rotation in camera axes (rad, multiplied onto `rotation_cam_target` from the left), then
+    to the position (m).
     """
 
     t_s: float
@@ -127,7 +127,8 @@ class MountingRecording:
 
 
 def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
-    """The numbers of a key, or a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
+    """The numbers under a key as an array, or a float if `shape` is (). Raises KeyError, TypeError,
+    ValueError."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{key} must contain {math.prod(shape)} numbers")
@@ -172,8 +173,8 @@ LEAST_POSES: dict[MountingPart, int] = {"carry": 150, "pivot": 100}
 LEAST_ATTITUDES = 500
 TILT_DEG: dict[MountingPart, float] = {"carry": 30.0, "pivot": 25.0}
 YAW_DEG, LEAST_RATE_DPS = 90.0, 15.0
-"""Range of the rotation about the vertical from one side to the other with the target in view, and
-its least rate; only for a carry."""
+"""Least range of the rotation about the vertical, from one side to the other with the target in
+view, and the least rate of rotation; only for a carry."""
 MOST_LATE_S = 1.0
 
 
@@ -232,7 +233,7 @@ def missing_motion(recording: MountingRecording) -> list[str]:
             lacking.append(f"turn the vehicle faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
         if len(attitudes) < LEAST_ATTITUDES:
             lacking.append(f"telemetry: {len(attitudes)} of {LEAST_ATTITUDES} samples")
-    seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # time in which the target is seen
+    seen_s = float(np.minimum(np.diff(arrays.t_s), 0.2).sum())  # time with the target in view
     if seen_s < LEAST_SEEN_S[part] or len(poses) < LEAST_POSES[part]:
         lacking.append(f"continue: {seen_s:.0f} of {LEAST_SEEN_S[part]:.0f} s in view")
     return lacking
