@@ -6,7 +6,7 @@ opened or armed. To fly, simulate or draw a fleet:
 
     fleet = load_fleet("atrium.yaml")   # Fleet; raises NotFound, InvalidValue, one sentence each
     fleet.vehicles                      # FleetVehicle: name, home_m, target_m, and an ordinary
-                                        # Profile, with which a single flight is flown as it is
+                                        # Profile, with which the vehicle can also fly alone
     plan = make_plan(fleet)             # FleetPlan; raises InvalidValue if it cannot be flown
     plan.fleet                          # the fleet with telemetry periods that fit its dongles
     plan.schedule.groups                # who flies together: (("north", "east"), ("south",))
@@ -27,13 +27,13 @@ A flight consists of one process per vehicle, and a parent process that sends th
         coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
         coordinator.run(until)          # in a thread of its own; or step() by step
         coordinator.confirm(), .land(name), .views, .has_ended
-    read_fleet_folder(folder)           # what such a flight has left
+    read_fleet_folder(folder)           # the results and logs of such a flight
 
 messages: the messages between parent and vehicle. vehicle_process: the vehicle's side.
 parent_watch: the operator's commands in it, and landing if the parent is gone. dispatch: who may
 take off, who lands, and who is too close, as pure functions. coordinator, children: the parent's
 side. prepare: checks before anything starts, and radio hubs. outcome: exit code and ``fleet.json``.
-folder: read that file again.
+folder: read ``fleet.json`` and the logs.
 
 load: the fleet file, and checks that two vehicles share nothing that they must not share. fleet:
 the frozen values. assignment: interchangeable targets. radio: dongles and the radio budget.

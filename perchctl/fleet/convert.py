@@ -39,8 +39,8 @@ class ConvertedVehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedFleet:
-    """Another program's list. `skipped`: the vehicles that are disabled in it. `in_room_axes`: it
-    says that a Lighthouse measures the positions."""
+    """Another program's list. `skipped`: the vehicles that are disabled in the list.
+    `in_room_axes`: True if, according to the list, a Lighthouse measures the positions."""
 
     name: str
     vehicles: tuple[ConvertedVehicle, ...]
@@ -175,7 +175,7 @@ def _is_number(value: Any) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # error for an integer that is too large for a float
+    except OverflowError:  # raised for an integer that is too large for a float
         return False
 
 

@@ -40,14 +40,14 @@ ROUND_S = 0.02
 """Time between two rounds, s. Longer: a stop is delayed for longer. Shorter: the rounds use too
 much computing time."""
 START_HUNG_S = 60.0
-"""The same time for a process that has not sent anything yet, s. On a busy computer, loading its
-libraries takes half a minute, and nothing is armed before all vehicles are ready. Longer: the
-operator waits for a process that hangs while it starts. Shorter: a busy computer cannot start a
-fleet."""
+"""Time after which a process that has not sent anything yet is killed, s. On a busy computer,
+loading its libraries takes half a minute, and nothing is armed before all vehicles are ready.
+Longer: the operator waits for a process that hangs while it starts. Shorter: a busy computer cannot
+start a fleet."""
 LOOP_HUNG_S = 60.0
 """Time without an iteration (turn) of its flight loop after which a process is killed, s. It is
 longer than a landing by the watchdog takes, including closing the link and the log. Longer: the
-fleet waits for nothing."""
+fleet waits needlessly."""
 
 
 class Child(Protocol):
@@ -137,7 +137,7 @@ class Coordinator:
         self._confirmed = True
 
     def land(self, name: str) -> None:
-        """Land one vehicle. If it is still on the floor, it will not take off any more. Raises
+        """Land one vehicle. A vehicle that is still on the floor can no longer take off. Raises
         InvalidValue if no vehicle in the fleet has this name."""
         if name not in self._children:
             known = ", ".join(self._children)
@@ -180,8 +180,8 @@ class Coordinator:
 
     def step_stopping(self) -> None:
         """Order all vehicles to land or, on the operator's command, to cut their motors, and
-        receive what can still be received. An error with one vehicle does not prevent the orders to
-        the others."""
+        receive the messages that can still be received. An error with one vehicle does not prevent
+        the orders to the others."""
         now_s, word = self._clock(), self._switch.read()
         order = Order(
             word=OperatorRequest.CUT_MOTORS
@@ -202,8 +202,8 @@ class Coordinator:
         self.rounds += 1
 
     def _watch_distances(self) -> None:
-        """Land both vehicles of a pair that came too close. The landing continues even when they
-        are apart again."""
+        """Land both vehicles of a pair that came too close. The landing continues even after they
+        have moved apart again."""
         self.unwatched = find_unwatched(self._plan, self._views)
         for pair in find_near_pairs(self._plan, self._views):
             both = {pair.first, pair.second}
@@ -273,8 +273,8 @@ class Coordinator:
 
 
 def _explained(result: Result, why: str | None) -> Result:
-    """Return the result with the reason `why`, for a vehicle that the parent did not permit to fly,
-    or has landed."""
+    """Return the result, with the reason `why`, for a vehicle that the parent has landed or did not
+    permit to fly."""
     if why is None or result.exit_code == 0:
         return result
     return replace(result, reason=f"{why}: {result.reason}")

@@ -40,20 +40,20 @@ FRESH_STATUS_S = 1.0
 as ready. Shorter: a busy computer delays the start."""
 
 NEAR_MARGIN_M = 2.0 * ROOM_ERROR_M
-"""Two vehicles land if they are closer than the plan promises by this distance, m; the positions of
-both may be wrong by `ROOM_ERROR_M`. Larger: two vehicles that approach each other are noticed
-later. Smaller: such errors land vehicles that are far enough apart."""
+"""Two vehicles land if their distance is smaller than the plan's separation by more than this
+margin, m; the positions of both may be wrong by `ROOM_ERROR_M`. Larger: two vehicles that approach
+each other are noticed later. Smaller: such errors land vehicles that are far enough apart."""
 FRESH_PLACE_S = 0.5
 """Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
 other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
 second, distances are unknown all the time."""
 HUNG_S = 10.0
 """Time without a message after which a process is ended, s. Its vehicle is down by then, since the
-firmware stops the motors 2 s after the last packet. Longer: the fleet waits for nothing. Shorter:
+firmware stops the motors 2 s after the last packet. Longer: the fleet waits needlessly. Shorter:
 flights are lost when a computer pauses, and a neighbour climbs while a vehicle that nobody controls
 may still be in the air."""
 ROUNDING_M = 1e-6
-"""Distance by which a vehicle at the very edge of its corridor may seem too near a climb, m.
+"""Rounding error by which a vehicle at the very edge of its corridor may seem too near a climb, m.
 Larger: a climb begins although another vehicle is too near."""
 
 
@@ -236,8 +236,8 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
 
     A vehicle without a known position is assumed to be in its corridor only if it has no position
     in room axes to report, still flies, answers, and is not landing. Otherwise it may be up to
-    `TARGET_ALONE_M` away from its path. So may one whose flight has ended without a known landing,
-    until it is down.
+    `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has ended
+    without a known landing, until it is down.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
     least_m = radius_m + plan.separation_m - ROUNDING_M
@@ -262,7 +262,7 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
 
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:
     """Return why this vehicle must not take off any more: another vehicle's flight has ended in its
-    corridor. Such a vehicle does not move again, so this is permanent."""
+    corridor. A vehicle whose flight has ended does not move again, so this reason is permanent."""
     corridor = plan.corridors[name]
     for other, result in ended.items():
         vehicle = plan.fleet.vehicle(other)

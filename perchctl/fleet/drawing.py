@@ -1,7 +1,7 @@
 """The room from above: homes, corridors, targets and order, as text and as SVG.
 
-In both, the room's x axis points to the right and y up. A plan that is refused is drawn as well,
-without the order of flight, to show which vehicles are in each other's way.
+In both drawings, the room's x axis points to the right and its y axis up. A plan that is refused is
+drawn as well, without the order of flight, to show which vehicles are in each other's way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ DRAWING_COLUMNS = 80
 DRAWING_ROWS = 34
 """Rows of the map. With more, it does not fit on a screen together with its legend."""
 CELL_ASPECT = 2.0
-"""Ratio of height to width of a character in usual terminals."""
+"""Ratio of height to width of a character in a typical terminal."""
 MARGIN_M = 0.2
 """Margin around the corridors, m."""
 OVERLAP = "#"
@@ -34,8 +34,8 @@ _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     """The room in at most 80 columns: a map, and a line for each vehicle.
 
-    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` lies in one
-    corridor, ``#`` in several.
+    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` marks a place in
+    one corridor, ``#`` a place in several.
     """
     corridors = _corridors(fleet)
     low, high = _bounds(corridors)

@@ -65,8 +65,8 @@ class FleetVehicle:
 
     @property
     def address(self) -> str:
-        """The same text for all URIs of a vehicle: without the dongle and options, in one letter
-        case."""
+        """A text that is the same for all URIs of a vehicle: its URI without dongle and options, in
+        one letter case."""
         return vehicle_uri(self.uri)
 
     @property
@@ -76,8 +76,8 @@ class FleetVehicle:
 
     @property
     def as_flown(self) -> FleetVehicle:
-        """The vehicle as its own process flies it. The axes of a simulated vehicle start where it
-        stands, even if a simulated motion-capture system measures its position."""
+        """The vehicle as its own process flies it. The axes of a simulated vehicle have their
+        origin where it stands, even if a simulated motion-capture system measures its position."""
         if not self.simulated or self.frame == "home":
             return self
         return replace(self, frame="home").with_target(self.target_m)

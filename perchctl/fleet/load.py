@@ -36,8 +36,8 @@ from perchctl.profile import (
 EXAMPLE_FLEET = "four"
 """The fleet in the package that is used if none is named."""
 FARTHEST_M = 50.0
-"""Largest distance of a home or target from the room's origin, m. Farther off, the numbers are
-probably millimetres."""
+"""Largest distance of a home or target from the room's origin, m. A number beyond this limit is
+probably in millimetres."""
 _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
 _NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
@@ -166,9 +166,9 @@ def _vehicle(
 
 
 def default_frame(profile: Profile) -> Frame:
-    """Return the frame of a vehicle if the fleet file does not say it. Motion capture measures in
-    room axes. A deck may be a Lighthouse but, since a profile does not say which deck it is, it
-    counts as a Flow deck, whose drift needs more room."""
+    """Return the frame of a vehicle for which the fleet file does not specify one. Motion capture
+    measures in room axes. A deck may be a Lighthouse but, since a profile does not say which deck
+    it is, it counts as a Flow deck, whose drift needs more room."""
     return "room" if profile.positioning.source.is_mocap else "home"
 
 

@@ -1,7 +1,7 @@
 """Fly a whole fleet in lockstep: one room, one clock, and the same result for the same seed.
 
-Each vehicle's flight is a flight in lockstep, flown and judged as by `perchctl simulate --faults`.
-It runs in a `ThreadCoroutine` that pauses at each tick of the room's clock:
+Each vehicle flies in lockstep and is judged as in `perchctl simulate --faults`. It runs in a
+`ThreadCoroutine` that pauses at each tick of the room's clock:
 
     for each group of the schedule:
         until all of its flights have ended:
@@ -328,7 +328,7 @@ class FleetFlight:
 
     def _in_the_way(self, other: str, name: str) -> str:
         """Return why a vehicle whose flight has ended is in the way of `name`; empty if none is. A
-        vehicle at an unknown position (NaN) always is."""
+        vehicle at an unknown position (NaN) is always in the way."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
         does = "hangs" if hangs else "lies"

@@ -3,9 +3,9 @@
     parent  --- Order, ten times a second and when it changes --->  vehicle
     parent  <-- Status, ten times a second, and one Result -------  vehicle
 
-Every message contains a whole state, never a change. If one is lost, late or duplicated, the next
-one corrects it, and none has to be answered. The command in the last `Order` that arrives stays
-valid, and without another order the vehicle lands after
+Every message contains a complete state, never a change of one. If a message is lost, late or
+duplicated, the next one corrects it, and no message needs an answer. The command in the last
+`Order` that arrives stays valid, and without another order the vehicle lands after
 `perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off is valid only for the
 iteration of the flight loop (turn) that reads it, and a permission to climb only while it is fresh.
 A command to land or to cut the motors takes precedence over both.
@@ -22,7 +22,7 @@ from perchctl.mission import OperatorRequest, Phase
 
 BEAT_S = 0.1
 """Time between two messages in each direction, s. Longer: only few arrive within the second after
-which a silent parent counts as dead. Shorter: they cost computing time."""
+which a silent parent counts as dead. Shorter: the messages cost computing time."""
 
 
 class Stage(Enum):

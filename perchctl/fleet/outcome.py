@@ -45,7 +45,7 @@ _WORST_FIRST: tuple[type[PerchError], ...] = (
     UsageError,
     LogIncomplete,
     ReplayDiffers,
-    Interrupted,  # last: vehicles are landed because another one has failed
+    Interrupted,  # last: it also ends vehicles that land because another one has failed
 )
 
 

@@ -46,8 +46,8 @@ class ParentSwitch(OperatorSwitch):
     _counting: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def take(self, order: Order) -> None:
-        """Process an order. Its command cannot revoke an earlier one. If orders arrive again from a
-        parent that was considered lost, they can still cut the motors, but cannot give
+        """Process an order. The command in an order cannot revoke an earlier one. If orders arrive
+        again from a parent that was considered lost, they can still cut the motors, but cannot give
         permission."""
         self._heard = True
         self._newest = order

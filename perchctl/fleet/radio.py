@@ -2,9 +2,9 @@
 
 A Crazyradio sends one packet at a time and receives one in its answer, so a vehicle can send only
 as often as it is polled. cflib polls the vehicles of a dongle in turn, whether or not they have
-anything to send. Before each packet it sets the dongle's address, and its channel if that differs.
-Each of n vehicles therefore gets an equal share, and a share is enough if it exceeds both what the
-vehicle sends (telemetry) and what it receives (setpoints and positions).
+anything to send. Before each packet, cflib sets the dongle's address, and its channel if that
+differs. Each of n vehicles therefore gets an equal share, and a share is enough if it exceeds both
+what the vehicle sends (telemetry) and what it receives (setpoints and positions).
 
 The figures were measured with cflib's threads over a simulated dongle (0.7 ms per packet, 1.25 ms
 per setting). They have not been confirmed with a real dongle.
@@ -34,27 +34,29 @@ SAME_CHANNEL_PER_S = {2: 245.0, 3: 162.0, 4: 123.0}
 """Measured packets per second for each of this many vehicles on one channel of one dongle. Too
 large: telemetry comes late in flight. Too small: fleets that could fly are refused."""
 OTHER_CHANNELS_PER_S = {2: 151.0, 4: 73.0}
-"""The same on different channels of one dongle, measured, which is why perchctl refuses this."""
+"""Measured packets per second for each of this many vehicles on different channels of one dongle.
+Because they are so few, perchctl refuses such fleets."""
 PACKET_S = 0.00206
 """Duration of a packet on a shared dongle, s, the longest of `SAME_CHANNEL_PER_S` (3 vehicles): 0.7
 ms on the air, 1.25 ms for the address, and the rest for Python's threads. It is used for larger
 numbers of vehicles than were measured."""
 USABLE_SHARE = 0.8
-"""Usable part of a share. The rest is for lost packets, for a neighbour that does not answer, which
-costs 2 ms per turn (measured), and for a busy computer. There, a hub over the same simulated dongle
-carried 207 packets per second for each of two vehicles and 111 for each of four, 0.85 and 0.9 of
-the shares. Larger: telemetry comes late; at 0.9, in one run, two simulated flights with telemetry
-every 10 ms were aborted. Smaller: telemetry is slower than necessary."""
+"""Usable part of a vehicle's share of the packets. The rest is for lost packets, for a neighbour
+that does not answer, which costs 2 ms per turn (measured), and for a busy computer. On a busy
+computer, a hub over the same simulated dongle carried 207 packets per second for each of two
+vehicles and 111 for each of four, 0.85 and 0.9 of the shares. Larger: telemetry comes late; at 0.9,
+in one run, two simulated flights with telemetry every 10 ms were aborted. Smaller: telemetry is
+slower than necessary."""
 MOST_ON_A_DONGLE = 5
 """Largest number of vehicles on one dongle: users of cflib report three to five."""
 LEAST_APART = 2
-"""Least number of channels between two dongles: at 2M, a channel is 2 MHz wide, which is two
-channels (bitcraze/cfcli)."""
+"""Least number of channels between two dongles: at 2M, a signal is 2 MHz wide, which is the width
+of two channels (bitcraze/cfcli)."""
 SLOWEST_PERIOD_S = SafetyConfig.proof_age_s / 2
 """Slowest telemetry period that is chosen, s. With a slower one, the telemetry could prove nothing
 after a single lost packet."""
 LEAST_RATE_HZ = 10
-"""Lowest rate of sent positions, Hz, which `positioning.rate_hz` allows."""
+"""Lowest rate at which `positioning.rate_hz` allows positions to be sent, Hz."""
 MEASURED_RATE = "2M"
 """Data rate to which all figures above apply; the capacity at 1M and 250K has not been measured."""
 
@@ -135,7 +137,7 @@ def needed_per_s(profile: Profile, period_s: float | None = None) -> float:
     """Return the packets per second that a flight needs at the telemetry period `period_s`, by
     default the profile's.
 
-    Each exchange carries one packet in each direction, so the larger of both numbers counts.
+    Each exchange carries one packet in each direction, so the larger of the two numbers counts.
     """
     period_s = profile.link.telemetry_period_s if period_s is None else period_s
     return max(telemetry_packets_per_s(period_s), uplink_per_s(profile))

@@ -12,7 +12,7 @@ from perchctl.faults import ENDS, FLAGS, HEALTHY, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
-"""Number of fleets that are named."""
+"""Number of the worst fleets that are named in the text."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ def _least(values_m: Sequence[float | None]) -> float | None:
 
 
 def worst_fleets(results: Sequence[FleetResult]) -> list[FleetResult]:
-    """Return the fleets in which something went wrong: first collisions, then flags that count."""
+    """Return the fleets in which something went wrong: first those with collisions, then those with
+    flags that count against the program."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-r.collisions, -sum(v.is_bad for v in r.vehicles), r.seed))
 

@@ -1,9 +1,9 @@
 """One simulated room: the positions of a fleet's vehicles, the downwash between them, and how close
 they come to each other.
 
-Each vehicle is simulated in its own axes, whose origin is the floor below its start. With an
-estimate in room axes, the flight would be the same with other numbers, so it is simulated in these
-axes as well. The room converts all positions with `FleetVehicle.to_room`.
+Each vehicle is simulated in its own axes, whose origin is the floor below its start. A flight with
+an estimate in room axes would differ only in its coordinates, so it is simulated in the vehicle's
+own axes as well. The room converts all positions with `FleetVehicle.to_room`.
 
 No vehicle starts exactly where the fleet file says. An estimate that starts at zero does not show
 the difference; an estimate in room axes does.
@@ -31,10 +31,10 @@ from perchctl.sim import (
 
 START_ERROR_M = 0.03
 """Largest error of a home in the fleet file on each axis, m: the homes are measured with a tape,
-and the vehicles are placed by hand. Larger: flights that no plan allows for."""
+and the vehicles are placed by hand. Larger: vehicles start at places that no plan allows for."""
 START_TURN_DEG = 2.0
-"""Largest error of a vehicle's heading from `heading_deg`. Larger: over a flight of 2 m, it causes
-a larger error than the drift."""
+"""Largest error of a vehicle's heading from `heading_deg`. Larger: over a flight of 2 m, the
+heading causes a larger error than the drift."""
 SEEN_M = 3.0
 """Distance beyond which a neighbour's target is never in the picture of a camera below another
 target, m. Larger: pictures take longer to compute."""

@@ -32,8 +32,8 @@ from perchctl.profile import CorridorConfig, MarkerConfig, Profile
 
 WANDER_M = 0.3
 """Horizontal distance by which a draught may move a healthy vehicle from its setpoint, m. It is
-also the profile's lower limit of the fence (`0.3 <= safety.fence_radius_m`). Smaller: gusts end
-flights. Larger: fewer vehicles fit into a room."""
+also the smallest fence radius that a profile allows (`0.3 <= safety.fence_radius_m`). Smaller:
+gusts end flights. Larger: fewer vehicles fit into a room."""
 ROOM_ERROR_M = 0.05
 """Error of a position in the room's axes, m. perchctl takes off only if estimate and motion capture
 agree within it (docs/positioning.md), and the Lighthouse geometries of two vehicles can differ by
@@ -57,13 +57,13 @@ less than the draughts in which perchctl perches. Distances between axes used el
 Bitcraze's demos, 0.24 m by Crazyswarm, 0.6 m in the firmware's avoidance. Smaller: neighbours
 disturb each other. Larger: fewer vehicles fit into a room."""
 START_SEPARATION_M = 0.5
-"""Distance of a vehicle that takes off from the corridor of another one that is flying, m, as in
-Bitcraze's demos. Smaller: a vehicle starts in another one's jet. Larger: homes must be farther
-apart."""
+"""Least distance between a vehicle that takes off and the corridor of another one that is flying,
+m, as in Bitcraze's demos. Smaller: a vehicle starts in another one's jet. Larger: homes must be
+farther apart."""
 OBSTACLE_M = 0.24
-"""Distance of a vehicle that waits or hangs from a corridor that is flown, m: twice the radius of
-0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch. Larger: fewer targets
-fit."""
+"""Least distance between a vehicle that waits or hangs and a corridor that is being flown, m: twice
+the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch. Larger:
+fewer targets fit."""
 
 
 # --- Corridors ---

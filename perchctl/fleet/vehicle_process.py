@@ -30,8 +30,8 @@ from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import NO_BATTERY_READING_V, PositionSetpoint, RawThrust
 
 OPTIONS_TIMEOUT_S = 60.0
-"""Time for the options of the flight, s, which the parent sends at once: nothing is connected
-before."""
+"""Time to wait for the options of the flight, s. The parent sends them at once, and nothing is
+connected before they arrive."""
 LAST_WORD_TIMEOUT_S = 2.0
 """Time for the parent to receive the result, s. Longer: a process lingers if its parent hangs.
 Shorter: a busy parent may miss the result and report the process as failed."""
@@ -267,7 +267,7 @@ class StatusReporter(Watcher):
             self._setpoint_s = None
         try:
             status = flight_status(tick)
-        except Exception as error:  # if detached, its loop would seem to hang
+        except Exception as error:  # detaching this watcher would make the loop seem to hang
             status = Status(
                 stage=Stage.FLYING,
                 phase=tick.state.phase,

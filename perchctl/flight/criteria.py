@@ -57,18 +57,19 @@ REST_S = 1.9
 """Time for which the state estimate must have stood still before a take-off. The loop keeps no
 older samples. Shorter: a slow drift is harder to detect."""
 DRIFT_M = 0.07
-"""Largest distance by which the estimate may move in that time (0.037 m/s). A healthy estimate
-moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from images, and
-0.035 m with ranging anchors."""
+"""Largest distance by which the estimate may move within `REST_S` (0.037 m/s). A healthy estimate
+moves by up to 0.006 m with a Flow or Lighthouse deck, 0.03 m with positions from images, and 0.035
+m with ranging anchors."""
 STANDING_MPS = 0.1
-"""Largest mean velocity of the estimate in that time. With the target as the only source of
+"""Largest mean velocity of the estimate over `REST_S`. With the target as the only source of
 positions, it reaches 0.076 m/s on a slope of 9 deg, because the tilted accelerometer misleads the
 estimate."""
 ESTIMATE_AGREE_M = 0.1
-"""Largest distance between estimate and capture once positions are fused. Larger: positions meant
-for another vehicle are taken for this vehicle's."""
+"""Largest distance between the estimated and the measured position once positions are fused.
+Larger: positions meant for another vehicle are taken for this vehicle's."""
 ESTIMATE_AGREE_DEG = 15.0
-"""Largest difference in heading. Larger: another rigid body is taken for the vehicle's."""
+"""Largest difference between the estimated and the measured heading. Larger: another rigid body is
+taken for the vehicle's."""
 
 _FORBIDDEN = (
     (LOCKED, "is locked", "inspect it and restart it"),
@@ -282,7 +283,7 @@ class GroundCriteria:
 
     @property
     def not_still(self) -> Problem | None:
-        """Problem: the vehicle moves or vibrates: its accelerometer does not read 1 g."""
+        """Problem: the accelerometer does not read 1 g, so the vehicle moves or vibrates."""
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
             return None
@@ -329,9 +330,9 @@ class GroundCriteria:
         moved, or its mean velocity was too high.
 
         The vehicle stands still, so something misleads its estimate: optical flow over a dark
-        floor, a base station that was moved, or the positions of another body. Or somebody carries
-        the vehicle too smoothly for its accelerometer to detect it. If the samples span less time,
-        only those are checked.
+        floor, a base station that was moved, or the positions of another body. It is also possible
+        that somebody carries the vehicle too smoothly for its accelerometer to detect it. If the
+        samples span less time, only those are checked.
         """
         if not samples:
             return None

@@ -305,16 +305,17 @@ class FlightInputs:
 
 # --- The target as positioning system, tick by tick ---
 # While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
-# better than from any image, so the known position is sent instead. This ends with the first sample
-# in which the accelerometer no longer shows that something supports the vehicle. Otherwise a
-# falling vehicle would receive the position of a hanging one, and its estimate would agree.
+# better than from any image, so the known position is sent instead. The known position is sent only
+# until the first sample in which the accelerometer no longer shows that something supports the
+# vehicle. Otherwise a falling vehicle would receive the position of a hanging one, and its estimate
+# would agree.
 
 
 SUPPORTED_FOR_S = 0.1
 SUPPORTED_SAMPLE_G = 0.25
 """Largest deviation from 1 g of a single accelerometer sample of a supported vehicle, g. Running
-motors cause a spread of 0.04 g. Smaller: their vibration counts as a fall. Larger: the beginning of
-a fall counts as support."""
+motors cause a spread of 0.04 g. Smaller: the vibration of the motors counts as a fall. Larger: the
+beginning of a fall counts as support."""
 SUPPORTED_MEAN_G = 0.06
 """Largest deviation from 1 g of the mean over `SUPPORTED_FOR_S`, g. Running motors cause a spread
 of 0.013 g."""
@@ -337,8 +338,8 @@ class TargetPositioning:
         self._touches = False
 
     def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:
-        """Begin a tick: if the vehicle's support shows its position without an image, send that
-        position."""
+        """Begin a tick: if the vehicle's position is known without an image because something
+        supports the vehicle, send that position."""
         newest = history.newest
         self._touches = in_contact
         if newest is None or not is_supported(history, now_s):

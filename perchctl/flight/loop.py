@@ -57,8 +57,8 @@ TURN_HANG_S = 0.25
 """Duration of a turn above which something has hung, so that the turn's data about the vehicle is
 out of date, s."""
 PERMISSION = "permission to take off"
-"""What a vehicle still waits for, as shown to the operator, when its own checks have passed but
-other vehicles fly in the same room."""
+"""The only remaining condition for a vehicle whose own checks have passed while other vehicles fly
+in the same room, as shown to the operator."""
 PERMISSION_PERIOD_S = 0.1
 """Period of the turns while waiting for permission, s. Longer: take-off begins later after the
 permission. Shorter: vehicles on the floor take computing time from those in the air."""
@@ -160,7 +160,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         )
         with contextlib.suppress(Exception):  # the part that failed may fail again
             turns.report_failure(inputs, error)
-        with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
+        with contextlib.suppress(Exception):  # a judge's error must not replace the first one
             watchers.event(Event.make_rescue_note(parts.clock.now(), error, rest.state, rest.text))
         raise
 

@@ -54,13 +54,13 @@ SAME_PRESS_S = 0.3
 missed."""
 LONGEST_DELAY_S = 1.0
 """Longest time for which a keyboard waits before it repeats a key, s. Until then, a second press
-may be the first repeat of a held key. Larger: a held key only lands for longer, and evenly repeated
-presses stop the motors later."""
+may be the first repeat of a held key. Larger: a held key takes longer until it does more than land,
+and evenly repeated presses stop the motors later."""
 SHORTEST_DELAY_S = 0.25
 """Shortest time for which a keyboard waits before it repeats a key, s. Smaller: more presses by
 hand are taken for a held key."""
 SLOWEST_REPEAT_S = 0.2
-"""The longest time between two repeats of a key; larger delays the stop by a second press."""
+"""Longest time between two repeats of a key, s. Larger: the stop by a second press is delayed."""
 KEY_JITTER_S = 0.02
 """Longest delay with which a busy computer reads a repeat, s. Larger: more presses by hand are
 taken for a held key."""
@@ -75,10 +75,10 @@ LONGER_THAN_REPEATS = 1.2
 """Lowest ratio of a key's initial delay to the mean interval of its repeats. Presses by hand have
 similar intervals throughout."""
 SURE_REPEATS, SURELY_LONGER = 4, 2.0
-"""Number of even repeats, and the ratio of the first interval to theirs, from which the presses
-must come from a held key, even at a rate that a hand can reach."""
+"""Smallest number of even repeats, and smallest ratio of the first interval to their mean interval,
+with which the presses must come from a held key, even at a rate that a hand can reach."""
 STOP_HANG_S = 10.0
-"""Time within which a stopped flight must end, s. After it, the flight counts as hanging."""
+"""Time within which a stopped flight must end, s. After that, the flight counts as hanging."""
 _EPS_S = 1e-9
 
 
@@ -92,7 +92,7 @@ class OperatorSwitch:
     called from any thread.
 
     `interrupt` raises `Interrupted` if the flight loop is not listening yet, because there is
-    nothing to land, and from `STOP_HANG_S` after a stop on, because nothing is left to do.
+    nothing to land, and once `STOP_HANG_S` has passed after a stop, because nothing is left to do.
     """
 
     listening: bool = False

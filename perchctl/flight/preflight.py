@@ -296,7 +296,7 @@ def disarm_on_word(operator: Callable[[], OperatorRequest]) -> Callable[..., Arm
 
 
 LEAN_DEG = 5.0  # allowance for the tilt during the climb, also against a draught
-Start = tuple[float, float, float]  # the vehicle's position, in the world of the target's position
+Start = tuple[float, float, float]  # the vehicle's position, in the same axes as the target's
 
 
 def view_problem(
@@ -330,7 +330,8 @@ def view_problem(
 def target_view_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """The target as seen from a level vehicle at `body_m`, in the target's world."""
+    """The target as seen from a level vehicle at `body_m`, a position in the same axes as
+    `target`."""
     return view_from(
         np.array(body_m),
         yaw_rad,

@@ -90,7 +90,7 @@ def check_options(options: FlyOptions) -> None:
     if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.source.is_mocap and find_spec("motioncapture") is None:
-        raise no_motion_capture()  # it also reads the simulated room; only a host is not needed
+        raise no_motion_capture()  # the simulated system needs this library too, but no host
     source = parse_source(options.source)
     if source.is_own:
         load_extension(options.source, "camera.source")
@@ -119,7 +119,7 @@ def fly_session(
     may_take_off: Callable[[str], bool] = lambda waiting: True,
     climb_withheld: Callable[[], str | None] = lambda: None,
 ) -> tuple[FlightReport, float | None]:
-    """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
+    """Fly once, in real time through cflib. Errors: any of `perchctl.errors`.
 
     Returns the report and, if a simulator can measure it, the gear's distance from the target's
     centre, m.

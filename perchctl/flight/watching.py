@@ -21,7 +21,8 @@ from perchctl.vision import Frame
 T = TypeVar("T")
 
 SLOW_WATCHER_S = 0.25
-"""Duration above which a call is reported, s: the watchdog steers meanwhile."""
+"""Duration above which a call of a watcher is reported, s, because the loop does not steer during
+it."""
 
 
 class FrameWatcher(Watcher, Protocol):

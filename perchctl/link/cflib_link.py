@@ -62,7 +62,8 @@ SILENCE_S = 1.5
 DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
-"""Time before the vehicle was last heard, s, from which on packets count as lost with the link."""
+"""A packet counts as lost with the link if it was sent later than this time before the vehicle was
+last heard, s."""
 FAREWELL = RawThrust(0)
 """The command that cflib's `close_link` sends."""
 
@@ -162,7 +163,7 @@ class CflibLink:
         return [] if self._sender is None else self._sender.new_notes()
 
     def close(self) -> None:
-        """Close the link. If the vehicle may still be flying, do so without cflib's farewell
+        """Close the link. If the vehicle may still be flying, close it without cflib's farewell
         packet.
 
         On the ground, a vehicle that does not arm itself is disarmed. If the vehicle still reports

@@ -1,9 +1,9 @@
 """Set up the estimator of a vehicle that uses external positions: set its parameters, start it, and
 check that estimate and measurement agree.
 
-On the ground only. The filter is reset to the measured pose while positions already arrive;
-otherwise it would drift. Positions do not determine the heading, and a wrong heading makes the
-vehicle fly away (docs/positioning.md).
+This is done only on the ground. The filter is reset to the measured pose while positions are
+already arriving; otherwise it would drift. Positions do not determine the heading, and a wrong
+heading makes the vehicle fly away (docs/positioning.md).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ RESET_STILL_M = 0.05
 """Largest motion from the reset until the agreement, m: a vehicle that moves further is being
 carried."""
 ESTIMATE_POLL_S = 0.02
-"""Time between two comparisons of estimate and capture, s."""
+"""Time between two comparisons of the estimate with the measured position, s."""
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
@@ -80,8 +80,8 @@ def settle_estimator(
 ) -> None:
     """Reset the estimator of a vehicle on the ground until it agrees with the feed, with a timeout.
 
-    `newest` returns the vehicle's newest telemetry, and `wait` waits for some seconds. Raises
-    ConnectionFailed for a vehicle that may be flying, NotFound, InvalidValue and TimedOut.
+    `newest` returns the vehicle's newest telemetry, and `wait` waits for a number of seconds.
+    Raises ConnectionFailed for a vehicle that may be flying, NotFound, InvalidValue and TimedOut.
     """
     end_s = clock() + config.connect_timeout_s
     while (status := feed.status(clock())).problem is not None or not status.sent:
@@ -97,7 +97,7 @@ def settle_estimator(
                 f"the vehicle at {uri} may be flying: its estimate is reset only on the ground"
             )
         start = feed.sent_pose()
-        assert start is not None  # the loop above has waited for one
+        assert start is not None  # the loop above has waited for a sent pose
         x, y, z = start.position_m
         set_parameters(cf, uri, estimator_start_parameters(start))
         # Only the estimate shows whether the reset was received, because the firmware may clear the

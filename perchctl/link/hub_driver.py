@@ -53,8 +53,8 @@ HELLO_TIMEOUT_S = 1.0
 """Timeout for the hub's first answer, s, which takes 1 ms on an idle computer. Longer: a dead hub
 is reported later. Shorter: connecting fails on a busy computer."""
 HELLO_PERIOD_S = 0.1
-"""Time between two requests for that answer, s, in case one gets lost. Longer: a lost request
-delays the connection. Shorter: no benefit."""
+"""Time between two requests for the hub's first answer, s, in case one gets lost. Longer: a lost
+request delays the connection. Shorter: no benefit."""
 SIGN_OF_LIFE_S = 1.0
 """Time between two requests of an open link, s. They tell the hub that the flight is still running.
 If the hub's process has ended, the operating system refuses them, so the flight detects this even
@@ -122,7 +122,7 @@ class HubDriver:
     """
 
     needs_resending = False  # the hub's radio driver has safelink
-    """Read by cflib: True would make it repeat its requests."""
+    """Read by cflib: with True, cflib would repeat its requests."""
 
     def __init__(self) -> None:
         self.uri = ""

@@ -275,7 +275,7 @@ def count_answers(driver: Any, on_answer: Callable[[bool | None], None]) -> None
     """Call `on_answer` after each packet of a radio's driver, in the driver's thread: with True if
     the vehicle acknowledged it, False if it was lost, None if the dongle failed.
 
-    cflib's statistics are made of acknowledged packets only.
+    cflib's own statistics include only acknowledged packets.
     """
     share = driver._radio
     send_packet = share.send_packet
@@ -303,7 +303,8 @@ def put_packet(driver: Any, packet: Any, wait_s: float) -> bool:
 def limit_rate(driver: Any, packets_per_s: int | None) -> None:
     """Limit how often a radio's driver polls its vehicle from the next poll on; None: no limit.
 
-    cflib reads the attribute before each poll, though it sets it only as the link is opened.
+    cflib reads the attribute `rate_limit` before each poll, although it sets the attribute only
+    when the link is opened.
     """
     driver._thread.rate_limit = packets_per_s
 
@@ -333,7 +334,7 @@ def close_radio(driver: Any, dongle: threading.Thread, timeout_s: float) -> None
     """Close a radio's driver, with a timeout, even if its dongle's thread has ended. Sends nothing.
 
     cflib's `close` joins the driver's thread, which may wait forever for an answer. Therefore an
-    answer of None is put into its queue, which makes it check if it should end.
+    answer of None is put into its queue, which makes the thread check whether it should end.
     """
     share = driver._radio
     closer = threading.Thread(target=driver.close, name="perchctl-close", daemon=True)

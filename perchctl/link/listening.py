@@ -82,8 +82,8 @@ MOST_ATTITUDE_SAMPLES = 20_000
 
 
 class AttitudeLink(ReadOnlyLink):
-    """A `ReadOnlyLink` that collects 100 attitude samples per second. Raises errors as `CflibLink`
-    does."""
+    """A `ReadOnlyLink` that collects 100 attitude samples per second. Raises the same errors as
+    `CflibLink`."""
 
     def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
         super().__init__(uri, config, clock)
@@ -213,7 +213,7 @@ class ProbeLink(ReadOnlyLink):
         """Blink all LEDs during the block; then the firmware controls them again.
 
         Raises, before the block, NotFound for firmware without `LED_PARAMETER`, InvalidValue and
-        TimedOut as `set_parameters`.
+        TimedOut as `set_parameters` does.
         """
         cf, ended = self._cf, threading.Event()
         set_parameters(cf, self._uri, {LED_PARAMETER: ALL_LEDS})

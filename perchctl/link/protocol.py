@@ -74,9 +74,9 @@ class VehicleLink(Protocol):
     and the profile's section `link`.
 
     `telemetry` and `problem` are called in one thread, 200 times a second, and `send` in another
-    one (after a hang, in a new one). An exception of the first two, exceptions of `send` for 0.5 s,
-    or a call longer than 0.5 s count as a lost link: perchctl continues to send, and lands the
-    vehicle.
+    one (after a hang, in a new one). An exception in `telemetry` or `problem`, exceptions in `send`
+    for 0.5 s, or a call longer than 0.5 s count as a lost link: perchctl continues to send, and
+    lands the vehicle.
     """
 
     def connect(self) -> None:
@@ -119,7 +119,7 @@ class VehicleLink(Protocol):
 
 USUAL_ADDRESS = "E7E7E7E7E7"
 """Default radio address of a Crazyflie."""
-_USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio URI without them
+_USUAL = ("2", "2M", USUAL_ADDRESS)  # default channel, rate and address of a radio URI
 _CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
 FORMS = {
     "sim": "",
@@ -166,7 +166,8 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """Return the same text for all URIs of a vehicle: without dongle, letter case and options."""
+    """Return a text that is the same for all URIs of a vehicle: the URI without dongle and options,
+    in one letter case."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

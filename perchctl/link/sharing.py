@@ -44,7 +44,7 @@ TICK_S = 0.02
 """Period of the dongle check, s. Longer: a dead dongle is reported later. Shorter: more processor
 time."""
 REPORT_PERIOD_S = 0.2
-"""Time between two reports, s. Longer: a lost report is made up for later. Shorter: more processor
+"""Time between two reports, s. Longer: a lost report is replaced later. Shorter: more processor
 time in each flight."""
 REFUSALS = 10
 """Number of successive packets for one vehicle without any answer from the dongle after which the
@@ -56,8 +56,8 @@ STUCK_TICKS = 25
 a working dongle reports even a lost packet within 2 ms. Counting ticks avoids a false alarm after
 the computer was suspended. More: reported later. Fewer: a slow USB call ends the flights."""
 REOPEN_PERIOD_S = 0.1
-"""Time between two attempts to open a dead dongle, s. Longer: it is available again later. Shorter:
-the computer scans its USB ports all the time."""
+"""Time between two attempts to open a dead dongle, s. Longer: the dongle is available again later.
+Shorter: the computer scans its USB ports all the time."""
 SAFELINK_PACKETS = 10
 """Number of packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md,
 "Safelink")."""
@@ -73,8 +73,8 @@ ROOM_WAIT_S = 0.005
 """Time for which a packet waits for the radio before its carrier checks the socket again, s.
 Longer: a new link from the flight is answered later. Shorter: more processor time."""
 IDLE_S = 0.1
-"""Time for which a thread waits for a packet before it checks whether it should end, s. Longer: it
-ends later. Shorter: more processor time."""
+"""Time for which a thread waits for a packet before it checks whether it should end, s. Longer: the
+thread ends later. Shorter: more processor time."""
 CLOSE_TIMEOUT_S = 3.0
 """Timeout for closing a driver, s; a USB call may take 2 s. Longer: a hanging dongle is reopened
 later. Shorter: it is reopened while the old driver still uses it."""
@@ -93,8 +93,8 @@ MOST_QUEUED_PACKETS = 64
 A flight's sender waits after each packet, but cflib's own requests do not. Larger: more packets are
 out of date. Smaller: cflib's requests get lost."""
 NULL_PACKET = 0xF3
-"""Header of the packet that a vehicle sends if it has no data. The signal strength may follow,
-which cflib's statistics have already read."""
+"""Header of the packet that a vehicle sends if it has no data. The signal strength may follow the
+header; cflib's statistics have already read it."""
 
 logger = logging.getLogger(__name__)
 
@@ -278,7 +278,7 @@ class Carrier:
     def _send(self, datagram: bytes) -> None:
         flight = self._flight
         if flight is not None:
-            with contextlib.suppress(OSError):  # lost like over the air
+            with contextlib.suppress(OSError):  # lost, as over the air
                 self.socket.sendto(datagram, flight)
 
 

@@ -42,7 +42,7 @@ BATTERY_BLOCK: dict[str, str] = {
     **dict.fromkeys(MOTOR_DUTIES, "uint16_t"),
 }
 """Uses 13 bytes. Without this block, the battery is unknown, which the flight tolerates (fault 7).
-The duty cycles are here because their thrust follows from the battery's voltage."""
+The duty cycles are in this block because the thrust also depends on the battery's voltage."""
 
 POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
 VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
@@ -63,8 +63,8 @@ def telemetry_from_log(
     battery_behind_s: float = 0.0,
     variance_behind_s: float = 0.0,
 ) -> Telemetry:
-    """Return telemetry from log variables by name; the other arguments as in `Telemetry`. Raises
-    KeyError if a needed value is missing."""
+    """Return telemetry from log variables, keyed by name; the other arguments are as in
+    `Telemetry`. Raises KeyError if a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     return Telemetry(
         t_s=t_s,
@@ -216,8 +216,8 @@ class SampleAssembler:
     ) -> Telemetry | None:
         """Process one packet of a block, and return the sample that it completes, if any.
 
-        `t_s` is the packet's stamp on the loop's clock, `start` as in `Timebase`; values from
-        before the newest restart are dropped.
+        `t_s` is the packet's stamp on the loop's clock, and `start` is as in `Timebase`; values
+        from before the newest restart are dropped.
         """
         if start < self._start:
             return None
@@ -261,7 +261,7 @@ BLOCKS_DELETED_AFTER_S = 1.0
 "Radio silence")."""
 RESUME_PERIOD_S = 0.25
 """Time between attempts to restart blocks, s; longer than the slowest block's period, so that a
-restarted block shows."""
+restarted block is noticed before the next attempt."""
 MOST_TELEMETRY_SAMPLES = 2000
 """Largest number of samples that wait to be read; older ones are dropped."""
 _SETTINGS, _CREATE, _START = 1, 6, 3  # channel of the log port, and commands

@@ -1,8 +1,8 @@
 """The Crazyflie's side of the link: packets in, firmware calls, packets out.
 
 It uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything that an
-unmodified cflib sends is answered as described in docs/firmware.md ("Connect sequence"). "Link"
-there describes ports and layouts, and "Signs and units" the signs.
+unmodified cflib sends is answered as described in docs/firmware.md ("Connect sequence"). In the
+same document, "Link" describes ports and layouts, and "Signs and units" describes the signs.
 """
 
 from __future__ import annotations
@@ -293,7 +293,7 @@ class CrtpServer:
         return packets
 
     def reboot(self) -> None:
-        """Restart the firmware. Its log blocks are lost."""
+        """Restart the firmware, which loses its log blocks."""
         self._firmware.reboot()
         self._blocks.clear()
 

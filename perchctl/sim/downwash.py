@@ -24,11 +24,12 @@ from __future__ import annotations
 import math
 
 AIR_DENSITY_KGPM3 = 1.2
-"""Density of air in a room at 20 degC. With it, the 42 g of the source give U = 5.06 m/s."""
+"""Density of air in a room at 20 degC. With this density, the source's vehicle of 42 g has U = 5.06
+m/s."""
 ROTOR_RADIUS_M = 0.0231
 """Radius of a Crazyflie 2.1's propeller."""
 MOTOR_DISTANCE_M = 0.092
-"""Distance between the axes of opposite motors, the length l of the source."""
+"""Distance between the axes of opposite motors, called l in the source."""
 ORIGIN = 5.82
 """Height of the jet's virtual origin above the rotors, in units of l."""
 DECAY = 10.11
@@ -55,8 +56,8 @@ missing."""
 
 def jet_mps(thrust_n: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed of the air, `below_m` below a vehicle and `aside_m` from its axis;
-    `thrust_n` is the total thrust of its rotors. 0 outside the jet or above the vehicle. SI
-    units."""
+    `thrust_n` is the total thrust of its rotors. The speed is 0 outside the jet or above the
+    vehicle. SI units."""
     if below_m <= 0.0 or thrust_n <= 0.0:
         return 0.0
     rotors_m2 = 8.0 * AIR_DENSITY_KGPM3 * math.pi * ROTOR_RADIUS_M**2

@@ -6,16 +6,16 @@
 - The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is a w +
   b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
   rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md, "Catching a
-  slip". At standstill it is `STANDING_LAG_S`, with which the slips on that page lose the measured
-  height.
+  slip". At standstill it is `STANDING_LAG_S`, with which simulated slips lose as much height as the
+  slips measured in docs/firmware.md.
 - Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within `MOTOR_COAST_S`,
-  the value that best fits the falls, landings and take-offs measured on that page. At any other
-  duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).
-- Motors of a kind differ (`Scenario.motor_strength`), and what each gives fluctuates
+  the value that best fits the falls, landings and take-offs measured in docs/firmware.md. At any
+  other duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).
+- Motors of one kind differ (`Scenario.motor_strength`), and the thrust of each fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) supplies 4.4 A at full thrust. Current and voltage sag are proportional to
-  thrust: the voltages that the page lists with the duty cycles lie on a line within 0.06 V, with a
-  sag of 0.63 V at full thrust.
+  thrust: the voltages that docs/firmware.md lists with the duty cycles lie on a line within 0.06 V,
+  with a sag of 0.63 V at full thrust.
 """
 
 from __future__ import annotations
@@ -83,10 +83,10 @@ STANDSTILL_V = motor_voltage(0.0)
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
-# - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's state
+# - Resting voltage by charge: the levels in tenths by which the firmware reports a battery's state
 #   (source: power management) are a discharge curve of the Crazyflie's own cell.
-# - The voltage falls under load by the cell's resistance at once, and in an old or cold cell by
-#   some more within `ION_DIFFUSION_S`: ions that have to diffuse over a longer distance.
+# - Under load, the cell's resistance makes the voltage fall at once. In an old or cold cell, it falls
+#   further within `ION_DIFFUSION_S`, because ions have to diffuse over a longer distance.
 # - An old cell holds less charge and has more resistance; `knee` is the share of the charge at
 #   which the steep end of the curve begins.
 
@@ -121,7 +121,7 @@ class Cell:
     """A battery cell: `rest_v` is its resting voltage, `battery_v` its voltage under load.
 
     Args:
-        ohm, slow_ohm: resistance that acts at once, and that acts slowly.
+        ohm, slow_ohm: the resistance that acts at once, and the one that acts slowly.
         charge: an old cell's capacity as a share of a new one's.
         knee: share of the charge below which the voltage falls steeply.
     """

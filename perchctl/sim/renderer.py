@@ -132,7 +132,7 @@ class Renderer:
 
         Args:
             T_world_cam_samples: poses (4, 4) at equal steps over the exposure,
-                first and last included; a single one is a still camera.
+                first and last included; a single pose means a still camera.
             defocus_px: sigma of the lens's blur; the scenario's if None.
             frame_index: chooses the noise.
 

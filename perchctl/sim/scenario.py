@@ -74,10 +74,10 @@ class Scenario:
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
             divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz. `thrust_noise`
             explains most of the reduction; the remainder is an assumption.
-        drag_nspm: level drag, N for each m/s. In 104 recorded flights 0.38 (0.36 to 0.41) of the
-            mass each second, which is 0.016 at 42 g.
+        drag_nspm: horizontal drag, N for each m/s. In 104 recorded flights, it was 0.38 (0.36 to 0.41)
+            times the mass per second, which is 0.016 at 42 g.
         airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
-            flight to the left, N.m for each m/s. In the same flights the motors hold against 0.8e-3
+            flight to the left, N.m for each m/s. In the same flights, the motors counteract 0.8e-3
             forward and 0.7e-3 sideways.
         ground_effect: share of thrust gained with the vehicle on the floor. Recorded take-offs of
             three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, 0.965 with 3 to 7.

@@ -1,4 +1,4 @@
-"""The scene of the simulated camera: printed sheets and the ceiling as textures, and the part of a
+"""The scene of the simulated camera: printed sheets and the ceiling as textures, and the part of an
 image that a sheet covers in one exposure.
 
 Textures are kept at several resolutions, each the exact or filtered mean over its texels' areas,
@@ -182,8 +182,8 @@ class PlacedSheet:
     to_sheet: Array | None = None
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
-        """The sheet as seen at the coarse nodes' points (rows, columns, 2), m, in the own
-        target's axes; None if the sheet is out of view.
+        """The sheet as seen at the coarse nodes' points (rows, columns, 2), m, in the axes of the
+        vehicle's own target; None if the sheet is out of view.
 
         `length_px` is the image's longest motion in the exposure."""
         if self.to_sheet is not None:

@@ -7,21 +7,21 @@ Assumptions of the model, each with its source:
 
 - Motors, their battery, and the curve between a motor's voltage and its thrust:
   `perchctl.sim.powertrain`.
-- Drag is linear in the airspeed, which R^2 = 0.98 confirms for 104 recorded flights; level it is
-  `Scenario.drag_nspm`, vertically 0.008 N/(m/s) of four rotors that lift 42 g (identified by
-  Foerster, ETH Zurich, 2015) and 0.001 of camera, board and gear.
+- Drag is linear in the airspeed, which R^2 = 0.98 confirms for 104 recorded flights; horizontally
+  it is `Scenario.drag_nspm`, vertically 0.008 N/(m/s) for four rotors that lift 42 g (identified by
+  Foerster, ETH Zurich, 2015) and 0.001 for camera, board and gear.
 - Airspeed tilts the vehicle away from its direction of flight, nose up in forward flight, by
   `Scenario.airspeed_moment_nmspm`.
 - Near the floor the rotors lift more, by `Scenario.ground_effect`.
-- A draught has a steady part and smooth gusts, which reach its nominal speed together when the
+- A draught has a steady part and smooth gusts, which together reach its nominal speed when the
   gusts are at two standard deviations (`Wind`).
 - The downwash of other vehicles in a fleet is `downwash_mps` (`perchctl.sim.downwash`).
 - Near the ceiling, suction pulls the rotors towards it: `Scenario.ceiling_suction` of their thrust
-  at the ceiling itself; with 0.1 as measured by benches with rotors of this size (Hsiao and
+  at the ceiling itself; with 0.1 as measured on test benches with rotors of this size (Hsiao and
   Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
-  hangs level and friction keeps the tip in its place: dry friction, without a creep under a
-  steady push (MuJoCo's `noslip`).
+  hangs level and friction keeps the tip in its place: dry friction, without creep under a steady
+  push (MuJoCo's `noslip`).
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class World:
         velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
         hold: bool = False,
     ) -> None:
-        """Put the vehicle into a pose, not rotating; `hold` keeps it there until `let_go`.
+        """Put the vehicle into a pose without rotation rates; `hold` keeps it there until `let_go`.
 
         The gyroscope does not sense the change of pose.
         """
@@ -284,8 +284,8 @@ _MODEL = """
 def build_model(scenario: Scenario) -> Any:
     """A `mujoco.MjModel` with the geoms "floor", "ceiling", "frame" and "gear".
 
-    The inertia is the Crazyflie 2.1's, scaled by mass, over the scenario's `authority`; the gear's
-    cylinder ends at its tip.
+    The inertia is the Crazyflie 2.1's, scaled by mass and divided by the scenario's `authority`;
+    the gear's cylinder ends at its tip.
     """
     scale = scenario.mass_kg / INERTIA_REFERENCE_KG / scenario.authority
     return mujoco.MjModel.from_xml_string(

@@ -197,7 +197,7 @@ class Controller:
         r = 0.5 * _saturated(self.roll_rate.update(roll_dps, now.gyro_x_dps))
         p = 0.5 * _saturated(self.pitch_rate.update(pitch_dps, -now.gyro_y_dps))
         y = -_saturated(self.yaw_rate.update(yaw_dps, now.gyro_z_dps))
-        # Neither bounded above nor below (see `MotorDriver`).
+        # Bounded neither above nor below (see `MotorDriver`).
         f = self.thrust
         return (f - r + p + y, f - r - p - y, f + r - p + y, f + r + p - y)
 
@@ -237,8 +237,8 @@ class Controller:
 
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out ---
 # In the firmware's order (source: power distribution, motor driver and stabiliser of release
-# 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
-# exceeds the full duty cycle is taken off all four. A single motor may therefore be commanded
+# 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then any excess
+# over the full duty cycle is subtracted from all four. A single motor may therefore be commanded
 # above its nominal full thrust, and delivers it as long as the battery voltage allows, so a yaw
 # step in hover loses no height (docs/firmware.md, "Yaw step").
 

@@ -33,9 +33,9 @@ class Firmware:
     """A Crazyflie 2.1, or the scenario's airframe, as firmware release 2026.08 (CRTP protocol 12)
     behaves.
 
-    docs/firmware.md describes and documents each behaviour. `step` senses, estimates, supervises,
-    controls, drives the motors and advances the world by `CONTROL_PERIOD_S`. Commands take effect
-    in the next step.
+    docs/firmware.md describes each behaviour and the evidence for it. `step` senses, estimates,
+    supervises, controls, drives the motors and advances the world by `CONTROL_PERIOD_S`. Commands
+    take effect in the next step.
     """
 
     LOG_VARIABLES: ClassVar[dict[str, LogVariable]] = LOG_VARIABLES

@@ -3,11 +3,11 @@ positions or poses.
 
 The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second, the
 gyroscope updates the attitude and the accelerometer updates the velocity. In flight, the velocity
-is updated along the thrust axis only, so drag and draught are not felt. Otherwise it is updated
-along all three axes, and the attitude is pulled towards the initial one. A position corrects
-position, velocity and attitude according to their covariance with it. The filter never sees the
-true state: the sensor errors (`Imu`) and any wrong position corrupt the estimate, because there is
-no gate (source).
+is updated along the thrust axis only, so drag and draught have no effect on it. Otherwise it is
+updated along all three axes, and the attitude is pulled towards the initial one. A position
+corrects position, velocity and attitude according to their covariance with it. The filter never
+sees the true state: the sensor errors (`Imu`) and any wrong position corrupt the estimate, because
+there is no gate (source).
 """
 
 from __future__ import annotations
@@ -45,11 +45,12 @@ _GYRO_LEFT_RADPS = 5e-4
 touched down 0.9 m away (docs/firmware.md, "Target covered")."""
 _PRESSED_MPS2 = 0.03
 """Error of the accelerometer along z while the vehicle is pressed against a ceiling. Without
-positions, the height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
+positions, the estimated height runs away at 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the
+ceiling")."""
 
 
 class Imu:
-    """`add` takes a control period's true motion; `read` gives the mean of `IMU_EVERY` periods.
+    """`add` takes a control period's true motion; `read` returns the mean over `IMU_EVERY` periods.
 
     `gyro_bias_radps`, `acc_bias_mps2`: constant errors, body axes; `acc_scale`: the firmware's
     divisor of the acceleration.

@@ -140,7 +140,7 @@ class HighLevelPlanner:
         self.state = TRAJECTORY_FLYING
 
     def setpoint(self, t_s: float) -> Setpoint:
-        """The plan's setpoint at `t_s`; while idle a setpoint with motors off."""
+        """The plan's setpoint at `t_s`; while idle, a setpoint with the motors off."""
         if self.state == TRAJECTORY_LANDING and self.finished(t_s):
             self.state = TRAJECTORY_IDLE
         if self.state == TRAJECTORY_IDLE:

@@ -58,7 +58,7 @@ _IN_FLIGHT = frozenset({State.FLYING, State.LEVEL_OUT})
 class Supervisor:
     """The firmware's supervisor. `update` runs at 25 Hz; the other methods only record events.
 
-    `arms_itself` and `spin_up_s` as in `perchctl.sim.airframe.Airframe`.
+    `arms_itself` and `spin_up_s` are as in `perchctl.sim.airframe.Airframe`.
     """
 
     def __init__(self, *, arms_itself: bool = True, spin_up_s: float = 0.0) -> None:
@@ -82,7 +82,7 @@ class Supervisor:
         return allowed, self.armed
 
     def request_recovery(self) -> tuple[bool, bool]:
-        """Recover from a crash; return (success, recovered). It is refused while tumbled."""
+        """Recover from a crash; return (success, recovered). A tumbled vehicle cannot recover."""
         self.crashed = self.crashed and self.tumbled
         return not self.crashed, not self.crashed
 
