@@ -1,5 +1,5 @@
-"""Read calibration files of ROS, OpenCV and Kalibr, and write one YAML for ROS, OpenCV and
-PyYAML."""
+"""Read calibration files of ROS, OpenCV and Kalibr, and write a YAML file that ROS, OpenCV and
+PyYAML can read."""
 
 from __future__ import annotations
 

@@ -84,8 +84,8 @@ CAMERA_FILE = Form(
         *("target_error", "target_error_columns", "converted_from", "picture_hashes"),
     ),
 )
-"""A file of ROS's camera_calibration, of OpenCV's calibration programs, or of a script: they use
-the same keys, in any combination."""
+"""A file written by ROS's camera_calibration, by OpenCV's calibration programs, or by a script,
+which all use the same keys, in any combination."""
 
 CAMERA_MESSAGE = Form(
     name="CameraInfo message",
@@ -100,8 +100,8 @@ CAMERA_MESSAGE = Form(
     neutral={"binning_x": (0, 1), "binning_y": (0, 1)},
     notes=("header", "r", "p"),
 )
-"""The output of ``ros2 topic echo /camera_info``, or of ``rostopic echo`` with D, K, R and P; also
-a script's file with K and D."""
+"""The output of ``ros2 topic echo /camera_info``, or of ``rostopic echo`` with D, K, R and P; or a
+script's file with K and D."""
 
 KALIBR_CAMERA = Form(
     name="Kalibr camchain",
@@ -335,8 +335,8 @@ _Found = dict[str, list[tuple[str, Any]]]
 
 
 def _plain_key(key: str) -> str:
-    """Return a key in lower case without underscores, since programs and versions differ in
-    these."""
+    """Return a key in lower case without underscores, since programs and versions differ in case
+    and underscores."""
     return key.replace("_", "").lower()
 
 

@@ -2,7 +2,7 @@
 
     nothing is permitted until all are ready at the same time and the operator has confirmed
     groups fly in the order of the schedule, each once all of the group before have ended
-    a vehicle that has ended in another one's corridor, or nobody knows where, keeps it on the floor
+    no vehicle takes off if another one has ended in its corridor, or at an unknown place
     a failure before the first take-off ends all flights; later, only with ``on_failure: land-all``
     two vehicles in the air that are known to be too close to each other land
     no vehicle begins to climb while another one is near its climb, or may be

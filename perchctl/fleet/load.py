@@ -212,7 +212,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
         )
     try:
         if not is_own_uri(uri):
-            # A URI without a dongle, as written by cfcli, is given one later.
+            # A dongle is added later to a URI that has none, as written by cfcli.
             check_uri(uri.replace("radio:///", "radio://0/", 1))
         source = parse_source(vehicle.source)
     except PerchError as error:
@@ -321,7 +321,7 @@ def _validated(where: object, model: type[Section], values: dict[str, Any]) -> A
 
 
 def _in_words(key: str, reason: str) -> str:
-    """Return the reason for an error with the allowed values in words, where pydantic shows a
+    """Return the reason for an error, with the allowed values in words instead of pydantic's
     regular expression."""
     found = reason.rpartition(", found ")[2]
     if reason.startswith("string should match") and key == "order":

@@ -46,7 +46,7 @@ from perchctl.fleet.room import PlacedVehicle, Room, body_name, place_fleet
 from perchctl.fleet.schedule import OBSTACLE_M, gap_text
 
 TICK_S = 0.02
-"""Period of the room's clock, s; two vehicles that fly at 0.4 m/s come 8 mm closer in it. Larger: a
+"""Period of the room's clock, s; a vehicle that flies at 0.4 m/s moves 8 mm in this time. Larger: a
 collision between two ticks is missed, and the downwash is late. Smaller: the flights wait for each
 other more often."""
 AT_HOME_M = 0.12
@@ -327,8 +327,8 @@ class FleetFlight:
         return next(filter(None, (self._in_the_way(other, name) for other in self._known_m)), "")
 
     def _in_the_way(self, other: str, name: str) -> str:
-        """Return why a vehicle whose flight has ended is in the way of `name`; empty if none is. A
-        vehicle at an unknown position (NaN) is always in the way."""
+        """Return why a vehicle whose flight has ended is in the way of `name`; empty if it is not.
+        A vehicle at an unknown position (NaN) is always in the way."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
         does = "hangs" if hangs else "lies"

@@ -98,7 +98,7 @@ def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
     """Return the vehicles with a dongle in each ``radio:///`` URI.
 
     Vehicles on one channel share a dongle, since two dongles on a channel disturb each other. A
-    channel without any vehicle that names a dongle gets the next unused number.
+    channel on which no vehicle names a dongle gets the next unused dongle number.
     """
     places = [radio_place(vehicle) for vehicle in vehicles]
     named = {p.channel: p.dongle for p in reversed(places) if p is not None and p.dongle}

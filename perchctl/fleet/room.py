@@ -184,8 +184,8 @@ class Room:
             `COLLISION_RADIUS_M` and `COLLISION_HALF_HEIGHT_M`, even if one fell onto the other with
             its motors off.
         least_m: smallest distance between the centres of two vehicles while the motors of at least
-            one turn; infinite at first. Only horizontal, since corridors are separated regardless
-            of height.
+            one turn; infinite at first. Only the horizontal distance counts, since corridors are
+            separated regardless of height.
         least_both_m: the same while the motors of both turn.
     """
 

@@ -1,8 +1,8 @@
 """The process of one vehicle in a fleet: one ordinary flight, and a connection to the parent.
 
-The flight is the one of `perchctl fly`, with its own link, watchdog, camera and log. Two things are
-added: it waits on the floor for permission to take off, and its operator is the parent. A separate
-thread serves the connection, so that nothing in the flight ever waits for the parent.
+The flight is the same as in `perchctl fly`, with its own link, watchdog, camera and log. Two things
+are added: it waits on the floor for permission to take off, and its operator is the parent. A
+separate thread serves the connection, so that nothing in the flight ever waits for the parent.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def main(channel: Channel) -> None:
 def fly_vehicle(
     options: FlyOptions, switch: ParentSwitch, line: ParentLine, reporter: StatusReporter
 ) -> Result:
-    """Fly once, and convert the outcome or any error to a `Result`. An error while another one is
-    being handled is raised; `reporter` then knows how far the flight had come."""
+    """Fly once, and convert the outcome or any error to a `Result`. An error that occurs while
+    another one is being handled is raised; `reporter` then knows how far the flight had come."""
     log: LogWatcher | None = None
     try:
         line.may_interrupt = True
@@ -100,8 +100,8 @@ class ParentLine:
     """The connection to the parent, served by a separate thread; only `finish` waits.
 
     If the parent is gone or sends an invalid message, the vehicle lands. In the latter case the
-    connection stays open, because the operator may still cut the motors. As long as the flight loop
-    does not read commands yet, a command interrupts the start of the process, as a signal would.
+    connection stays open, because the operator may still cut the motors. Until the flight loop
+    reads commands, a command interrupts the start of the process, as a signal would.
 
     Attributes:
         may_interrupt: True while an `Interrupted` may be raised in the main thread.

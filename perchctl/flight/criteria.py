@@ -194,7 +194,7 @@ class GroundCriteria:
 
         The velocity's variance shows whether anything corrects the estimate. The position's
         variance shows whether the estimate has received a position since the estimator last
-        started. A Flow deck measures the height alone.
+        started. Of the position, a Flow deck measures only the height.
         """
         telemetry, safety = self.telemetry, self.profile.safety
         is_placed = not self.profile.positioning.source.is_deck or {*self.decks} & {*ABSOLUTE_DECKS}
@@ -362,7 +362,7 @@ class GroundCriteria:
     @staticmethod
     def moved_body(moved_m: float, profile: Profile) -> Problem | None:
         """Problem: the external positions have moved by `moved_m` while the vehicle stood still.
-        They belong to another rigid body, or the target swings."""
+        The positions belong to another rigid body, or the target swings."""
         if moved_m <= WANDERED_M:
             return None
         return Problem(

@@ -20,9 +20,9 @@ spaced as a key repeats, and let go within that second    land if no hand presse
 
 A held key waits 0.25 to 1 s and then repeats 5 to 33 times a second, evenly (terminals on Linux:
 after 250 to 660 ms, every 30 to 92 ms). A person presses a key 3 to 10 times a second, unevenly,
-and the first interval is no longer than the next ones. If both could have caused the presses, they
-count as a stop, because a falling vehicle does less harm than one that flies on against the
-operator's command.
+and the first interval is no longer than the next ones. If either a held key or a hand could have
+caused the presses, they count as a stop, because a falling vehicle does less harm than one that
+flies on against the operator's command.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ FASTER_THAN_A_HAND_S = 0.08
 """Mean interval below which repeats must come from a held key, s. Larger: more presses by hand are
 taken for a held key."""
 SHORTEST_FAST_DELAY_S = 0.15
-"""Shortest initial delay of a key that repeats that fast (``xset r rate 200 50``), s."""
+"""Shortest initial delay of a key whose mean repeat interval is below `FASTER_THAN_A_HAND_S`
+(``xset r rate 200 50``), s."""
 LONGER_THAN_REPEATS = 1.2
 """Lowest ratio of a key's initial delay to the mean interval of its repeats. Presses by hand have
 similar intervals throughout."""

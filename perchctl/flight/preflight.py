@@ -34,7 +34,7 @@ from perchctl.vision import CameraModel, TargetEstimate
 
 
 def abort_on(problem: Problem | None) -> None:
-    """Raise SafetyAbort with the text of the problem; do nothing if it is None."""
+    """Raise SafetyAbort with the text of the problem; do nothing if there is no problem."""
     if problem is not None:
         raise SafetyAbort(problem.sentence)
 

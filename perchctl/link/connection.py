@@ -27,8 +27,8 @@ LINK_CLOSE_TIMEOUT_S = 3.0
 """Longest wait for a driver to close, s."""
 RADIO_RETRIES = 100_000
 """Number of successive lost packets after which cflib gives up on a radio link: about 200 s,
-instead of 0.2 s with cflib's default of 100. Waiting is better, because a link that was given up
-must negotiate safelink again."""
+instead of 0.2 s with cflib's default of 100. Waiting is better, because a link that cflib has given
+up must negotiate safelink again."""
 REOPEN_PAUSE_S = 0.05
 """Time between two attempts to reopen a driver, s."""
 SAFELINK_S = 0.15
@@ -366,8 +366,8 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
 
 
 # --- One program per vehicle: a lock between the programs of one user on this computer ---
-# Connecting by cflib would reset the log blocks of a vehicle that flies for another program, and
-# two streams of setpoints would conflict.
+# Connecting through cflib would reset the log blocks of a vehicle that flies for another program,
+# and two streams of setpoints would conflict.
 
 
 def lock_vehicle(uri: str, shown_uri: str | None = None) -> contextlib.ExitStack:

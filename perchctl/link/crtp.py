@@ -136,9 +136,9 @@ _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPO
 
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet after boot, on the ground, then the message that returns the priority.
-Without the first, raw thrust stays 0; without the second, the firmware does not execute its own
-landing (docs/firmware.md, "Raw thrust"). The vehicle does not confirm these packets, and if they
-were lost, the first raw thrust in the air would cut the motors. They are therefore sent
-`UNLOCK_TIMES`."""
+Without the zero-thrust packet, raw thrust stays 0; without the message, the firmware does not
+execute its own landing (docs/firmware.md, "Raw thrust"). The vehicle does not confirm these
+packets, and if they were lost, the first raw thrust in the air would cut the motors. They are
+therefore sent `UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
 """Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

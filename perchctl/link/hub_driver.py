@@ -61,7 +61,7 @@ If the hub's process has ended, the operating system refuses them, so the flight
 when it sends nothing else. Longer: detected later. Shorter: more packets."""
 HUB_STOP_PERIOD_S = 0.2
 """Longest time until the driver's thread reacts to a close or sends the next request, s. Longer:
-its socket is freed later. Shorter: it wakes up more often for nothing."""
+its socket is freed later. Shorter: the thread wakes up more often for nothing."""
 HUB_ENDED = "the radio hub of this vehicle has ended"
 
 

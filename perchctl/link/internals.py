@@ -1,9 +1,9 @@
 """Undocumented parts of cflib that perchctl reads or replaces.
 
-This module contains all of them: the list (`INTERNALS`), the check that this cflib has each of them
-(`check_internals`), and the functions through which the rest of the package uses them. Without the
-check, a cflib release that renames one of them would silently change how perchctl behaves after a
-radio failure.
+This module contains everything that depends on these parts: the list (`INTERNALS`), the check that
+the installed cflib has each of them (`check_internals`), and the functions through which the rest
+of the package uses them. Without the check, a cflib release that renames such a part would silently
+change how perchctl behaves after a radio failure.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Links that read from a vehicle without commanding it, and a scan for vehicles.
 
-`AttitudeLink` reads the motion of a vehicle that is moved by hand. `ProbeLink` reads its
-configuration and the link quality, and can blink its LEDs. Nothing in this module makes a vehicle
-fly, arm or spin a motor.
+`AttitudeLink` reads the motion of a vehicle that is moved by hand. `ProbeLink` reads a vehicle's
+configuration and the link quality, and can blink the vehicle's LEDs. Nothing in this module makes a
+vehicle fly, arm or spin a motor.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ReadOnlyLink(CflibLink):
         return False  # even if connecting fails half-way
 
     def _prepare(self, connection: Connection) -> None:
-        """Do nothing; subclasses start the data that they receive."""
+        """Do nothing; subclasses start the data streams that they receive."""
 
 
 # --- Motion by hand: attitude and rotation rates at the same time, in one packet ---

@@ -30,7 +30,7 @@ command is waiting to be sent."""
 
 
 class Link(Protocol):
-    """A vehicle: simulated in lockstep, or connected by cflib.
+    """A vehicle, either simulated in lockstep or connected through cflib.
 
     All methods but `send_external` are called from the flight loop's thread. They raise
     ConnectionFailed, NotFound or TimedOut of `perchctl.errors`.
@@ -50,8 +50,9 @@ class Link(Protocol):
         """Send one command to the vehicle. Blocks only briefly."""
 
     def send_external(self, place: ExternalPosition) -> bool:
-        """Send an external position to the vehicle, at once or not at all: never queued, raises
-        nothing. Returns True if it was sent. Called from the thread of the position feed."""
+        """Send an external position to the vehicle, at once or not at all. The position is never
+        queued, and no exception is raised. Returns True if it was sent. Called from the thread of
+        the position feed."""
 
     def problem(self, now_s: float) -> str | None:
         """Return None while the link works, otherwise one sentence with the cause."""

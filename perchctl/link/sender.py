@@ -6,8 +6,8 @@ command to send while the loop hangs, and it replaces the first thread with a ne
 No error ends either thread.
 
 Setpoints coalesce: only the newest is kept. Setpoints and arming requests that have waited too long
-are dropped. Other commands keep their place until the library has accepted them, however long that
-takes. An emergency stop replaces all waiting commands.
+are dropped. Other commands keep their place in the queue until the library has accepted them,
+however long that takes. An emergency stop replaces all waiting commands.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STALE_COMMAND_S = 0.25
 GUARD_PERIOD_S = 0.05
 """Period of the second thread, s."""
 LIBRARY_HANG_S = 0.5
-"""Longest time for which a call of the library may last, or for which its calls may fail, s
+"""Longest time for which a call into the library may last, or for which such calls may fail, s
 (docs/firmware.md, "Silence")."""
 SEND_RETRY_S = 0.002
 """Time until a piece that the library did not accept is offered again, s: about the duration of one
@@ -48,7 +48,7 @@ class _Waiting:
     """A command from `put` until the library has accepted all of it.
 
     `rest` is None until the first attempt, then the pieces that are still to be passed on; `begun`
-    is True once one has been.
+    is True once a piece has been passed on.
     """
 
     put_s: float

@@ -227,8 +227,8 @@ class Carrier:
         """Make sure that no packet sent by the flight so far reaches the vehicle.
 
         cflib's driver holds up to two: one that it repeats until the vehicle acknowledges it, and
-        one in its queue. They cannot be removed, so the driver is closed; the next driver starts by
-        offering safelink.
+        one in its queue. These packets cannot be removed, so the driver is closed; the next driver
+        starts by offering safelink.
         """
         self._waiting.clear()
         driver, has_carried = self.driver, self._has_carried

@@ -170,7 +170,7 @@ BLOCKS: dict[str, dict[str, str]] = {
     "state": STATE_BLOCK,
     "attitude": ATTITUDE_BLOCK,
 }
-"""Log blocks in the order in which they are sent for the same time; the block that completes a
+"""Log blocks in the order in which they are sent at the same time; the block that completes a
 sample is last."""
 FAST_BLOCKS = ("state", "attitude")
 """A sample requires these blocks; the others arrive ten times a second if the firmware has them."""

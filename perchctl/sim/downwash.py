@@ -42,9 +42,9 @@ JET_BEGINS_M = 0.25
 """Distance below the rotors at which the measurements of the jet begin, m. Closer to the rotors,
 the speed at this distance is used. Smaller: higher speeds than were ever measured."""
 AXIS_FACTOR = 1.5
-"""Factor on the jet along its axis as a wind that acts on a drag of 0.009 N/(m/s). A vehicle of 42
-g then pushes with 6.3 g at 0.5 m, where the recorded vehicles of 34 g feel 5.9 g. Larger: a
-stronger push exactly below the vehicle."""
+"""Factor by which the jet's speed on its axis is multiplied to give the wind that acts on a drag of
+0.009 N/(m/s). A vehicle of 42 g then pushes with 6.3 g at 0.5 m, where the recorded vehicles of 34
+g feel 5.9 g. Larger: a stronger push exactly below the vehicle."""
 FACTOR_RADIUS_M = 0.05
 """Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: a stronger
 push next to the axis, although the recordings need no factor at 0.1 m."""
@@ -68,7 +68,7 @@ def jet_mps(thrust_n: float, below_m: float, aside_m: float) -> float:
 
 
 def downwash_mps(thrust_n: float, below_m: float, aside_m: float) -> float:
-    """Return the downward wind that a vehicle in that jet feels; exactly 0 below `LEAST_MPS`."""
+    """Return the downward wind that acts on a vehicle in this jet; exactly 0 below `LEAST_MPS`."""
     speed_mps = jet_mps(thrust_n, below_m, aside_m)
     if speed_mps < LEAST_MPS:
         return 0.0

@@ -1,8 +1,8 @@
 """Four motors and the battery cell that feeds them, from duty cycles to thrust.
 
-- A motor's voltage is its duty cycle times the battery's. Its speed follows that voltage
-  with a lag, and its thrust is the curve at the voltage that belongs to the speed
-  (`thrust_n`).
+- A motor's voltage is its duty cycle times the battery voltage. The motor's speed follows that
+  voltage with a lag, and its thrust is the value of the thrust curve at the voltage that
+  corresponds to the speed (`thrust_n`).
 - The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is a w +
   b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
   rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md, "Catching a
@@ -85,8 +85,8 @@ STANDSTILL_V = motor_voltage(0.0)
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware reports a battery's state
 #   (source: power management) are a discharge curve of the Crazyflie's own cell.
-# - Under load, the cell's resistance makes the voltage fall at once. In an old or cold cell, it falls
-#   further within `ION_DIFFUSION_S`, because ions have to diffuse over a longer distance.
+# - Under load, the cell's resistance makes the voltage fall at once. In an old or cold cell, it
+#   falls further within `ION_DIFFUSION_S`, because ions have to diffuse over a longer distance.
 # - An old cell holds less charge and has more resistance; `knee` is the share of the charge at
 #   which the steep end of the curve begins.
 
@@ -113,7 +113,7 @@ _CELL_CURVE: tuple[tuple[float, float], ...] = (
     (1.0, 4.2),
     (1.05, 4.3),
 )
-_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # charges at which its linear parts end
+_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # charges at which the curve's segments end
 _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 
 
@@ -192,7 +192,7 @@ ForcesN = tuple[float, float, float, float]
 
 
 class Powertrain:
-    """Four motors M1..M4, with thrusts `forces_n`, on the scenario's `cell`."""
+    """Four motors M1..M4, with thrusts `forces_n`, powered by the scenario's `cell`."""
 
     def __init__(self, scenario: Scenario) -> None:
         ohm = scenario.cell_resistance_ohm

@@ -379,8 +379,8 @@ def blur_sample_count(length_px: float) -> int:
 def resample_poses(poses: Array, count: int) -> Array:
     """Return `count` poses (count, 4, 4) at the middles of equal parts of the exposure.
 
-    Linear in the matrices of `poses` (n, 4, 4): an exposure's rotation is so small that the error
-    is below 1e-3 of a pixel.
+    The poses are interpolated linearly between the matrices `poses` (n, 4, 4): the rotation within
+    an exposure is so small that the error is below 1e-3 of a pixel.
     """
     if len(poses) == 1:
         return np.broadcast_to(poses, (count, 4, 4))
@@ -421,7 +421,7 @@ HUM_GREY = 18.0
 TEAR_PX = 30.0
 TEARS_PER_FRAME = 1.5
 SNOW_LINES_PER_FRAME = 12.0
-"""Mean numbers per frame at full strength."""
+"""Mean numbers of torn bands and of snow lines per frame at full strength."""
 
 
 def add_analogue_faults(

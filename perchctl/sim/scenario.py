@@ -42,8 +42,8 @@ class Scenario:
     there.
 
     The defaults are those of the trials in docs/firmware.md, in which the vehicle had four equal
-    motors and less drag than a real one. A field named as a key of
-    `perchctl.profile.SimulationConfig` is the value drawn from the key's range.
+    motors and less drag than a real one. A field with the same name as a key of
+    `perchctl.profile.SimulationConfig` is the value drawn from that key's range.
 
     Attributes:
         target_xy_m, target_yaw_rad: centre and heading of the target.
@@ -59,13 +59,13 @@ class Scenario:
             accelerometer before the firmware's calibration on the ground; only for a vehicle
             without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: height of the target's plane above the surface that the gear meets.
-        target_tilt_rad: the target's turns about the world's x and y, after its heading.
+        target_tilt_rad: the target's rotations about the world's x and y axes, after its heading.
         capture_holes_s: start and duration of each period in which motion capture does not see the
             vehicle.
         neighbours: other vehicles' targets; their downwash is in the draught.
         motor_strength: thrust of M1..M4 at the same duty, as shares of the data sheet's. In steady
-            flight the strongest and the weakest of recorded vehicles differ by 17 % of the mean
-            (7 to 40).
+            flight, the strongest and the weakest motor of a recorded vehicle differ by 17 % of the
+            mean (7 to 40).
         motors_brake: the motors slow down as fast as they speed up at any duty but 0, as recorded
             take-offs show (30 to 50 ms both ways); else they coast whenever they get less, as the
             trials do.
@@ -74,8 +74,8 @@ class Scenario:
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
             divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz. `thrust_noise`
             explains most of the reduction; the remainder is an assumption.
-        drag_nspm: horizontal drag, N for each m/s. In 104 recorded flights, it was 0.38 (0.36 to 0.41)
-            times the mass per second, which is 0.016 at 42 g.
+        drag_nspm: horizontal drag, N for each m/s. In 104 recorded flights, it was 0.38 (0.36 to
+            0.41) times the mass per second, which is 0.016 at 42 g.
         airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
             flight to the left, N.m for each m/s. In the same flights, the motors counteract 0.8e-3
             forward and 0.7e-3 sideways.

@@ -2,7 +2,7 @@
 image that a sheet covers in one exposure.
 
 Textures are kept at several resolutions, each the exact or filtered mean over its texels' areas,
-so that sampling near one texel a pixel is correct near and far. Pure.
+so that sampling at about one texel per pixel is correct at any distance. Pure.
 """
 
 from __future__ import annotations
@@ -160,9 +160,9 @@ _LOOK_UP_TEXELS = 2.5
 
 class SheetView(NamedTuple):
     """A sheet in one exposure: `box` is its part of the image, `to_texels` (3, 3) maps the plane of
-    the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows, columns),
-    `is_uniform` are those whose pixels all show one `value` and `alpha`. `covers_all` is True if
-    the sheet covers the whole image."""
+    the vehicle's own target to the texture's columns and rows. `is_uniform` marks those of the
+    box's blocks (rows, columns) whose pixels all have the same `value` and `alpha`. `covers_all` is
+    True if the sheet covers the whole image."""
 
     texture: SheetTexture
     box: Box

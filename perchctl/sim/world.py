@@ -302,9 +302,10 @@ def build_model(scenario: Scenario) -> Any:
 
 
 # --- The magnet: how it pulls the gear's tip towards the ceiling, and when it holds ---
-# It acts within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at contact,
-# and falls to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker than the later
-# ones (`Scenario.first_contact_force_n`); it is over when the tip has engaged and come off again.
+# The magnet acts on an upright vehicle within `MAGNET_RADIUS_M` of the target's centre. Its force
+# is full at contact and falls to zero over a gap of `MAGNET_RANGE_M`. The first contact may be
+# weaker than the later ones (`Scenario.first_contact_force_n`); it is over when the tip has engaged
+# and come off again.
 
 
 MAGNET_RADIUS_M = 0.025

@@ -161,7 +161,7 @@ MAX_CORNERS_OUT = 0.25
 MAX_VIEWS_OUT = 1.0 / 3.0
 """Largest share of rejected views. If more are rejected, the fault lies not in the views but in the
 board, its size or the lens."""
-_MEDIAN_OF_RAYLEIGH = 1.1774  # median distance of a round Gaussian with spread 1
+_MEDIAN_OF_RAYLEIGH = 1.1774  # median radius of a circular Gaussian with spread 1
 _REJECTION_ROUNDS = 10
 
 
@@ -234,7 +234,7 @@ def _spread_px(residual: Array) -> float:
 
 
 SIGMAS_95 = 1.96
-"""Standard deviations to each side of a 95 % interval."""
+"""Half-width of a 95 % interval, in standard deviations."""
 _LEAST_INFORMATION_SHARE = 1e-10
 """Fraction of each parameter's information that is added to it, so that a parameter that no image
 determines stays finite."""
@@ -280,6 +280,6 @@ def jackknife_covariance(
 
 
 def student_to_normal_ratio(degrees_of_freedom: int) -> float:
-    """The ratio of the 95 % half-widths of Student's t and the normal distribution; fewer
-    than 3 degrees of freedom count as 3."""
+    """Return the ratio of the 95 % half-width of Student's t distribution to that of the normal
+    distribution; fewer than 3 degrees of freedom count as 3."""
     return float(stdtrit(max(degrees_of_freedom, 3), 0.975)) / SIGMAS_95

@@ -38,7 +38,8 @@ def find_views(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
     """Detect the board in image files. Images that are damaged or show no board are returned
-    separately. `progress` is called with the number of images done and their total number.
+    separately. `progress` is called with the number of images processed so far and the total
+    number.
 
     Raises InvalidValue, before the search, if the images differ in size.
     """
@@ -122,9 +123,10 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Describe how a view shows the board by five numbers, (5,): x and y of the corners' centre and
-    the size of the board, relative to the image, and two tilts. The tilts say how much farther away
-    the right side is than the left one, and the lower side than the upper one."""
+    """Describe the board's position, size and tilt in a view by five numbers, (5,): x and y of the
+    corners' centre and the size of the board, relative to the image, and two tilts. The tilts say
+    how much farther away the right side is than the left one, and the lower side than the upper
+    one."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
     squares = view.corners_m[:, :2] / board.square_m
@@ -253,7 +255,7 @@ class GuidedCapture:
     def update(self, view_or_reason: BoardView | str) -> bool:
         """Process the next image: extract its view of the board, or find out why there is none.
 
-        Return True if the view was taken because it is new, sharp and still.
+        Return True if the view was taken, that is, if it is new, sharp and still.
         """
         before, seen = self._last, view_or_reason
         self._last = seen if isinstance(seen, BoardView) else None

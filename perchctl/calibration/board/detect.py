@@ -20,7 +20,7 @@ MIN_CORNERS = 6
 SEARCH_PX = 1600
 """Size to which larger images are scaled down for the search; corners are fitted at full size."""
 _HASH_BYTES = 6
-"""Length of an image's hash, bytes. With a shorter one, the probability that two of a thousand
+"""Length of an image's hash, bytes. With a shorter hash, the probability that two of a thousand
 images have the same hash by chance would exceed 1 in 10^8."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 # no exhaustive search, because it takes a second in an image without a board
@@ -118,8 +118,8 @@ class FrameCounts:
 
     @property
     def advice(self) -> str:
-        """Advice on how to get more views; empty if it is enough to show the board, or to move it
-        elsewhere."""
+        """Advice on how to get more views; empty if showing the board or moving it elsewhere is
+        enough."""
         if self.moved + self.blurred <= self.alike:
             return ""
         if self.live:
@@ -153,8 +153,8 @@ class FoundViews:
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     """Return the view of a board in a grey image (h, w), or the reason why no board was found. In
-    an interlaced image, the first field is used, since a moving board has two positions. Both
-    layouts of a ChArUco board are tried, whatever `board` says."""
+    an interlaced image, the first field is used, since a moving board appears at a different
+    position in each field. Both layouts of a ChArUco board are tried, whatever `board` says."""
     picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
     image = deinterlace_image(image)[0]
     h, w = image.shape
@@ -238,8 +238,8 @@ def _chessboard(image: Grey, board: Board) -> _Corners | str:
 
 
 def _without_board(image: Grey) -> str:
-    """Return why no board was found in an image. It may show the perching target instead, which is
-    a likely mistake."""
+    """Return why no board was found in an image. The image may show the perching target instead,
+    which is an easy mistake to make."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
@@ -259,7 +259,8 @@ def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
 def _local_axes(cells: Array, corners: Array) -> Array:
     """Return the two sides of a square at each corner, as the columns of (n, 2, 2), px.
 
-    They are the derivative of the homography, which smooths out single bad corners.
+    The sides are computed from the derivative of the homography, which smooths out single bad
+    corners.
     """
     H, _ = cv2.findHomography(cells, corners, cv2.RANSAC, 5.0)
     if H is None:
@@ -310,7 +311,7 @@ def fit_saddles(
 
     Args:
         image: grey image (h, w).
-        corners_px: first guess, good to a fifth of a square, (n, 2).
+        corners_px: initial corner positions, accurate to a fifth of a square, (n, 2).
         axes_px: the vectors in the image from each corner to its two neighbours on the board, as
             the columns of (n, 2, 2).
         white_rim: width of the blank rim of the white squares, in squares (1: no markers inside).

@@ -112,7 +112,7 @@ def _marker_m(camera: CameraModel, z_m: float) -> Array:
 
 
 def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None) -> Array:
-    """Return target centres at that depth, (n, 3), the first straight ahead."""
+    """Return target centres at the depth `z_m`, (n, 3), the first straight ahead."""
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 9), np.linspace(0, h - 1, 7)), axis=-1)
     rays = undistort_to_normalised(grid.reshape(-1, 2), camera)
@@ -131,7 +131,7 @@ def _cells(camera: CameraModel, place: Array, corners_m: Array) -> NDArray[np.in
     w, h = camera.size_px
     if not ((pixels >= 0).all() and (pixels <= (w - 1, h - 1)).all()):
         return None
-    # Far outside its field of view, the polynomial of a lens folds back into the image.
+    # The polynomial of a lens maps points far outside the field of view back into the image.
     straight = corners_m[:, :2] * (1.0, -1.0) + place[:2]
     if not np.allclose(undistort_to_normalised(pixels, camera), straight / place[2], atol=1e-3):
         return None

@@ -1,8 +1,8 @@
 """Find out which board the images show if it is not the specified one.
 
-For chessboards, this is the grid of corners that most images show, at least two. For boards with
-markers, it is the dictionary that decodes most of them, and the layout whose corners OpenCV then
-finds. A board is named only if it is identified with certainty.
+For chessboards, this is the grid of corners that is found in the most images, and in at least two.
+For boards with markers, it is the dictionary that decodes most of them, and the layout whose
+corners OpenCV then finds. A board is named only if it is identified with certainty.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
     if not images:
         return ""
     with_markers = _markers_text(images[:MARKER_PICTURES], named)
-    # Boards with markers come first, because a part of one would pass for a chessboard.
+    # Boards with markers come first, because part of such a board would pass for a chessboard.
     return _grid_text(images, named) if with_markers is None else with_markers
 
 

@@ -45,7 +45,8 @@ def record_mounting(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Fill the recording until it has all motions, a recorded source ends, or `stopped` is True.
+    """Fill the recording until it contains all required motions, a recorded source ends, or
+    `stopped` is True.
 
     Args:
         attitudes: returns the vehicle's new samples, oldest first.

@@ -2,7 +2,7 @@
 file format (JSON lines).
 
 Each part begins with a line ``{"part": "carry", ...}``. One line per sample follows, first all
-attitudes, then all poses. A file holds one part or both.
+attitudes, then all poses. A file contains one part or both.
 """
 
 from __future__ import annotations

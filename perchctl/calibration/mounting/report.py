@@ -20,7 +20,7 @@ from perchctl.profile import Profile
 @dataclass(frozen=True, eq=False)
 class _Value:
     """One or three measured numbers. `written` is the value in the profile, or None. For display,
-    numbers are multiplied by `scale`, in `unit`."""
+    the numbers are multiplied by `scale`, which converts them to `unit`."""
 
     name: str
     key: str

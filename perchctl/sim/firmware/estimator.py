@@ -107,8 +107,9 @@ class Estimator:
     def variance(self, t_s: float, state: int = POSITION_STATE) -> float:
         """Return the variance of a position or velocity state, numbered as in `ExternalFilter`.
 
-        While another estimator runs, it is zero, like memory that was never written. A Flow deck
-        does not measure the horizontal position, whose variance stays at its value after a reset.
+        While another estimator runs, the variance is zero, like memory that was never written. A
+        Flow deck does not measure the horizontal position, whose variance stays at its value after
+        a reset.
         """
         if self._parameters["stabilizer.estimator"] != KALMAN:
             return 0.0

@@ -155,7 +155,7 @@ class Firmware:
         self.supervisor.emergency = True
 
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
-        """Take an external position, m, or a pose; `quaternion`: w, x, y, z, body to world."""
+        """Receive an external position, m, or a pose; `quaternion`: w, x, y, z, body to world."""
         self.estimator.take_external(position_m, quaternion)
 
     # Readable values ----------------------------------------------------------------

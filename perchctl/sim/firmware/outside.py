@@ -133,7 +133,8 @@ def first_covariance() -> Array:
 class ExternalFilter:
     """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
 
-    `covariance` (9, 9) is of the errors of position, velocity and attitude; SI, world axes.
+    `covariance` (9, 9) is the covariance of the errors of position, velocity and attitude; SI,
+    world axes.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:

@@ -113,7 +113,7 @@ class HighLevelPlanner:
         return True
 
     def land(self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float) -> bool:
-        """Plan as for a take-off; the motors stop when the plan ends."""
+        """Plan a vertical flight, as `take_off` does; the motors stop when the plan ends."""
         return self.take_off(height_m, duration_s, yaw_rad, t_s, TRAJECTORY_LANDING)
 
     def go_to(
