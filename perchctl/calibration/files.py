@@ -143,8 +143,8 @@ def calibration_text(
 
 
 def _number(value: float | int) -> str:
-    """Return text that reads back as exactly the same number. It contains a decimal point, because
-    PyYAML would otherwise read it as text."""
+    """Return text that reads back as exactly the same number. The text contains a decimal point,
+    because PyYAML would otherwise read the number as a string."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

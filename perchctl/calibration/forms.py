@@ -204,7 +204,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     """Return the lens that the text of a calibration file describes, and the values of all its
     keys.
 
-    Raises InvalidValue with the form that was found and what is needed.
+    Raises InvalidValue, which names the form that was found and what is needed.
     """
     for pattern, name, advice in _OTHER_FORMS:
         if re.search(pattern, text, re.MULTILINE):

@@ -25,8 +25,8 @@ VEHICLE_PROGRAM = (
 
 
 class VehicleProcess:
-    """The process of one vehicle. It runs in its own session, so that the terminal's Ctrl-C does
-    not reach it. Its output is written to a file in the flight's folder.
+    """The process of one vehicle. The process runs in its own session, so that the terminal's
+    Ctrl-C does not reach it. The output of the process is written to a file in the flight's folder.
 
     A thread receives the messages from the process. If the process is stopped in the middle of a
     message, only this thread is blocked. An invalid message is dropped, and `fault` says why.

@@ -1,9 +1,9 @@
 """Convert lists of Crazyflies from other programs to fleet files.
 
 Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config), and
-the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither
-contains targets or cameras, and cfcli's contains no positions. `missing` says what you have to add;
-until then, perchctl refuses the file.
+the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither format
+contains targets or cameras, and cfcli's format contains no positions. `missing` says what you have
+to add; until then, perchctl refuses the file.
 """
 
 from __future__ import annotations

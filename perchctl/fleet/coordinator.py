@@ -1,13 +1,14 @@
 """The parent of a fleet: it receives the vehicles' messages, sends orders, and ends processes that
-hang. It has no flight logic.
+hang. The parent has no flight logic.
 
 `Coordinator.step` does one round without waiting; `run` repeats it in a separate thread, so that
 neither a blocked terminal nor an unanswered question can delay a stop. If a round hangs, no more
 orders are sent, and every vehicle lands by itself.
 
 If a round raises an exception, its decisions can no longer be trusted, and
-`Coordinator.step_stopping` permanently replaces `step`. It orders all vehicles to land or, on the
-operator's command, to cut their motors. It needs neither the plan nor the vehicles' reports.
+`Coordinator.step_stopping` permanently replaces `step`. `step_stopping` orders all vehicles to land
+or, on the operator's command, to cut their motors, and needs neither the plan nor the vehicles'
+reports.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ loading its libraries takes half a minute, and nothing is armed before all vehic
 Longer: the operator waits for a process that hangs while it starts. Shorter: a busy computer cannot
 start a fleet."""
 LOOP_HUNG_S = 60.0
-"""Time without an iteration (turn) of its flight loop after which a process is killed, s. It is
-longer than a landing by the watchdog takes, including closing the link and the log. Longer: the
+"""Time without an iteration (turn) of its flight loop after which a process is killed, s. This time
+is longer than a landing by the watchdog takes, including closing the link and the log. Longer: the
 fleet waits needlessly."""
 
 

@@ -7,8 +7,8 @@ several flights together, each runs in a thread that returns the baton after eac
     resume()  --- baton --->    runs on
               <-- baton ----    pause()
 
-Only one of all these threads runs at a time, and the owner decides which one. The results therefore
-do not depend on the computer's scheduler.
+Only one of the threads runs at a time, and the owner decides which one. The results therefore do
+not depend on the computer's scheduler.
 """
 
 from __future__ import annotations

@@ -11,9 +11,10 @@ A vehicle's reported position is used only if it is measured in room axes (``fra
 other vehicles, the positions in the plan are used.
 
 If a position is old or cannot be trusted, the distances to it are unknown. An unknown distance does
-not make a vehicle land; otherwise a lost link to one vehicle would end its neighbours' flights. It
-does not count as safe either: `find_unwatched` lists such vehicles for the operator. They are kept
-apart by their corridors, which each vehicle enforces by itself, without any message.
+not make a vehicle land; otherwise a lost link to one vehicle would end its neighbours' flights. An
+unknown distance does not count as safe either: `find_unwatched` lists such vehicles for the
+operator. These vehicles are kept apart by their corridors, which each vehicle enforces by itself,
+without any message.
 
 As long as all vehicles keep to their corridors, every vehicle may climb: in the plan, the place
 below a target has the required separation from all corridors that are flown at the same time. The
@@ -48,10 +49,10 @@ FRESH_PLACE_S = 0.5
 other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
 second, distances are unknown all the time."""
 HUNG_S = 10.0
-"""Time without a message after which a process is ended, s. Its vehicle is down by then, since the
-firmware stops the motors 2 s after the last packet. Longer: the fleet waits needlessly. Shorter:
-flights are lost when a computer pauses, and a neighbour climbs while a vehicle that nobody controls
-may still be in the air."""
+"""Time without a message after which a process is ended, s. The vehicle of such a process is
+already down, since the firmware stops the motors 2 s after the last packet. Longer: the fleet waits
+needlessly. Shorter: flights are lost when a computer pauses, and a neighbour climbs while a vehicle
+that nobody controls may still be in the air."""
 ROUNDING_M = 1e-6
 """Rounding error by which a vehicle at the very edge of its corridor may seem too near a climb, m.
 Larger: a climb begins although another vehicle is too near."""
@@ -97,7 +98,7 @@ class VehicleView:
     @property
     def place_age_s(self) -> float:
         """Age of the position in the newest status, including all parts that may hang: telemetry,
-        flight loop and process. Infinite if one of them is unknown."""
+        flight loop and process. The age is infinite if one of its parts is unknown."""
         status = self.status
         if status is None or status.telemetry_age_s is None or status.loop_age_s is None:
             return math.inf
@@ -235,8 +236,8 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
     is, or may be, within the plan's separation from its climb, a column as wide as its corridor.
 
     A vehicle without a known position is assumed to be in its corridor only if it has no position
-    in room axes to report, still flies, answers, and is not landing. Otherwise it may be up to
-    `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has ended
+    in room axes to report, still flies, answers, and is not landing. Otherwise the vehicle may be
+    up to `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has ended
     without a known landing, until it is down.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m

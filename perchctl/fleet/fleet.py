@@ -105,8 +105,9 @@ class FleetVehicle:
         """The vehicle with a target at this position in the room. `target`: the target's markers,
         by default those in the vehicle's profile.
 
-        A vehicle that flies with the target alone gets no approach point. It stands below its
-        target, and with a heading error of a few degrees it would first fly away from the target.
+        A vehicle that flies with the target alone gets no approach point. Such a vehicle stands
+        below its target, and with a heading error of a few degrees it would first fly away from the
+        target.
         """
         expected_m = self.to_estimate(target_m)
         planner = self.profile.planner

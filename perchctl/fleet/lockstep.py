@@ -1,7 +1,7 @@
 """Fly a whole fleet in lockstep: one room, one clock, and the same result for the same seed.
 
-Each vehicle flies in lockstep and is judged as in `perchctl simulate --faults`. It runs in a
-`ThreadCoroutine` that pauses at each tick of the room's clock:
+Each vehicle flies in lockstep and is judged as in `perchctl simulate --faults`. Each flight runs in
+a `ThreadCoroutine` that pauses at each tick of the room's clock:
 
     for each group of the schedule:
         until all of its flights have ended:
@@ -10,8 +10,8 @@ Each vehicle flies in lockstep and is judged as in `perchctl simulate --faults`.
             the room measures distances, and updates the downwash on each vehicle
 
 Meanwhile, the vehicles of later groups stand at their homes. A vehicle whose flight has ended stays
-where it hangs, stands or lies. A vehicle of the next group takes off only if none of these is in
-its way.
+where it hangs, stands or lies. A vehicle of the next group takes off only if none of these vehicles
+is in its way.
 """
 
 from __future__ import annotations

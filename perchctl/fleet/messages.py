@@ -61,8 +61,8 @@ class VehicleOutcome(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """Everything that the parent wants from one vehicle. It is also a sign of life, so it is sent
-    repeatedly.
+    """Everything that the parent wants from one vehicle. An order is also a sign of life, so it is
+    sent repeatedly.
 
     Attributes:
         may_take_off: permission to take off; has no effect in the air.

@@ -1,8 +1,9 @@
 """Receive the operator's commands in a vehicle's own process, and land if the parent is gone.
 
 The flight loop and the link's watchdog both read the current command many times a second. Neither
-waits for the parent: a separate thread receives the orders, and if the parent is dead or silent,
-the command is to land. A vehicle therefore also lands if its loop hangs and the parent is gone.
+the loop nor the watchdog waits for the parent: a separate thread receives the orders, and if the
+parent is dead or silent, the command is to land. A vehicle therefore also lands if its loop hangs
+and the parent is gone.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ PARENT_SILENCE_S = 1.0
 nobody can stop the vehicle for longer. Shorter: a busy computer ends flights."""
 LONGEST_WATCH_STEP_S = 0.25
 """Largest time by which one reading of the command may increase the parent's silence, s. After a
-suspension, this process has not yet read the messages that are waiting for it. Longer: its own
-pause is taken for the parent's silence. Shorter: on a busy computer, a parent's silence is noticed
-late."""
+suspension, this process has not yet read the messages that are waiting for it. Longer: this process
+mistakes its own pause for the parent's silence. Shorter: on a busy computer, a parent's silence is
+noticed late."""
 
 PERMISSION_FRESH_S = 0.5
 """Age up to which a permission to climb counts, s; it is repeated every `BEAT_S`. Longer: a climb

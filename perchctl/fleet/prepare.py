@@ -74,8 +74,8 @@ def open_radios(plan: FleetPlan) -> Iterator[Radios]:
     """Open a radio hub for each dongle that several vehicles share, until the block ends. A vehicle
     alone on its dongle needs none.
 
-    Raises the errors of `RadioHub`, with the dongle's name. In that case, no packet was sent to any
-    vehicle.
+    Raises the errors of `RadioHub`, with the dongle's name. If an error is raised, no packet was
+    sent to any vehicle.
     """
     with contextlib.ExitStack() as stack:
         hubs = {}

@@ -7,7 +7,7 @@ differs. Each of n vehicles therefore gets an equal share, and a share is enough
 what the vehicle sends (telemetry) and what it receives (setpoints and positions).
 
 The figures were measured with cflib's threads over a simulated dongle (0.7 ms per packet, 1.25 ms
-per setting). They have not been confirmed with a real dongle.
+per setting). The figures have not been confirmed with a real dongle.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ OTHER_CHANNELS_PER_S = {2: 151.0, 4: 73.0}
 Because they are so few, perchctl refuses such fleets."""
 PACKET_S = 0.00206
 """Duration of a packet on a shared dongle, s, the longest of `SAME_CHANNEL_PER_S` (3 vehicles): 0.7
-ms on the air, 1.25 ms for the address, and the rest for Python's threads. It is used for larger
-numbers of vehicles than were measured."""
+ms on the air, 1.25 ms for the address, and the rest for Python's threads. This duration is used for
+larger numbers of vehicles than were measured."""
 USABLE_SHARE = 0.8
 """Usable part of a vehicle's share of the packets. The rest is for lost packets, for a neighbour
 that does not answer, which costs 2 ms per turn (measured), and for a busy computer. On a busy

@@ -102,8 +102,9 @@ def place_fleet(fleet: Fleet, seed: int) -> tuple[PlacedVehicle, ...]:
 def _neighbours(
     own: FleetVehicle, scenario: Scenario, drawn: Sequence[tuple[FleetVehicle, Scenario]]
 ) -> tuple[Neighbour, ...]:
-    """Return the other vehicles' targets, in the axes of this vehicle's target. Their marker ids
-    are given even if they are the same, so that flying to one of them counts as an error."""
+    """Return the other vehicles' targets, in the axes of this vehicle's target. The marker ids of
+    the neighbours' targets are set even if they equal the ids of the vehicle's own target, so that
+    flying to one of them counts as an error."""
     found = []
     heading_rad = math.radians(own.heading_deg) + scenario.target_yaw_rad
     c, s = math.cos(heading_rad), math.sin(heading_rad)

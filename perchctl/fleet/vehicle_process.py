@@ -99,8 +99,8 @@ def fly_vehicle(
 class ParentLine:
     """The connection to the parent, served by a separate thread; only `finish` waits.
 
-    If the parent is gone or sends an invalid message, the vehicle lands. In the latter case the
-    connection stays open, because the operator may still cut the motors. Until the flight loop
+    If the parent is gone or sends an invalid message, the vehicle lands. After an invalid message
+    the connection stays open, because the operator may still cut the motors. Until the flight loop
     reads commands, a command interrupts the start of the process, as a signal would.
 
     Attributes:

@@ -13,7 +13,7 @@ from perchctl.children import SharedTime
 
 SIM_PATIENCE_S = 5.0
 """Time without progress in the simulator after which the flight's clock continues with the wall
-clock. It is longer than the simulator's own wait for the loop."""
+clock. This time is longer than the simulator's own wait for the loop."""
 _CLOCK_POLL_S = 0.001
 
 

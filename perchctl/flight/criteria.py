@@ -66,10 +66,10 @@ positions, it reaches 0.076 m/s on a slope of 9 deg, because the tilted accelero
 estimate."""
 ESTIMATE_AGREE_M = 0.1
 """Largest distance between the estimated and the measured position once positions are fused.
-Larger: positions meant for another vehicle are taken for this vehicle's."""
+Larger: positions meant for another vehicle are mistaken for this vehicle's."""
 ESTIMATE_AGREE_DEG = 15.0
 """Largest difference between the estimated and the measured heading. Larger: another rigid body is
-taken for the vehicle's."""
+mistaken for the vehicle's."""
 
 _FORBIDDEN = (
     (LOCKED, "is locked", "inspect it and restart it"),
@@ -411,7 +411,7 @@ class GroundCriteria:
 
 def rest_window(samples: Sequence[Telemetry]) -> list[Telemetry]:
     """Return the samples, oldest first, from which to decide if a vehicle has stood still for
-    `REST_S`: those within that time, and the one before it, which shows if there was a gap at the
+    `REST_S`: those within `REST_S`, and the one before them, which shows if there was a gap at the
     beginning. Samples from before the vehicle's last restart are left out. If the samples span less
     time, all are returned."""
     same = [s for s in samples if s.start == samples[-1].start]

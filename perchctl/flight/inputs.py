@@ -325,8 +325,8 @@ FROZEN_ATTITUDE_S = 0.06
 """Age above which an unchanged attitude no longer counts as the attitude at the exposure, s. An
 error of 0.1 rad displaces a vehicle 1.2 m below the target by 12 cm."""
 PICTURE_AHEAD_S = 0.1
-"""Largest time by which an image may be ahead of the loop's clock, s. If it is further ahead, its
-time stamp comes from another clock."""
+"""Largest time by which an image may be ahead of the loop's clock, s. If an image is further ahead,
+its time stamp comes from another clock."""
 
 
 class TargetPositioning:

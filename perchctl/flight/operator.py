@@ -53,22 +53,22 @@ SAME_PRESS_S = 0.3
 """Two presses that are closer together than this count as one, s. Larger: a quick second press is
 missed."""
 LONGEST_DELAY_S = 1.0
-"""Longest time for which a keyboard waits before it repeats a key, s. Until then, a second press
-may be the first repeat of a held key. Larger: a held key takes longer until it does more than land,
-and evenly repeated presses stop the motors later."""
+"""Longest time for which a keyboard waits before it repeats a key, s. Within this time, a second
+press may be the first repeat of a held key. Larger: a held key takes longer until it does more than
+land, and evenly repeated presses stop the motors later."""
 SHORTEST_DELAY_S = 0.25
 """Shortest time for which a keyboard waits before it repeats a key, s. Smaller: more presses by
-hand are taken for a held key."""
+hand are mistaken for a held key."""
 SLOWEST_REPEAT_S = 0.2
 """Longest time between two repeats of a key, s. Larger: the stop by a second press is delayed."""
 KEY_JITTER_S = 0.02
 """Longest delay with which a busy computer reads a repeat, s. Larger: more presses by hand are
-taken for a held key."""
+mistaken for a held key."""
 KEY_REPEAT_WAIT_S = SLOWEST_REPEAT_S + KEY_JITTER_S + 0.01
 """Time after which a key that is still held must have repeated."""
 FASTER_THAN_A_HAND_S = 0.08
 """Mean interval below which repeats must come from a held key, s. Larger: more presses by hand are
-taken for a held key."""
+mistaken for a held key."""
 SHORTEST_FAST_DELAY_S = 0.15
 """Shortest initial delay of a key whose mean repeat interval is below `FASTER_THAN_A_HAND_S`
 (``xset r rate 200 50``), s."""
@@ -206,7 +206,7 @@ def _are_even(times_s: Sequence[float]) -> bool:
 
 
 LANDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-"""Signals that end or suspend other programs; on one of them, a flight lands."""
+"""Signals that end or suspend other programs; when a flight receives one, it lands."""
 _MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight that runs in the background
 _NO_SUSPENDING = "Ctrl-Z cannot suspend a flight: landing"
 
@@ -255,7 +255,8 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if any(number in LANDING_SIGNALS for number in numbers):
             switch.land()
         if switch.listening and signal.SIGTSTP in numbers:
-            # Not printed from this thread, which would block if the terminal is stopped by Ctrl-S.
+            # The line is not printed from this thread, which would block if the terminal is stopped
+            # by Ctrl-S.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 

@@ -126,8 +126,8 @@ def fly_session(
 
     `switch` carries the operator's commands. `begin_turn`, `remarks`, `may_take_off`, and
     `climb_withheld`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
-    answered. If it raises an exception, the session ends on the ground. `rows` are added to the
-    profile's transition table.
+    answered. If `before_arming` raises an exception, the session ends on the ground. `rows` are
+    added to the profile's transition table.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()

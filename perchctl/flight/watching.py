@@ -1,10 +1,10 @@
 """Observers of a flight. If an observer raises an exception, it is detached and the flight
 continues.
 
-A panel, a page, a callback or a log may fail in any tick. It is then detached, the other observers
-are informed, and the flight continues without it. Two kinds of exceptions are raised after the loop
-has landed the vehicle: errors from the judges, without which a simulated flight would prove
-nothing, and requests to exit (KeyboardInterrupt, SystemExit).
+A panel, a page, a callback or a log may fail in any tick. The observer is then detached, the other
+observers are informed, and the flight continues without it. Two kinds of exceptions are raised
+after the loop has landed the vehicle: errors from the judges, without which a simulated flight
+would prove nothing, and requests to exit (KeyboardInterrupt, SystemExit).
 """
 
 from __future__ import annotations

@@ -209,8 +209,8 @@ class CflibLink:
         )
 
     def _unlock_thrust(self, connection: Connection) -> None:
-        """Unlock raw thrust. Only called on the ground, because the zero-thrust packet cuts the
-        motors."""
+        """Unlock raw thrust. This method is called only on the ground, because the zero-thrust
+        packet cuts the motors."""
         newest, now_s = self._blocks.newest, self._clock()
         if not is_fresh(newest, now_s):
             raise ConnectionFailed(

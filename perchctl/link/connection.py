@@ -150,7 +150,7 @@ class Connection:
         with self._change:
             self._left = True
             if not farewell and self.cf.link is not None:
-                # Without its driver, close_link cannot send the zero setpoint.
+                # Without a driver, cflib's close_link cannot send the zero setpoint.
                 calls.insert(0, self.cf.link.close)
                 self.cf.link = None
         _run_bounded(calls)
@@ -323,7 +323,8 @@ _CAUSES = {
     "Cannot find": Problem(f"no Crazyradio is plugged in, or {_PERMISSION}", UDEV_HELP),
     "Access denied": Problem(_PERMISSION, UDEV_HELP),
 }
-"""Cause and remedy for an error of cflib, by words in it; the first match is used."""
+"""Cause and remedy for an error of cflib, by words in the error message; the first match is
+used."""
 
 
 def find_cause(message: str) -> Problem:

@@ -103,7 +103,8 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
         case RawThrust(thrust, roll_rad, pitch_rad):
             return (_raw(thrust, roll_rad, pitch_rad),)
         case Land(height, duration):
-            # Without a yaw, to which the vehicle would rotate on the way: cflib's `yaw=None`.
+            # No yaw is sent (cflib's `yaw=None`), because the vehicle would rotate to it on the
+            # way.
             data = struct.pack("<BBff?f", _LAND_2, _ALL_GROUPS, height, 0.0, True, duration)
             # The landing command is sent first, three times: it must not get lost, because the
             # notify message alone cuts the motors at once (docs/firmware.md, "Notify alone"). If
@@ -138,7 +139,7 @@ UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet after boot, on the ground, then the message that returns the priority.
 Without the zero-thrust packet, raw thrust stays 0; without the message, the firmware does not
 execute its own landing (docs/firmware.md, "Raw thrust"). The vehicle does not confirm these
-packets, and if they were lost, the first raw thrust in the air would cut the motors. They are
-therefore sent `UNLOCK_TIMES`."""
+packets, and if they were lost, the first raw thrust in the air would cut the motors. The packets
+are therefore sent `UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
 """Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

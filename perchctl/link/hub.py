@@ -2,7 +2,7 @@
 
 cflib shares a dongle only within one process (docs/firmware.md, "Shared dongle"). Each vehicle's
 flight runs in its own process, so that a hang or a crash in one never delays another. The hub
-carries the packets of all of them. `RadioHub` is the handle used by the process that starts the
+carries the packets of all vehicles. `RadioHub` is the handle used by the process that starts the
 flights; `perchctl.link.sharing` runs in the hub process.
 """
 
@@ -26,8 +26,8 @@ HUB_END_TIMEOUT_S = 5.0
 """Time after which a hub that does not end is killed, s. Longer: a hanging hub delays the end.
 Shorter: its dongle may stay claimed until the system has cleaned up."""
 SILENT_S = 1.0
-"""Time without a report after which the hub counts as hanging, s. It reports five times a second.
-Longer: a hang is detected later. Shorter: a busy computer looks like a hang."""
+"""Time without a report after which the hub counts as hanging, s. The hub reports five times a
+second. Longer: a hang is detected later. Shorter: a busy computer looks like a hang."""
 PROGRAM = "from perchctl.link.sharing import serve_parent; serve_parent()"
 
 
@@ -35,9 +35,9 @@ class RadioHub:
     """Handle of a hub for the vehicles at `uris`, radio URIs of one dongle; a context manager.
 
     Raises InvalidValue for URIs that one dongle cannot serve, ConnectionFailed if the dongle cannot
-    be opened or a vehicle is in use by another program, and TimedOut. In these cases, no packet has
-    been sent to any vehicle. A vehicle that does not answer is not an error here: its flight fails
-    to connect.
+    be opened or a vehicle is in use by another program, and TimedOut. If an error is raised, no
+    packet has been sent to any vehicle. A vehicle that does not answer is not an error here: its
+    flight fails to connect.
 
     If its parent process ends, the hub keeps running until the flights have ended, because they
     need it to land.
@@ -96,7 +96,7 @@ class RadioHub:
             self._channel.send((uri, packets_per_s))
 
     def stop(self) -> None:
-        """Stop the hub. It sends no more packets. May be called twice."""
+        """Stop the hub. The hub sends no more packets. May be called twice."""
         self._channel.close()
         if self._child.poll() is None:
             with contextlib.suppress(OSError):

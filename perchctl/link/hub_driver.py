@@ -16,9 +16,9 @@ header are always set (`perchctl.link.crtp.Packet`); a datagram without them is 
 - `ROOM` and a byte: the number of the flight's packets that are waiting in the hub for the radio.
 - `REPORT` and a `HubReport` as JSON.
 
-cflib's own `udp://` driver is not suitable. It accepts any number of packets, so a stop would be
-sent after all the setpoints that had piled up during a radio dropout. It also cannot report a dead
-dongle.
+cflib's own `udp://` driver is not suitable. The `udp://` driver accepts any number of packets, so a
+stop would be sent after all the setpoints that had piled up during a radio dropout. This driver
+also cannot report a dead dongle.
 
 Only `connect` waits for the hub; cflib calls it in a separate thread.
 """
@@ -56,9 +56,9 @@ HELLO_PERIOD_S = 0.1
 """Time between two requests for the hub's first answer, s, in case one gets lost. Longer: a lost
 request delays the connection. Shorter: no benefit."""
 SIGN_OF_LIFE_S = 1.0
-"""Time between two requests of an open link, s. They tell the hub that the flight is still running.
-If the hub's process has ended, the operating system refuses them, so the flight detects this even
-when it sends nothing else. Longer: detected later. Shorter: more packets."""
+"""Time between two requests of an open link, s. These requests tell the hub that the flight is
+still running. If the hub's process has ended, the operating system refuses them, so the flight
+detects this even when it sends nothing else. Longer: detected later. Shorter: more packets."""
 HUB_STOP_PERIOD_S = 0.2
 """Longest time until the driver's thread reacts to a close or sends the next request, s. Longer:
 its socket is freed later. Shorter: the thread wakes up more often for nothing."""

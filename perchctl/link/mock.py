@@ -65,7 +65,8 @@ class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
     Commands reach `vehicle`, a `perchctl.sim.SimulatedVehicle`, as bytes through the simulated
-    link's decoder. Its telemetry arrives in log blocks through the same assembler as by radio.
+    link's decoder. The vehicle's telemetry arrives in log blocks and passes through the same
+    assembler as over the radio.
     """
 
     FAST_BLOCKS = FAST_BLOCKS

@@ -23,22 +23,23 @@ def ignore_sent(sent: SentCommand) -> None:
 
 
 Guard = Callable[[float, Telemetry | None, Sequence[Telemetry]], Command | None]
-"""Returns the command that the link must send in the loop's place, nearly always None. Its
+"""Returns the command that the link must send in the loop's place, nearly always None. The guard's
 arguments are the time, the newest telemetry, and the samples that the loop has not taken yet,
-oldest first. It is called about every 50 ms, in a thread of the link if it has one, but not while a
-command is waiting to be sent."""
+oldest first. The guard is called about every 50 ms, in a thread of the link if it has one, but not
+while a command is waiting to be sent."""
 
 
 class Link(Protocol):
     """A vehicle, either simulated in lockstep or connected through cflib.
 
-    All methods but `send_external` are called from the flight loop's thread. They raise
+    All methods but `send_external` are called from the flight loop's thread. These methods raise
     ConnectionFailed, NotFound or TimedOut of `perchctl.errors`.
     """
 
     def connect(self) -> None:
-        """Connect, check the firmware, set parameters and unlock the thrust, with a timeout. Does
-        not arm: a vehicle that does not arm itself receives `Arm` just before take-off."""
+        """Connect, check the firmware, set parameters and unlock the thrust, with a timeout. This
+        does not arm the vehicle: a vehicle that does not arm itself receives `Arm` just before
+        take-off."""
 
     def decks(self) -> tuple[str, ...]:
         """Return the decks that the connected vehicle found at boot, by the firmware's names."""
@@ -61,8 +62,8 @@ class Link(Protocol):
         """Call `guard` regularly from now on, until the link is closed.
 
         `on_sent` is called with each command that the link has sent in the loop's place: the
-        guard's commands, commands repeated after a lost link, and the farewell. It is called from
-        the link's own thread if it has one.
+        guard's commands, commands repeated after a lost link, and the farewell. `on_sent` is called
+        from the link's own thread if it has one.
         """
 
     def close(self) -> None:

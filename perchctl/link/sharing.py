@@ -6,7 +6,7 @@ flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->  thread of
 flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->        |
 ```
 
-The hub only transfers packets and does not know their meaning. It uses the drivers without a
+The hub only transfers packets and does not know their meaning. The hub uses the drivers without a
 `Crazyflie` object, whose `close_link` would send a zero setpoint and drop a flying vehicle.
 `RadioDriver.close` sends nothing.
 

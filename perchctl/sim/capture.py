@@ -120,7 +120,7 @@ class SimCapture:
     """Motion capture with exposures at `rate_hz`. The same settings and flight give the same
     frames.
 
-    It is the `CaptureSource` of a flight in lockstep.
+    This object is the `CaptureSource` of a flight in lockstep.
 
     Each exposure draws the same random numbers with or without a fault, so a fault changes no frame
     outside its time. Frames never overtake each other.

@@ -1,6 +1,6 @@
 """The Crazyflie's side of the link: packets in, firmware calls, packets out.
 
-It uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything that an
+This module uses no socket and no clock; `perchctl.sim.host` carries the packets. Everything that an
 unmodified cflib sends is answered as described in docs/firmware.md ("Connect sequence"). In the
 same document, "Link" describes ports and layouts, and "Signs and units" describes the signs.
 """

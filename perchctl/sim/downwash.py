@@ -49,9 +49,9 @@ FACTOR_RADIUS_M = 0.05
 """Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: a stronger
 push next to the axis, although the recordings need no factor at 0.1 m."""
 LEAST_MPS = 0.01
-"""Speed below which a jet is ignored, m/s, so that vehicles far apart fly exactly as if alone. It
-is the speed 2 m below the source and 1 m from its axis. Larger: the drag force at this speed is
-missing."""
+"""Speed below which a jet is ignored, m/s, so that vehicles far apart fly exactly as if alone. The
+jet has this speed 2 m below its source and 1 m from its axis. Larger: the drag force at this speed
+is missing."""
 
 
 def jet_mps(thrust_n: float, below_m: float, aside_m: float) -> float:

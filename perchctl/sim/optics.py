@@ -65,8 +65,8 @@ def ray_to_plane_map(T_target_cam: Array) -> Array:
     """The homographies (..., 3, 3) from rays (x, y, 1) to homogeneous points (X w, Y w, w)
     of the target's plane, for poses (..., 4, 4).
 
-    They follow from X = t + s R r with X_z = 0. A camera above the plane does not see it (w is made
-    negative).
+    The homographies follow from X = t + s R r with X_z = 0. A camera above the plane does not see
+    it (w is made negative).
     """
     R, t = T_target_cam[..., :3, :3], T_target_cam[..., :3, 3:]
     H = np.empty(R.shape)

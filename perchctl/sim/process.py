@@ -19,8 +19,8 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.sim.scenario import Scenario
 
 ANSWER_TIMEOUT_S = 60.0
-"""Timeout for an answer, s. It must also suffice for `advance`, which takes one second per 30 s of
-simulated time."""
+"""Timeout for an answer, s. The timeout must also suffice for `advance`, which takes one second per
+30 s of simulated time."""
 _STOP_TIMEOUT_S = 5.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
@@ -32,10 +32,10 @@ def _serve_parent(*arguments: Any) -> None:
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It also has the methods that
-    `perchctl.sim.host.VehicleHost.call_method` finds in the child.
+    """Handle of a running simulated vehicle; a context manager. The handle also has the methods
+    that `perchctl.sim.host.VehicleHost.call_method` finds in the child.
 
-    Its methods may be called from any thread. They raise `ConnectionFailed` if the child is gone,
+    All methods may be called from any thread. They raise `ConnectionFailed` if the child is gone,
     `TimedOut` if it does not answer, and `InvalidValue` if it refuses a call.
 
     Attributes:

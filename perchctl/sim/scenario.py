@@ -354,8 +354,9 @@ answered."""
 
 class RadioBursts:
     """Gilbert's two-state channel in continuous time: the lengths of good and bad periods are
-    exponentially distributed and do not depend on the packet rate. Both directions are lost
-    together. The times passed to `is_lost` must not decrease. The same seed gives the same bursts.
+    exponentially distributed and do not depend on the packet rate. Packets in both directions are
+    lost together. The times passed to `is_lost` must not decrease. The same seed gives the same
+    bursts.
 
     Args:
         share: share of the time in which packets are lost, above 0 and below 1.

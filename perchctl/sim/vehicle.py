@@ -22,8 +22,8 @@ _PAST = 128  # control periods: longer than any exposure with its read-out
 class SimulatedVehicle:
     """One simulated Crazyflie.
 
-    It has a camera only if a camera model is given, and motion capture only if capture settings are
-    given.
+    The vehicle has a camera only if a camera model is given, and motion capture only if capture
+    settings are given.
     """
 
     def __init__(

@@ -274,8 +274,8 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 # --- The corner where four squares meet, found by fitting the image around it ---
 # `cv2.cornerSubPix` has a fixed window, which includes neighbouring corners of small squares and
 # the markers of a ChArUco board. The errors of `cv2.cornerSubPix` are 0.03 to 0.5 px where this fit
-# has errors of 0.02 px. Here the window follows the size and slant of the square, and a model of
-# two crossing blurred edges is fitted to its grey levels:
+# has errors of 0.02 px. In this module, the window follows the size and slant of the square, and a
+# model of two crossing blurred edges is fitted to its grey levels:
 #
 #     I = a + gx x + gy y + (c + hx x + hy y) tanh(d1 / w1) tanh(d2 / w2)
 #
@@ -354,7 +354,8 @@ def fit_saddles(
 
 
 def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the grey levels (n, m) at places (n, m, 2), and which of these are in the image."""
+    """Return the grey levels (n, m) at positions (n, m, 2), and which of these positions are in the
+    image."""
     h, w = image.shape
     inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)

@@ -120,8 +120,8 @@ def _marker_ids(
 
 
 def _smallest(family: str, largest_id: int) -> str:
-    """Return the smallest dictionary of a family that contains this id; all of them begin with the
-    same markers."""
+    """Return the smallest dictionary of a family that contains this id; all dictionaries of a
+    family begin with the same markers."""
     if not family.endswith(f"_{_SIZES[-1]}"):
         return family
     return next(f"{_stem(family)}_{n}" for n in _SIZES if n > largest_id)

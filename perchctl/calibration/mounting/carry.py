@@ -1,10 +1,10 @@
 """The carry: find the camera's rotation and latency while the vehicle is turned by hand.
 
-One rotation chain holds at each image's exposure: ``R_cam_target = R_body_cam^T R_world_body(t -
-latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body, where the world
-frame is the body frame at the first sample. The solution contains the rotations of camera and
-target, the latency, the bias and scale error of the gyroscope, and a random walk of the integrated
-rotation.
+The following chain of rotations holds at each image's exposure: ``R_cam_target = R_body_cam^T
+R_world_body(t - latency)^T R_world_target``. Integrating the gyroscope's rates gives R_world_body,
+where the world frame is the body frame at the first sample. The solution contains the rotations of
+camera and target, the latency, the bias and scale error of the gyroscope, and a random walk of the
+integrated rotation.
 """
 
 from __future__ import annotations

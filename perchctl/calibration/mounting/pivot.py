@@ -2,9 +2,9 @@
 tilted around it.
 
 The point c in the target's frame and the tip in the camera's frame are the same in every image:
-``tip = R_cam_target c + p_cam_target``. Both are found by linear least squares, in which each
-image is weighted by its own covariance and outliers count little. Neither the vehicle's attitude
-nor the images' timestamps are needed.
+``tip = R_cam_target c + p_cam_target``. The point and the tip are found by linear least squares, in
+which each image is weighted by its own covariance and outliers count little. Neither the vehicle's
+attitude nor the images' timestamps are needed.
 """
 
 from __future__ import annotations

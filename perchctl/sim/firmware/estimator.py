@@ -53,8 +53,9 @@ _FIRST_DECK_S = 0.03
 _RANGED_M2, _CLIMB_M2PS2 = 2.4e-6, 1.8e-4
 """Variances of height and vertical speed with the range sensor of a Flow deck, sigma 2.5 mm."""
 _FLOW_M2PS2, _FLOW_LEAST_M = 2.15e-3, 0.1
-"""Variance of the horizontal velocity from optical flow, sigma 0.2 px, at 1 m above the ground. It
-grows with the height to the power of 1.5; below the second value, m, it stays constant."""
+"""Variance of the horizontal velocity from optical flow, sigma 0.2 px, at 1 m above the ground. The
+variance grows with the height to the power of 1.5; below the height given by the second value, m,
+it stays constant."""
 _ABSOLUTE_M2, _ABSOLUTE_M2PS2 = 1e-6, 2.5e-4
 """Variances of position and velocity with a Lighthouse deck."""
 

@@ -3,11 +3,11 @@ positions or poses.
 
 The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second, the
 gyroscope updates the attitude and the accelerometer updates the velocity. In flight, the velocity
-is updated along the thrust axis only, so drag and draught have no effect on it. Otherwise it is
-updated along all three axes, and the attitude is pulled towards the initial one. A position
-corrects position, velocity and attitude according to their covariance with it. The filter never
-sees the true state: the sensor errors (`Imu`) and any wrong position corrupt the estimate, because
-there is no gate (source).
+is updated along the thrust axis only, so drag and draught have no effect on it. While the vehicle
+is not flying, the velocity is updated along all three axes, and the attitude is pulled towards the
+initial one. A position corrects position, velocity and attitude according to their covariance with
+it. The filter never sees the true state: the sensor errors (`Imu`) and any wrong position corrupt
+the estimate, because there is no gate (source).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The log variables and parameters that a Crazyflie announces, and how they are read and set.
 
-The names are those of the real firmware. They cover the variables that perchctl reads, and the
-parameters that a profile may set, most of which have no effect here. Each table is filled up to the
-measured size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
+The names are those of the real firmware. The tables cover the variables that perchctl reads, and
+the parameters that a profile may set, most of which have no effect here. Each table is filled up to
+the measured size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
 """
 
 from __future__ import annotations
