@@ -96,7 +96,7 @@ def _checked(lens: Lens) -> CameraModel:
     """Return the camera model for a lens. Raises InvalidValue for an implausible camera matrix."""
     camera = CameraModel(lens.size_px, lens.K, lens.distortion, lens.model)
     K = lens.K.copy()
-    K[0, 1] = 0.0  # a skew that `CameraModel` allows, but no computation uses
+    K[0, 1] = 0.0  # `CameraModel` allows a skew, but no computation uses it
     (width, height), (cx, cy) = camera.size_px, K[:2, 2]
     if not (0 < cx < width and 0 < cy < height and K[0, 0] > 0 and K[1, 1] > 0):
         raise InvalidValue(

@@ -15,7 +15,7 @@ is 0 or empty, which disables any term of a lens model. `rectification_matrix` a
 `projection_matrix` are among the notes: according to sensor_msgs/CameraInfo, they describe
 rectified images, whereas K and D describe the camera's own images.
 
-Known forms that are not supported are refused by name.
+Known forms that are not supported are refused with a message that names them.
 """
 
 from __future__ import annotations

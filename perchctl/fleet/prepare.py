@@ -30,8 +30,8 @@ def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
 
 
 IDLE_PER_S = 10
-"""Packets per second for a vehicle whose flight has ended, the lowest limit of a hub. Larger: less
-radio time is left for the vehicles that still fly. Smaller is not possible."""
+"""Packets per second for a vehicle whose flight has ended, the lowest limit that a hub allows.
+Larger: less radio time is left for the vehicles that still fly. Smaller is not possible."""
 
 
 class Radios:

@@ -50,7 +50,7 @@ slower than necessary."""
 MOST_ON_A_DONGLE = 5
 """Largest number of vehicles on one dongle: users of cflib report three to five."""
 LEAST_APART = 2
-"""Least number of channels between two dongles: at 2M, a signal is 2 MHz wide, which is the width
+"""Minimum number of channels between two dongles: at 2M, a signal is 2 MHz wide, which is the width
 of two channels (bitcraze/cfcli)."""
 SLOWEST_PERIOD_S = SafetyConfig.proof_age_s / 2
 """Slowest telemetry period that is chosen, s. With a slower one, the telemetry could prove nothing
@@ -90,7 +90,7 @@ def radio_place(vehicle: FleetVehicle) -> RadioPlace | None:
         return None
     _, channel, rate, _ = vehicle.address.split("/")
     dongle = vehicle.uri.removeprefix(RADIO).partition("?")[0].partition("/")[0]
-    is_number = dongle.isdecimal() and len(dongle) < 10  # ten digits are a serial number
+    is_number = dongle.isdecimal() and len(dongle) < 10  # a number of ten digits is a serial number
     return RadioPlace(str(int(dongle)) if is_number else dongle.upper(), int(channel), rate)
 
 
@@ -266,7 +266,8 @@ def _periods_s(profile: Profile) -> list[float]:
 
 
 def _most_that_fit(need_per_s: float) -> int:
-    """Return how many vehicles that need this packet rate one dongle can carry, at least one."""
+    """Return how many vehicles with this packet rate one dongle can carry; the result is at least
+    1."""
     counts = range(1, MOST_ON_A_DONGLE + 1)
     fit = [count for count in counts if need_per_s <= USABLE_SHARE * carried_per_s(count)]
     return max(fit, default=1)

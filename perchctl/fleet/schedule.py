@@ -57,13 +57,13 @@ less than the draughts in which perchctl perches. Distances between axes used el
 Bitcraze's demos, 0.24 m by Crazyswarm, 0.6 m in the firmware's avoidance. Smaller: neighbours
 disturb each other. Larger: fewer vehicles fit into a room."""
 START_SEPARATION_M = 0.5
-"""Least distance between a vehicle that takes off and the corridor of another one that is flying,
+"""Minimum distance between a vehicle that takes off and the corridor of another one that is flying,
 m, as in Bitcraze's demos. Smaller: a vehicle starts in another one's jet. Larger: homes must be
 farther apart."""
 OBSTACLE_M = 0.24
-"""Least distance between a vehicle that waits or hangs and a corridor that is being flown, m: twice
-the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch. Larger:
-fewer targets fit."""
+"""Minimum distance between a vehicle that waits or hangs and a corridor that is being flown, m:
+twice the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch.
+Larger: fewer targets fit."""
 
 
 # --- Corridors ---
@@ -284,7 +284,7 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
     try:
         sorter.prepare()
     except CycleError as error:
-        circle = error.args[1]  # each must precede the one after it
+        circle = error.args[1]  # each vehicle must fly before the next one
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
             f"{each.first} and {each.then} cannot fly in any order, because the order "

@@ -52,7 +52,7 @@ def main(channel: Channel) -> None:
         reporter = StatusReporter(line, switch)
         try:
             result = fly_vehicle(options, switch, line, reporter)
-        except BaseException as error:  # a signal while another failure was being handled
+        except BaseException as error:  # a signal came while another failure was being handled
             result = reporter.failure or reporter.result_of_error(error)
         line.finish(result)
     sys.stdout.flush()
@@ -303,7 +303,8 @@ class StatusReporter(Watcher):
         if self._rest is not None:
             reason = f"{reason}; {self._rest}"
         result = self._result(code, VehicleOutcome.FAILED, reason)
-        return replace(result, log=None if self._tick is None else self.log)  # deleted if no tick
+        # Without a tick, the log is deleted.
+        return replace(result, log=None if self._tick is None else self.log)
 
     def _result(self, code: int, outcome: VehicleOutcome, reason: str) -> Result:
         tick, lost = self._tick, self._switch.lost
@@ -313,7 +314,7 @@ class StatusReporter(Watcher):
         # rescue.
         has_flown = tick is not None or self._rest is not None
         if has_flown and lost is not None and code == Interrupted.exit_code:
-            code = SafetyAbort.exit_code  # no operator has landed it
+            code = SafetyAbort.exit_code  # the operator did not land the vehicle
         return Result(
             exit_code=code,
             outcome=outcome,

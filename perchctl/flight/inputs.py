@@ -92,7 +92,7 @@ class FlightInputs:
     output: PipelineOutput | None = None  # output for this tick's frame, if it was searched
     taken: TickInputs = field(default_factory=TickInputs)  # what was received in this tick
     is_blind: bool = False
-    repeated: bool = False  # this tick's frame is identical to the one before
+    repeated: bool = False  # this tick's frame is identical to the previous one
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     # If the camera's problem is a bad image, its kind according to `FrameHealth`; otherwise None.

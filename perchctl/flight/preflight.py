@@ -85,10 +85,10 @@ def refuse_wrong_positions(
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
-        return  # unknown: neither checked nor reset
+        return  # the position is neither checked nor reset
     criteria = GroundCriteria(telemetry, profile)
     stands = criteria.stands
-    # The last position before a problem may have been somewhere else.
+    # The last position before a problem may have been measured at another place.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
         return

@@ -41,7 +41,7 @@ def read_device_type(cf: Any) -> str | None:
     """Return the type of vehicle that the firmware reports; None if it does not answer within a
     timeout.
 
-    cflib 0.1.34 never requests it.
+    cflib 0.1.34 never requests the type.
     """
     answers: queue.SimpleQueue[str] = queue.SimpleQueue()
 

@@ -92,7 +92,7 @@ class RadioHub:
         Takes effect after the vehicle's next packet. The limit includes telemetry: if a flight
         requests more than fits, its telemetry arrives late.
         """
-        with contextlib.suppress(OSError):  # the hub has ended, as `update` says
+        with contextlib.suppress(OSError):  # the hub has ended, which `update` reports
             self._channel.send((uri, packets_per_s))
 
     def stop(self) -> None:

@@ -160,7 +160,7 @@ class HubDriver:
             self._await_report(wire)
             if self.report.problem is not None:
                 raise ConnectionFailed(self.report.problem)
-        except OSError:  # nobody has the port any more
+        except OSError:  # no process uses the port any more
             wire.close()
             raise ConnectionFailed(HUB_ENDED) from None
         except BaseException:
@@ -236,7 +236,7 @@ class HubDriver:
                     self._take(wire.recv(MOST_BYTES))
                 except TimeoutError:
                     continue
-                except OSError:  # refused, since nobody has the hub's port any more
+                except OSError:  # refused, since no process uses the hub's port any more
                     self._fail(HUB_ENDED)
                     return
                 if self.report.problem is not None:

@@ -302,7 +302,7 @@ class Hub:
             self.carriers = [Carrier(uri) for uri in uris]
             try:
                 self._open_dongle()
-            except Exception as error:  # any error of cflib's and of USB's
+            except Exception as error:  # any error from cflib or USB
                 for carrier in self.carriers:
                     carrier.socket.close()
                 cause = readable_cause(str(error) or type(error).__name__)
@@ -406,11 +406,11 @@ class Hub:
                 carrier.opened_s = time.monotonic()
             elif carrier.has_stale_packet and carrier.driver is not None:
                 self._close_driver(carrier)
-                carrier.opened_s = -math.inf  # must be reopened at once
+                carrier.opened_s = -math.inf  # the driver must be reopened at once
             elif carrier.driver is None and time.monotonic() - carrier.opened_s > SAFELINK_PERIOD_S:
                 try:
                     carrier.open()
-                except Exception:  # any error of cflib's and of USB's
+                except Exception:  # any error from cflib or USB
                     self._set_problem(DEAD)
 
     def _open_dongle(self) -> None:

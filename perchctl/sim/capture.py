@@ -262,7 +262,7 @@ class MotionCaptureServer:
 
     def _answer(self) -> None:
         while True:
-            with contextlib.suppress(OSError):  # error of a client that has gone
+            with contextlib.suppress(OSError):  # error from a client that has disconnected
                 request, address = self._socket.recvfrom(2048)
                 kind = int.from_bytes(request[:2], "little") if len(request) >= 4 else None
                 if kind == CONNECT:

@@ -127,7 +127,7 @@ def _plan(firmware: Firmware, data: bytes) -> int:
         case _:
             return ENOEXEC
     is_finite = all(math.isfinite(value) for value in values if value is not None)
-    if is_finite and data[1:2] == b"\0":  # a command for all groups; this vehicle is in none
+    if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in no group
         firmware.command_planner(order, *values)
     return OK
 

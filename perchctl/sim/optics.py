@@ -26,7 +26,7 @@ FINE_PX, COARSE_PX = 2, 8
 FAR_AWAY_M = 1e4
 """Coordinate assigned to rays that miss the plane."""
 LEAST_RISE = 0.02
-"""Least z of a ray (target axes, depth 1 in the view) that still meets the plane."""
+"""Smallest z of a ray (target axes, depth 1 in the view) that still meets the plane."""
 
 
 @dataclass(frozen=True, eq=False)

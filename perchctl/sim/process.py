@@ -26,7 +26,7 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 
 def _serve_parent(*arguments: Any) -> None:
-    from perchctl.sim.host import serve_parent  # loads the physics: in the child only
+    from perchctl.sim.host import serve_parent  # loads the physics, in the child only
 
     serve_parent(*arguments)
 

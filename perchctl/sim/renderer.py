@@ -321,7 +321,7 @@ def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONST
 
 
 def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
-    """Blur a box of blocks in place by a Gaussian, with the margin that the blur reaches."""
+    """Blur a box of blocks in place with a Gaussian, with the margin that the blur reaches."""
     reach = math.ceil(3.0 * sigma_px) + 1
     near, far = pixel_slices(box, reach), pixel_slices(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)

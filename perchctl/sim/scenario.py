@@ -223,7 +223,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     weak_part = between("first_contact_share")
     extra = {"analogue": sim.camera_analogue} if sim.camera_analogue else {}
     if not profile.positioning.source.is_deck:
-        extra["external_position"] = 1.0  # and has no deck
+        extra["external_position"] = 1.0  # such a vehicle has no deck
     return Scenario(
         seed=seed,
         target_xy_m=(x_m, y_m),

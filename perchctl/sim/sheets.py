@@ -252,7 +252,7 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
     return PlacedSheet(printed_sheet(target.model_dump_json()), plane)
 
 
-@lru_cache(maxsize=32)  # the targets of a fleet
+@lru_cache(maxsize=32)  # enough for the targets of a fleet
 def printed_sheet(target_json: str) -> Sheet:
     """Return a target's sheet. Flights share its textures, which take more than a second to
     make."""

@@ -321,7 +321,7 @@ class Magnet:
         self._came_off = False
         self.engaged = False
         self.target_xy_m = scenario.target_xy_m
-        self.let_go = False  # permanently failed: it no longer pulls
+        self.let_go = False  # the magnet has failed and no longer pulls
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
         """Return the pull on the gear's tip at `tip_m`, world axes; 0 unless `upright`."""

@@ -111,7 +111,7 @@ def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
 
 
 COVERAGE_AXES = ("position x", "position y", "size", "skew")
-"""Named as in ROS's camera_calibration."""
+"""The names are those of ROS's camera_calibration."""
 GOALS = {"position x": 0.5, "position y": 0.5, "size": 0.3, "skew": 0.4}
 """Spread of the views along each axis at which the axis counts as covered."""
 NEW_BEYOND = 0.18

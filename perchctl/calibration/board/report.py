@@ -39,8 +39,8 @@ outliers shrink the others. Smaller: the longest ones leave the image."""
 _LEAST_RESIDUAL_PX = 1e-3
 """Smallest length that counts as a long residual, px: with exact corners, all residuals are 0."""
 _LEAST_STEPS = 2
-"""Least number of steps on the distance axis; there may be up to 2.5 times as many. Larger: labels
-overlap."""
+"""Minimum number of steps on the distance axis; there may be up to 2.5 times as many. Larger:
+labels overlap."""
 _STEPS = (1.0, 2.0, 5.0)
 """Leading digits to which the enlargement, the length of the scale arrow and the steps of an axis
 are rounded."""
@@ -240,7 +240,7 @@ def _reported_view(
 ) -> ReportedView:
     R = np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=np.float64)
     middle_m = R @ view.corners_m.mean(axis=0) + pose[3:]
-    normal = -R[:, 2] if R[2, 2] > 0 else R[:, 2]  # its z points towards the camera
+    normal = -R[:, 2] if R[2, 2] > 0 else R[:, 2]  # points towards the camera
     hull = cv2.convexHull(view.corners_px.astype(np.float32))
     sideways = float(np.linalg.norm(normal[:2]))
     return ReportedView(

@@ -40,7 +40,7 @@ TITLES: dict[Level, str] = {
 }
 CARE_FACTOR = 3.0
 ASIDE_FACTOR = 2.0
-_EASIER = 0.95  # a richer model is used only if it reduces the spread at least to this share
+_EASIER = 0.95  # a richer model is used only if it reduces the spread to this share or less
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame
 
 LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
-"""Least duration of each part's recording, s, even if no motion is missing."""
+"""Minimum duration of each part's recording, s, even if no motion is missing."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5

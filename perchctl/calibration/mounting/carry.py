@@ -37,7 +37,7 @@ KNOT_S = 2.0
 GYRO_WALK_RAD = math.radians(0.03)
 """Random walk of the integrated rotation in the first second, rad; it grows with the square root of
 time."""
-FLOOR_RAD = math.radians(0.02)  # least error of a pose: lens, print and paper
+FLOOR_RAD = math.radians(0.02)  # smallest error of a pose, due to lens, print and paper
 _CARRY_ITERATIONS = 15
 
 TURN, TARGET, BIAS, SCALE = (slice(3 * k, 3 * k + 3) for k in range(4))

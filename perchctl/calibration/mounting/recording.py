@@ -173,8 +173,8 @@ LEAST_POSES: dict[MountingPart, int] = {"carry": 150, "pivot": 100}
 LEAST_ATTITUDES = 500
 TILT_DEG: dict[MountingPart, float] = {"carry": 30.0, "pivot": 25.0}
 YAW_DEG, LEAST_RATE_DPS = 90.0, 15.0
-"""Least range of the rotation about the vertical, from one side to the other with the target in
-view, and the least rate of rotation; only for a carry."""
+"""Minimum range of the rotation about the vertical, from one side to the other with the target in
+view, and minimum rate of rotation; only for a carry."""
 MOST_LATE_S = 1.0
 
 

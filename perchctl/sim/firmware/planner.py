@@ -72,7 +72,7 @@ class HighLevelPlanner:
         return self.state != TRAJECTORY_IDLE
 
     def finished(self, t_s: float) -> bool:
-        """True if the plan's time is over, whatever the height (docs/firmware.md, "Setpoint
+        """True if the plan's time is over, regardless of the height (docs/firmware.md, "Setpoint
         modes")."""
         return self.state == TRAJECTORY_IDLE or t_s - self._begin_s >= self._duration_s
 
