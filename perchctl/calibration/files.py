@@ -58,7 +58,7 @@ def load_calibration(file: Path | str) -> CameraModel:
 
 
 def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
-    """Return the camera and the values of all keys of the file."""
+    """Return the camera, and the values of all keys in the file."""
     text = _text(path)
     try:
         lens, values = parse_calibration(text)
@@ -115,7 +115,7 @@ def calibration_text(
 ) -> str:
     """The text of a calibration file; `name` is the camera's name.
 
-    `notes` are further keys, ignored by ROS readers, with numbers, texts or arrays (n, m).
+    `notes` are further keys, which ROS readers ignore, with numbers, strings or arrays (n, m).
     """
     # ROS requires five coefficients for plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4

@@ -12,7 +12,7 @@ its keys:
 
 A key that is not in the table might change the projection, so the file is refused, unless the value
 is 0 or empty, which disables any term of a lens model. `rectification_matrix` and
-`projection_matrix` are among the notes: according to sensor_msgs/CameraInfo, they describe
+`projection_matrix` are among the notes, because according to sensor_msgs/CameraInfo they describe
 rectified images, whereas K and D describe the camera's own images.
 
 Known forms that are not supported are refused with a message that names them.
@@ -225,7 +225,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
 
 
 def _values(text: str) -> dict[str, Any]:
-    """Return the values by key from a text in YAML, JSON or OpenCV's XML."""
+    """Parse a text in YAML, JSON or OpenCV's XML, and return its values by key."""
     if text.lstrip().startswith("<"):
         return _xml_values(text)
     # OpenCV's first line and tags are not YAML; its keys contain the same information.
@@ -471,7 +471,7 @@ def _pixels(key: str, value: Any, least: int = 1) -> int:
 
 
 def _named_lens(found: _Found) -> str | None:
-    """Return the model that the file names; None if it names none."""
+    """Return the lens model that the file names; None if the file names none."""
     named: dict[str, str] = {}
     for key, value in found.get("lens", []):
         name = re.sub(r"[\s-]+", "_", str(value or "").strip().lower())

@@ -13,8 +13,7 @@ def assign_nearest(fleet: Fleet) -> Fleet:
 
     With squared distances, straight paths between starts and goals do not meet if starts and goals
     are 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). If several assignments have the
-    same sum, scipy's choice is used, which is deterministic. A target's markers are assigned with
-    it.
+    same sum, scipy chooses one of them deterministically. A target's markers are assigned with it.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -15,8 +15,8 @@ from perchctl.fleet.messages import Order, Result, Status, find_fault
 from perchctl.flight import FlyOptions
 
 PROCESS_END_TIMEOUT_S = 5.0
-"""Time for a process to end after its result, s. Longer: the fleet ends later. Shorter: a process
-that is only slow is killed."""
+"""Time for a process to end after it has sent its result, s. Longer: the fleet ends later. Shorter:
+a process that is only slow is killed."""
 # Before it loads the libraries, the child reports that it is running.
 VEHICLE_PROGRAM = (
     "from perchctl.children import connect_to_parent; channel = connect_to_parent(); "

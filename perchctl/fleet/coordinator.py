@@ -64,8 +64,8 @@ class Child(Protocol):
         """Return the result of the process once it has sent one and has ended."""
 
     def fault(self) -> str | None:
-        """Return what was wrong with a message from the process, in words; None if all were
-        valid."""
+        """Return what was wrong with a message from the process, in words; None if all messages
+        were valid."""
 
     def end_of_process(self) -> str | None:
         """Return how the process ended without a result, in words; None while it runs."""
@@ -103,8 +103,8 @@ class Coordinator:
         self.failure: str | None = None
         self._plan, self._children, self._switch, self._clock = plan, children, switch, clock
         self._confirmed = False
-        # Vehicles in the order of `land` calls. A dict, because adding to it is atomic: the keys
-        # and the page may call `land` at the same time.
+        # Vehicles in the order of `land` calls. This is a dict because adding a key is atomic, and
+        # the keyboard and the page may call `land` at the same time.
         self._landed: dict[str, None] = {}
         self._were_near: frozenset[str] = frozenset()
         self._garbled: frozenset[str] = frozenset()
@@ -242,7 +242,7 @@ class Coordinator:
         self, name: str, child: Child, status: Status | None, silent_s: float
     ) -> Result | None:
         """Return a result for a process that has ended without sending one, or that hangs and is
-        killed now."""
+        therefore killed."""
         problem = child.end_of_process()
         loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
         if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):

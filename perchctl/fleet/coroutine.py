@@ -21,8 +21,8 @@ R = TypeVar("R")
 
 
 class CoroutineClosed(BaseException):
-    """Ends a function whose owner has closed it. Not an Exception, so that its `except Exception`
-    clauses do not catch it."""
+    """Ends a function whose owner has closed it. This is not an Exception, so that the function's
+    `except Exception` clauses do not catch it."""
 
 
 class ThreadCoroutine(Generic[R]):

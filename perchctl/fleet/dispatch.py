@@ -79,13 +79,14 @@ class VehicleView:
 
     @property
     def is_in_air(self) -> bool:
-        """True from its first setpoint to the end of its mission, according to its status."""
+        """True from the vehicle's first setpoint to the end of its mission, according to its
+        status."""
         return self.result is None and self.stage is Stage.FLYING
 
     @property
     def may_be_in_air(self) -> bool:
-        """True if it is in the air, or if its flight has ended without a known landing, and it may
-        not have come down by itself yet."""
+        """True if the vehicle is in the air, or if its flight has ended without a known landing and
+        the vehicle may not have come down by itself yet."""
         result = self.result
         lost = (
             result is not None
@@ -285,7 +286,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
 
 def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
     """True if a vehicle whose flight has ended is known to stand where it took off. An estimate
-    that starts at zero drifts, so it cannot show this."""
+    that starts at zero drifts, so it cannot show where the vehicle stands."""
     if not result.has_flown:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:

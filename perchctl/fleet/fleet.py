@@ -55,7 +55,8 @@ class FleetVehicle:
 
     @property
     def uri(self) -> str:
-        """The vehicle's URI. If the file names no dongle (``radio:///80``), one has been chosen."""
+        """The vehicle's URI. If the file names no dongle (``radio:///80``), a dongle has been
+        chosen."""
         return self.profile.link.uri
 
     @property

@@ -19,8 +19,8 @@ from perchctl.fleet.schedule import have_common_marker
 def identify_fleet(
     plan: FleetPlan, scope: CheckScope, ask: Callable[[str], bool]
 ) -> Iterator[tuple[str, Row]]:
-    """Yield the name and a row for each vehicle, as soon as a row is known. Connects to one vehicle
-    at a time, so vehicles that share a dongle need no radio hub.
+    """Yield the name and a row for each vehicle as soon as the row is known. Connects to one
+    vehicle at a time, so vehicles that share a dongle need no radio hub.
 
     Errors: those of `flight_options` and of `perchctl.check.check`.
     """

@@ -111,7 +111,7 @@ class Trouble:
 def draw_trouble(
     plan: FleetPlan, placed: Sequence[PlacedVehicle], faults: Sequence[str], seed: int
 ) -> Trouble:
-    """Draw, with a seed, a fault or common cause from the names `faults`; none if there are no
+    """Draw a fault or common cause from the names `faults` with a seed; none if there are no
     names."""
     if not faults:
         return Trouble(cases={})
@@ -311,7 +311,7 @@ class FleetFlight:
     # --- Vehicles that must not start ---
 
     def _refuse(self, name: str) -> bool:
-        """Record a vehicle that must not take off as refused, standing at its home."""
+        """Record that a vehicle that must not take off was refused and stands at its home."""
         reason = self._refusal(name)
         if not reason:
             return False

@@ -1,4 +1,4 @@
-"""The messages between a fleet's parent and the process of one vehicle.
+"""The messages between a fleet's parent process and the process of one vehicle.
 
     parent  --- Order, ten times a second and when it changes --->  vehicle
     parent  <-- Status, ten times a second, and one Result -------  vehicle
@@ -8,7 +8,7 @@ duplicated, the next one corrects it, and no message needs an answer. The comman
 `Order` that arrives stays valid, and without another order the vehicle lands after
 `perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off is valid only for the
 iteration of the flight loop (turn) that reads it, and a permission to climb only while it is fresh.
-A command to land or to cut the motors takes precedence over both.
+A command to land or to cut the motors takes precedence over both permissions.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class FleetOutcome:
 
     @property
     def ratio(self) -> float | None:
-        """Ratio of flight time to wall-clock time: below 1 if simulated time ran slower."""
+        """Ratio of flight time to wall-clock time; it is below 1 if simulated time ran slower."""
         paces = [result.pace for result in self.results.values() if result.pace is not None]
         wall_s = sum(pace.wall_s for pace in paces)
         return sum(pace.flown_s for pace in paces) / wall_s if wall_s > 0.0 else None

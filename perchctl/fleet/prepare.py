@@ -134,7 +134,7 @@ def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
 
 @contextlib.contextmanager
 def naming(name: str) -> Iterator[None]:
-    """Prefix each error of the block with the name of the vehicle or dongle."""
+    """Prefix each error raised in the block with the name of the vehicle or dongle."""
     try:
         yield
     except PerchError as error:

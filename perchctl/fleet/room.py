@@ -6,7 +6,7 @@ an estimate in room axes would differ only in its coordinates, so it is simulate
 own axes as well. The room converts all positions with `FleetVehicle.to_room`.
 
 No vehicle starts exactly where the fleet file says. An estimate that starts at zero does not show
-the difference; an estimate in room axes does.
+this error; an estimate in room axes does.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ START_TURN_DEG = 2.0
 """Largest error of a vehicle's heading from `heading_deg`. Larger: over a flight of 2 m, the
 heading causes a larger error than the drift."""
 SEEN_M = 3.0
-"""Distance beyond which a neighbour's target is never in the picture of a camera below another
-target, m. Larger: pictures take longer to compute."""
+"""Distance beyond which a neighbour's target is never in the image of a camera below another
+target, m. Larger: images take longer to compute."""
 COLLISION_RADIUS_M = 0.12
 """Half-width of the ellipsoid that one vehicle needs according to Crazyswarm (IMRCLab/crazyswarm),
 m; the centres of two vehicles stay twice as far apart. Larger: vehicles that pass each other count

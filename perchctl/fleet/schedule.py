@@ -13,8 +13,8 @@ others:
     i waits in j's corridor  ->  i flies before j
     i hangs in j's corridor  ->  j flies before i
 
-An order that satisfies all of these constraints is found by topological sorting. If there is none,
-the error names two vehicles.
+An order that satisfies all of these constraints is found by topological sorting. If there is no
+such order, the error names two vehicles.
 """
 
 from __future__ import annotations
@@ -266,8 +266,8 @@ def _groups(
 
 
 def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corridor]) -> None:
-    """Raise InvalidValue if no order satisfies all precedences. If there are several cycles, report
-    one of only two vehicles if possible."""
+    """Raise InvalidValue if no order satisfies all precedences. If there are several cycles of
+    precedences, report one with only two vehicles if possible."""
     by_pair: dict[tuple[str, str], Precedence] = {}
     for each in precedences:
         by_pair.setdefault((each.first, each.then), each)

@@ -46,7 +46,7 @@ def main(channel: Channel) -> None:
         try:
             options: FlyOptions = channel.receive(OPTIONS_TIMEOUT_S)
             line = ParentLine(channel, switch)
-        # the parent is gone, or does not want a flight any more
+        # the parent is gone, or no longer wants a flight
         except (EOFError, OSError, Interrupted):
             return
         reporter = StatusReporter(line, switch)
@@ -56,7 +56,7 @@ def main(channel: Channel) -> None:
             result = reporter.failure or reporter.result_of_error(error)
         line.finish(result)
     sys.stdout.flush()
-    os._exit(0)  # a hanging thread of a library must not keep the process alive
+    os._exit(0)  # a library's hanging thread must not keep the process alive
 
 
 def fly_vehicle(
@@ -123,8 +123,8 @@ class ParentLine:
         self._turned_s = time.monotonic()
 
     def tell(self, status: Status) -> None:
-        """Store the newest status. If its stage or phase is new, it is sent without waiting for the
-        next regular message."""
+        """Store the newest status. A status with a new stage or phase is sent without waiting for
+        the next regular message."""
         before, self._status = self._status, status
         self._soon = self._soon or (before.stage, before.phase) != (status.stage, status.phase)
 
@@ -164,8 +164,8 @@ class ParentLine:
             self._ended.set()
 
     def _take_orders(self) -> None:
-        """Process all waiting orders. If this process was stopped for a while, there may be many; a
-        permission counts only if the newest order still gives it."""
+        """Process all waiting orders. If this process was stopped for a while, many orders may be
+        waiting; a permission counts only if the newest order still gives it."""
         order = self._next_order()
         while self._channel.poll(0.0):
             if order is not None:

@@ -246,8 +246,8 @@ class GroundCriteria:
 
     @property
     def off_ground(self) -> Problem | None:
-        """Problem: according to the settled state estimate, the vehicle is not on the ground, but
-        hangs or is held."""
+        """Problem: according to the settled state estimate, the vehicle is not on the ground; it
+        hangs or is being held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",

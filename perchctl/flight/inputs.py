@@ -276,8 +276,8 @@ class FlightInputs:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Return why this frame cannot be used as a measurement: it has the wrong size, is frozen,
-        is not a valid image, or is too old."""
+        """Return why this frame cannot be used as a measurement: the frame has the wrong size, is
+        frozen, is not a valid image, or is too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
@@ -387,7 +387,7 @@ def is_supported(history: History, now_s: float) -> bool:
 
 def _newest_samples(history: History, within_s: float) -> list[Telemetry]:
     """The samples that are at most `within_s` older than the newest one, oldest first. The search
-    starts at the newest sample, because the history is much longer."""
+    starts at the newest sample, because the history is much longer than `within_s`."""
     newest_s = history.samples[-1].t_s
     found: list[Telemetry] = []
     for sample in reversed(history.samples):

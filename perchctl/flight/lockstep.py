@@ -172,7 +172,7 @@ def fly_lockstep(
     camera: Callable[[FrameSource], FrameSource] = lambda source: source,
     perception: StepFunction | None = None,
 ) -> LockstepFlight:
-    """Fly one seed of the profile's scenario to its end, faster than real time.
+    """Fly the profile's scenario with one seed to the end, faster than real time.
 
     Args:
         log: the log file, or a watcher, which is closed only if the flight raises an exception.

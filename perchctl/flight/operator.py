@@ -85,7 +85,7 @@ _EPS_S = 1e-9
 
 @dataclass
 class OperatorSwitch:
-    """The operator's command, by the table above, for planner and watchdog.
+    """The operator's command for planner and watchdog, according to the table above.
 
     `press` handles Ctrl-C. `land` handles the Land button on the live page and the signals that ask
     a program to end: it lands the vehicle, never stops the motors, and may be repeated. `cut`
@@ -145,7 +145,7 @@ class OperatorSwitch:
 
 
 def _is_stop(presses_s: Sequence[float], now_s: float) -> bool:
-    """True if these presses, with no further one until `now_s`, stop the motors. Once true, it
+    """True if these presses, with no further press until `now_s`, stop the motors. Once true, it
     stays true."""
     if len(presses_s) < 2:
         return False

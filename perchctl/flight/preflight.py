@@ -239,8 +239,9 @@ class Arming:
         """Record which checks failed (`waiting`, may be empty) in a turn that began at `began_s`
         and has just ended.
 
-        Raises SafetyAbort if any has failed for longer than `ARMING_PAUSE_S` since the first
-        request to arm. A turn that hangs counts, because nothing was observed during it.
+        Raises SafetyAbort if any check has failed for longer than `ARMING_PAUSE_S` since the first
+        request to arm. The time of a turn that hangs counts as well, because nothing was observed
+        during the turn.
         """
         if not waiting:
             self._ready_s = began_s

@@ -3,13 +3,14 @@ error.
 
 The watchdog decides what the link sends (`Link.set_guard`), in a thread that a hanging loop cannot
 block. Before the loop's first tick the vehicle does not fly, and the watchdog only obeys the
-operator's command: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence it holds the
-last position, but never one above the vehicle, so that the vehicle neither climbs nor presses
-against the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above itself, which
-brakes it. The lander of `perchctl.mission` takes over after `safety.loop_late_land_s`, on the
-operator's command, or if the loop was already descending or had put the weight on the magnet. With
-decks or motion capture, it commands the firmware's own landing at once, three to six times, because
-a late loop cannot steer. With the target as the only position source, it descends level.
+operator's command: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence, the watchdog
+holds the last position, but never a position above the vehicle, so that the vehicle neither climbs
+nor presses against the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above
+itself, which brakes it. The lander of `perchctl.mission` takes over after
+`safety.loop_late_land_s`, on the operator's command, or if the loop was already descending or had
+put the weight on the magnet. With decks or motion capture, the lander commands the firmware's own
+landing at once, three to six times, because a late loop cannot steer. With the target as the only
+position source, the vehicle descends level.
 """
 
 from __future__ import annotations

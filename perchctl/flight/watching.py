@@ -80,7 +80,7 @@ class Watchers:
 
     @property
     def problem(self) -> str | None:
-        """The reason why records of the flight are lost; None if none are."""
+        """The reason why records of the flight are lost; None if no records are lost."""
         for watcher in self._active:
             try:
                 if watcher.problem:

@@ -1,8 +1,8 @@
 """Disarm the vehicle at the end of a session. Every kind of link uses this module.
 
 A vehicle that does not arm itself spins its propellers while it is armed, even on the ground.
-`perchctl.flight` arms it once everything else is ready. However the session ends on the ground, the
-link disarms the vehicle as it closes.
+`perchctl.flight` arms such a vehicle once everything else is ready. However the session ends on the
+ground, the link disarms the vehicle as it closes.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ dead. Smaller: a short radio dropout may leave the vehicle armed."""
 DISARM_PERIOD_S = 0.1
 """Time between two disarm commands, s."""
 ANSWERED_S = 0.1
-"""Time after the disarm command from which telemetry shows its effect, s. The supervisor reacts
-within 40 ms."""
+"""Time after the disarm command until telemetry shows its effect, s. The supervisor reacts within
+40 ms."""
 
 
 def disarm(
@@ -42,10 +42,9 @@ def disarm(
     most `DISARM_S`.
 
     Nothing is sent to a vehicle that arms itself, or that is not armed unless `was_ordered`. The
-    command is sent only
-    while fresh telemetry says that the vehicle is not flying, because it would cut the motors in
-    the air. The flying bit stays set for 2 s after the motors stop. Returns False if the vehicle
-    may still be armed.
+    command is sent only while fresh telemetry shows that the vehicle is not flying, because it
+    would cut the motors in the air. The flying bit stays set for 2 s after the motors stop. Returns
+    False if the vehicle may still be armed.
 
     Args:
         newest: function that returns the newest telemetry, or None if there is none.

@@ -133,9 +133,9 @@ class CflibLink:
             return False
 
     def settle_estimator(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
-        """Start the estimator at the vehicle's position according to `feed`; without a feed, at the
-        world's origin with the height `ground_z_m`. Must be called on the ground, after `connect`;
-        has a timeout. Raises ConnectionFailed, NotFound, InvalidValue and TimedOut."""
+        """Start the estimator at the vehicle's position according to `feed` or, without a feed, at
+        the world's origin with the height `ground_z_m`. Must be called on the ground, after
+        `connect`; has a timeout. Raises ConnectionFailed, NotFound, InvalidValue and TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         cf, config, clock = self.connection.cf, self._positioning, self._clock

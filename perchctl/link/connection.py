@@ -41,9 +41,9 @@ lost packet within 2 ms."""
 class Connection:
     """An open `cflib.crazyflie.Crazyflie`.
 
-    `lost` is None while connected, otherwise the cause in one sentence. `cf` is cflib's object, for
-    its tables, parameters and log blocks. `claim`, the vehicle's lock, is closed when the
-    connection ends. `shown_uri` replaces the opened URI in cflib's messages.
+    `lost` is None while connected, otherwise the cause in one sentence. `cf` is cflib's `Crazyflie`
+    object, which gives access to tables, parameters and log blocks. `claim`, the vehicle's lock, is
+    closed when the connection ends. `shown_uri` replaces the opened URI in cflib's messages.
     """
 
     def __init__(self, shown_uri: str | None = None) -> None:
@@ -132,7 +132,7 @@ class Connection:
         return not thread.is_alive() or (left is not None and now_s - self._counted_s > DEAD_S)
 
     def reopen(self, cause: str | None = None) -> None:
-        """Replace the driver: open new drivers until one answers. The old one has ended or, if
+        """Replace the driver: open new drivers until one answers. The old driver has ended or, if
         `cause` is given, is closed. Returns at once; the link is `lost` until a driver answers."""
         with self._change:
             if self._left or (self._opener is not None and self._opener.is_alive()):
@@ -214,8 +214,8 @@ class Connection:
         return False
 
     def _agrees_on_safelink(self, driver: Any) -> bool:
-        """Wait for a new driver to negotiate safelink, with a timeout. Return True if it has
-        safelink or does not need it.
+        """Wait for a new driver to negotiate safelink, with a timeout. Return True if the driver
+        has safelink or does not need it.
 
         A vehicle that has used safelink accepts only one packet from a driver without safelink
         (docs/firmware.md, "Safelink"). A driver that was opened while the vehicle was out of range
@@ -246,8 +246,8 @@ class _Nowhere:
 
 
 def open_connection(uri: str, timeout_s: float, *, shown_uri: str | None = None) -> Connection:
-    """Open a vehicle's connection with all tables and parameters read. Messages name the vehicle
-    `shown_uri`, or `uri` without it.
+    """Open a vehicle's connection and read all tables and parameters. Messages call the vehicle
+    `shown_uri` or, if that is not given, `uri`.
 
     `timeout_s` is shared by `CONNECT_TRIES` attempts, since a single lost packet can block cflib's
     connect permanently (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also if another

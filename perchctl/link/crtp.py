@@ -3,7 +3,8 @@ them.
 
 `CflibLink` sends these packets, and `MockLink` passes the same bytes to the simulated vehicle. The
 layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for protocol
-12 and later. Radians become degrees here (docs/firmware.md, "Link" and "Signs and units").
+12 and later. This module converts radians to degrees (docs/firmware.md, "Link" and "Signs and
+units").
 """
 
 from __future__ import annotations

@@ -42,9 +42,10 @@ RESET_AGREE_M = 0.05
 """Largest distance between estimated and measured position after a reset, m: ten times the assumed
 error of motion capture."""
 RESET_AGREE_RAD = math.radians(5.0)
-"""Largest difference of the heading after a reset, rad: tolerable for half a metre of climb."""
+"""Largest difference between estimated and measured heading after a reset, rad: tolerable for half
+a metre of climb."""
 RESET_STILL_M = 0.05
-"""Largest motion from the reset until the agreement, m: a vehicle that moves further is being
+"""Largest motion from the reset until the agreement, m; a vehicle that moves farther is being
 carried."""
 ESTIMATE_POLL_S = 0.02
 """Time between two comparisons of the estimate with the measured position, s."""

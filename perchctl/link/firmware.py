@@ -15,8 +15,8 @@ from perchctl.link.telemetry import NEEDED
 from perchctl.vehicle import AIRFRAMES
 
 NEEDED_PROTOCOL = 12
-"""Protocol version from firmware 2026.08 on, with the supervisor's own port (docs/firmware.md,
-"Link")."""
+"""Protocol version of firmware 2026.08 and later, in which the supervisor has its own port
+(docs/firmware.md, "Link")."""
 PARAMETER_TIMEOUT_S = 2.0
 """Timeout for the answer to a parameter request, s."""
 ASKED_TIMES = 10

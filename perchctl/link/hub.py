@@ -132,5 +132,5 @@ def check_uris(uris: Sequence[str]) -> None:
 
 
 def dongle_of(uri: str) -> str:
-    """Return the number or serial number of a radio URI's dongle."""
+    """Return the number or serial number of the dongle in a radio URI."""
     return uri.removeprefix("radio://").partition("?")[0].partition("/")[0].upper()

@@ -231,12 +231,12 @@ def retries_left(thread: threading.Thread | None) -> int | None:
 
 
 def forget_dead_dongle(uri: str) -> None:
-    """Make cflib forget a dongle whose thread has ended or which is closed; cflib would keep it
-    forever.
+    """Make cflib forget a dongle that is closed or whose thread has ended; otherwise cflib would
+    keep it forever.
 
     cflib counts the links of a closed dongle wrongly once an attempt to open it has failed, and
-    then never closes it again: after being unplugged twice, it would stay dead (docs/firmware.md,
-    "Dongle unplugged twice").
+    then never closes the dongle again. After being unplugged twice, the dongle would stay dead
+    (docs/firmware.md, "Dongle unplugged twice").
 
     The check and the removal hold cflib's own lock because a second link over the same dongle may
     have reopened it meanwhile.
@@ -313,7 +313,7 @@ def dongle_thread(uri: str) -> threading.Thread:
     """Return the thread of the dongle of an open URI.
 
     The thread ends as soon as the dongle rejects a setting, which with several vehicles happens at
-    the next packet. The drivers then wait for its answers forever and report nothing.
+    the next packet. The drivers then wait for the thread's answers forever and report nothing.
     """
     from cflib.crtp.radiodriver import RadioDriver, RadioManager
 

@@ -94,7 +94,7 @@ class AttitudeLink(ReadOnlyLink):
 
     @property
     def motors_running(self) -> bool:
-        """True if the newest packet reports that the motors are running (it keeps doing so for 2 s
+        """True if the newest packet reports that the motors are running (it still does so for 2 s
         after they stop), or that a vehicle without automatic arming is armed: its propellers spin
         the whole time it is armed."""
         return self._motors_run
@@ -275,9 +275,9 @@ SCAN_TIMEOUT_S = 20.0
 
 
 def find_uris_and_problem(uri: str = "") -> tuple[list[str], Problem | None]:
-    """Scan for vehicles that answer now, at the default radio address and at the address of `uri`.
-    Sends only null packets. Return their URIs, and the reason why no radio could be scanned (None
-    if one was).
+    """Scan for vehicles that currently answer at the default radio address or at the address of
+    `uri`. Sends only null packets. Return their URIs, and the reason why no radio could be scanned
+    (None if one was).
 
     A driver may block: after `SCAN_TIMEOUT_S`, the URIs found so far are returned.
     """

@@ -119,7 +119,8 @@ class MockLink:
         self.vehicle.advance_to(t_s)
 
     def call_every(self, period_s: float, call: Callable[[float], object]) -> None:
-        """Call `call` with the time every `period_s` from now on; replaces a thread."""
+        """Call `call` with the current time every `period_s` from now on; this replaces a
+        thread."""
         self._call, self._call_period_s, self._call_due_s = call, period_s, self.now_s
 
     def connect(self) -> None:

@@ -33,10 +33,10 @@ clock."""
 class GuardedLink:
     """`perchctl.link.protocol.Link` around your own link.
 
-    A reader thread calls it for telemetry and problems, and the threads of the `Sender` pass it
-    commands and call the watchdog, so that nothing waits for a call that hangs. An exception, an
-    invalid sample, or a call longer than `LIBRARY_HANG_S` counts as a lost link until it works
-    again; exceptions of `send` count once they last for `LIBRARY_HANG_S`.
+    A reader thread asks your link for telemetry and problems, and the threads of the `Sender` pass
+    commands to it and call the watchdog, so that nothing waits for a call that hangs. An exception,
+    an invalid sample, or a call longer than `LIBRARY_HANG_S` counts as a lost link until it works
+    again; exceptions in `send` count once they have persisted for `LIBRARY_HANG_S`.
     """
 
     def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:

@@ -23,10 +23,10 @@ def ignore_sent(sent: SentCommand) -> None:
 
 
 Guard = Callable[[float, Telemetry | None, Sequence[Telemetry]], Command | None]
-"""Returns the command that the link must send in the loop's place, nearly always None. The guard's
-arguments are the time, the newest telemetry, and the samples that the loop has not taken yet,
-oldest first. The guard is called about every 50 ms, in a thread of the link if it has one, but not
-while a command is waiting to be sent."""
+"""Returns the command that the link must send in the loop's place; this is nearly always None. The
+guard's arguments are the time, the newest telemetry, and the samples that the loop has not taken
+yet, oldest first. The guard is called about every 50 ms, in a thread of the link if it has one, but
+not while a command is waiting to be sent."""
 
 
 class Link(Protocol):
@@ -101,8 +101,8 @@ class VehicleLink(Protocol):
         """
 
     def send(self, command: Command) -> None:
-        """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second. Without a
-        next command, the vehicle must level out by itself after 0.5 s, and stop after 2 s.
+        """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second. If no
+        further command comes, the vehicle must level out by itself after 0.5 s, and stop after 2 s.
 
         `Arm(True)` comes just before take-off, if the telemetry's bits are `CAN_ARM` without
         `AUTO_ARM` and `CAN_FLY`; `Arm(False)` after a session, on the ground, if they are `ARMED`

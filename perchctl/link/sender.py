@@ -136,7 +136,8 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Return for how long, s, no waiting command has been accepted; 0 if none waits."""
+        """Return the time for which no waiting command has been accepted, s; 0 if no command is
+        waiting."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
@@ -224,8 +225,8 @@ class Sender:
         self._error = (str(error).strip() or type(error).__name__).splitlines()[0]
 
     def _is_mine(self) -> bool:
-        """True while this thread is the current worker, False once it was found hanging and
-        replaced."""
+        """True while this thread is the current worker, False once it has been replaced because it
+        hung."""
         return self._running and self._worker is threading.current_thread()
 
     def _next(self) -> _Waiting | None:
@@ -304,7 +305,7 @@ class Sender:
         called_s, stuck_s = self._called_s, self.stuck_s()
         too_long = called_s is not None and self._clock() - called_s > LIBRARY_HANG_S
         # Two checks are required: after the computer was suspended, every call seems too long at
-        # the first one.
+        # the first check.
         hangs = too_long and called_s == self._held_since_s
         self._held_since_s = called_s if too_long else None
         try:

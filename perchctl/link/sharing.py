@@ -79,11 +79,11 @@ CLOSE_TIMEOUT_S = 3.0
 """Timeout for closing a driver, s; a USB call may take 2 s. Longer: a hanging dongle is reopened
 later. Shorter: it is reopened while the old driver still uses it."""
 LINGER_S = 5.0
-"""Time without any datagram from a flight after which it counts as dead, s; an open link sends one
-at least once a second. The hub then drops its packets, and a hub without a parent and without
-flights ends. Longer: a vehicle that was out of range may execute an old command, and the dongle
-stays claimed after a crash. Shorter: a flight on a busy computer may lose its radio while it
-lands."""
+"""Time without any datagram from a flight after which the flight counts as dead, s; an open link
+sends one at least once a second. The hub then drops the flight's packets, and a hub without a
+parent and without flights ends. Longer: a vehicle that was out of range may execute an old command,
+and the dongle stays claimed after a crash. Shorter: a flight on a busy computer may lose its radio
+while it lands."""
 FAREWELL_S = 0.5
 """Time for which the last packets of a flight are still sent after it has closed its link, s.
 Longer: a vehicle that was out of range may execute an old command. Shorter: a landing command sent
@@ -226,9 +226,9 @@ class Carrier:
     def _drop_packets(self) -> None:
         """Make sure that no packet sent by the flight so far reaches the vehicle.
 
-        cflib's driver holds up to two: one that it repeats until the vehicle acknowledges it, and
-        one in its queue. These packets cannot be removed, so the driver is closed; the next driver
-        starts by offering safelink.
+        cflib's driver holds up to two packets: one that it repeats until the vehicle acknowledges
+        it, and one in its queue. These packets cannot be removed, so the driver is closed; the next
+        driver starts by offering safelink.
         """
         self._waiting.clear()
         driver, has_carried = self.driver, self._has_carried
@@ -314,7 +314,7 @@ class Hub:
 
     @property
     def uris(self) -> dict[str, str]:
-        """The flights' URIs, by the URIs of their vehicles."""
+        """The flights' URIs, keyed by the URIs of their vehicles."""
         return {carrier.uri: carrier.hub_uri for carrier in self.carriers}
 
     def tick(self) -> bool:
@@ -333,7 +333,7 @@ class Hub:
         return True
 
     def reports(self) -> dict[str, HubReport]:
-        """Return the state of each link by the vehicle's URI."""
+        """Return the state of each link, keyed by the vehicle's URI."""
         return {carrier.uri: carrier.report() for carrier in self.carriers}
 
     def limit(self, uri: str, packets_per_s: int | None) -> None:

@@ -34,8 +34,8 @@ ATTITUDE_BLOCK: dict[str, str] = {
 """Uses all 26 bytes: half floats resolve a force of 0.1 g to 0.1 mg."""
 
 MOTOR_DUTIES = tuple(f"motor.m{number}" for number in (1, 2, 3, 4))
-"""All four are left out of their block if the firmware lacks one of them, because the battery is
-more important."""
+"""All four duty cycles are left out of their block if the firmware lacks one of them, because the
+battery is more important."""
 BATTERY_BLOCK: dict[str, str] = {
     "pm.vbat": "float",
     "pm.state": "int8_t",

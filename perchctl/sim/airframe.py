@@ -1,8 +1,8 @@
 """The airframes of simulated vehicles: their firmware's device type and parameters, and their
 motors.
 
-Figures are the firmware's own platform defaults (release 2026.08), measured on a thrust stand; the
-firmware is built for one airframe.
+Figures are the firmware's own platform defaults (release 2026.08), measured on a thrust stand; each
+build of the firmware is for one airframe.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ PUMPING_HZ = (0.4, 2.0)
 
 
 class Shutter:
-    """Times, camera poses and brightness of a frame's rows; same seed, same light.
+    """Times, camera poses and brightness of a frame's rows; the same seed gives the same light.
 
     `half_frame_s`: half the time from the first light on the frame to the last.
     """

@@ -12,8 +12,8 @@ axis:
 
 If this jet acts as a wind through perchctl's drag model, its force matches the recordings of
 Neural-Swarm2 next to the axis, but is too small exactly below a vehicle (Shi, Hoenig, Shi, Yue and
-Chung, 2021). Therefore the wind on the axis is the jet times `AXIS_FACTOR`, and the factor falls to
-1 within the width of a vehicle.
+Chung, 2021). Therefore the wind on the axis is the jet's speed times `AXIS_FACTOR`, and the factor
+falls to 1 within the width of a vehicle.
 
 Three effects are not modelled: the flow after the jet has met the floor, the air between two
 vehicles close to the same ceiling, and jets that tilt with their vehicle.
@@ -37,7 +37,7 @@ DECAY = 10.11
 WIDTH = 0.0767
 """Growth of the half-width with distance. Larger: a wider jet."""
 SHAPE = 0.414
-"""Shape factor with which the speed falls to half at the half-width."""
+"""Shape factor that makes the speed fall to half at the half-width."""
 JET_BEGINS_M = 0.25
 """Distance below the rotors at which the measurements of the jet begin, m. Closer to the rotors,
 the speed at this distance is used. Smaller: higher speeds than were ever measured."""

@@ -121,7 +121,7 @@ class VehicleHost:
             self._truth.flush()
 
     def advance(self, dt_s: float) -> float:
-        """Step for `dt_s`; return the simulated time since the start."""
+        """Advance by `dt_s`; return the simulated time since the start."""
         for _ in range(round(dt_s / CONTROL_PERIOD_S)):
             self.step()
         return self.elapsed_s

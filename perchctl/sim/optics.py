@@ -45,7 +45,7 @@ class RayGrid:
 
 
 def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
-    """Return rays over the image, its size rounded up to whole coarse blocks."""
+    """Return rays that cover the image, whose size is rounded up to whole coarse blocks."""
     cols, rows = (-(-side // COARSE_PX) * (COARSE_PX // stride) + 2 for side in camera.size_px)
     u = stride * (np.arange(cols) - 1) + (stride - 1) / 2.0
     v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0

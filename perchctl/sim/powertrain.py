@@ -39,7 +39,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 FULL_COMMAND = 65535.0
 """Full scale of both the thrust command and the duty cycle (PWM)."""
 MOTOR_FORCE_N = CRAZYFLIE_21.thrust.most_n
-"""Thrust of one motor at `FULL_COMMAND`, with any battery that can still deliver it."""
+"""Thrust of one motor at `FULL_COMMAND`, with any battery that can still supply it."""
 
 VoltageFunction = Callable[[float], float]
 
@@ -253,7 +253,8 @@ class Fluctuation:
 
 
 def max_thrust_n(rest_v: float) -> float:
-    """Return the steady thrust of four motors at full duty with a cell of that resting voltage."""
+    """Return the steady thrust of four motors at full duty with a cell that has this resting
+    voltage."""
     battery_v = rest_v
     for _ in range(30):
         forces_n = 4.0 * thrust_n(battery_v)

@@ -50,8 +50,8 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""Margin by which the bank of noise is larger than an image, px: each frame uses another part of
-it."""
+"""Margin by which the bank of noise is larger than an image, px: each frame uses a different part
+of the bank."""
 _PLAIN_PX = 1.5
 """Blur of the lens above which the whole image is blurred, px. A smaller blur does not show on
 the bare ceiling, which is drawn at half the size or less."""
@@ -66,8 +66,8 @@ class Exposure:
 
     Attributes:
         row_poses: for rows at equal distances from the first to the last, the camera poses
-            T_world_cam (4, 4) at equal steps over their exposure. A single entry: all rows at
-            once (global shutter).
+            T_world_cam (4, 4) at equal steps over their exposure. A single entry means that all
+            rows are exposed at once (global shutter).
         row_brightness: factor of each row's brightness (height,); None: 1 for all.
     """
 
@@ -144,8 +144,8 @@ class Renderer:
     def expose(
         self, shots: Sequence[Exposure], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
-        """The frame of one `Exposure`, or of two fields, the earlier first, woven as the
-        scenario's `camera_fields` says. Otherwise as `render`."""
+        """The frame of one `Exposure`, or of two fields, the earlier first, woven as the scenario's
+        `camera_fields` specifies. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0]
         if len(shots) > 1:

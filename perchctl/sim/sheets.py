@@ -55,7 +55,7 @@ _BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
 
 
 class SheetTexture(NamedTuple):
-    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage, and
+    """The sheet at one resolution: `value` is grey times coverage, `alpha` is the coverage, and
     `uniform_texels` the distance to the next change of grey or coverage, along x or y, up to 255.
 
     A point (x, y) of the target's plane (target axes) is at column
@@ -88,7 +88,7 @@ class Sheet:
 
     def _build(self, px_per_m: float, window_px: float) -> SheetTexture:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
-        # Computed in place, because a campaign uses the most memory here.
+        # The arrays are computed in place, because a campaign uses the most memory here.
         sheet = self.drawing.sheet_coverage(px_per_m, size, window_px)
         alpha = np.multiply(sheet, 255.0)
         alpha = np.rint(alpha, out=alpha).astype(np.uint8)

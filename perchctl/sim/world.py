@@ -62,9 +62,9 @@ Vector = tuple[float, float, float]
 class World:
     """One vehicle in one room. Deterministic for a scenario.
 
-    The attributes `x_m ... fz_mps2` are the state: position and velocity in world axes, turning
-    rates in the body's, `quaternion` (w, x, y, z) body to world, and `fx_mps2 ... fz_mps2` what an
-    ideal accelerometer reads in body axes (+g along z at rest).
+    The attributes `x_m ... fz_mps2` are the state: position and velocity in world axes, rotation
+    rates in body axes, `quaternion` (w, x, y, z) from body to world, and `fx_mps2 ... fz_mps2`, the
+    readings of an ideal accelerometer in body axes (+g along z at rest).
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -304,8 +304,8 @@ def build_model(scenario: Scenario) -> Any:
 # --- The magnet: how it pulls the gear's tip towards the ceiling, and when it holds ---
 # The magnet acts on an upright vehicle within `MAGNET_RADIUS_M` of the target's centre. Its force
 # is full at contact and falls to zero over a gap of `MAGNET_RANGE_M`. The first contact may be
-# weaker than the later ones (`Scenario.first_contact_force_n`); it is over when the tip has engaged
-# and come off again.
+# weaker than the later ones (`Scenario.first_contact_force_n`); the first contact is over when the
+# tip has engaged and come off again.
 
 
 MAGNET_RADIUS_M = 0.025
@@ -337,7 +337,8 @@ class Magnet:
 
     @property
     def hold_n(self) -> float:
-        """Return the force that separates magnet and gear; may be smaller at the first contact."""
+        """Return the force that separates magnet and gear; it may be smaller at the first
+        contact."""
         scenario = self._scenario
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
@@ -362,7 +363,7 @@ _WIND_STREAM = 1
 
 
 class Wind:
-    """A steady wind with gusts, which are a sum of sines on each axis. The wind has the speed
+    """A steady wind with gusts; the gusts are a sum of sines on each axis. The wind has the speed
     `Scenario.draught_mps` when the gusts are at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:

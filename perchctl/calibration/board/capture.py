@@ -137,7 +137,7 @@ def view_signature(view: BoardView, board: Board) -> Array:
     affine = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
     columns, rows = board.squares
     size = np.sqrt(abs(np.linalg.det(affine)) * columns * rows / (w * h))
-    # Rotated from the board's axes to those of the image.
+    # The tilts are rotated from the board's axes to those of the image.
     rotation = affine / max(float(np.linalg.norm(affine[:, 0])), 1e-9)
     tilt = _TILT_GAIN * 0.5 * max(columns, rows) * (rotation @ H[2, :2])
     return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
@@ -160,7 +160,7 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
 def coverage_bars(signatures: Sequence[Array]) -> dict[str, GuidanceBar]:
     """The bar for each of `COVERAGE_AXES`. The bars for positions and size reach from the smallest
     to the largest value in the view signatures, as fractions of the image, so that a gap shows what
-    is missing. The bar for the skew is its share of the required spread."""
+    is missing. The bar for the skew is the skew's spread as a share of the required spread."""
     shares = covered_shares(signatures)
     reach = dict.fromkeys(COVERAGE_AXES, (0.0, 0.0))
     if signatures:
@@ -199,8 +199,8 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> FoundViews:
-    """Collect new, sharp, still views of the board from a video or live camera, until they vary
-    enough, the source ends, or `stopped` returns True. `show` is called for each frame.
+    """Collect new, sharp, still views of the board from a video or live camera, until the views
+    vary enough, the source ends, or `stopped` returns True. `show` is called for each frame.
 
     Raises TimedOut if the camera is lost before there are `MIN_VIEWS` views.
     """
@@ -308,8 +308,8 @@ class GuidedCapture:
 
 
 def _moved_px(before: BoardView, now: BoardView) -> float:
-    """Return the median motion in px of the corners that both views show; infinite if there are
-    none."""
+    """Return the median motion in px of the corners that both views show; infinite if they have no
+    corner in common."""
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
     ways = np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)
     return float(np.median(ways)) if len(a) else float("inf")

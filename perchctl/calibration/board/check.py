@@ -1,17 +1,18 @@
 """Check an existing calibration against new images.
 
-The camera in the file, for which only the board poses are fitted, is compared with a camera that is
-fully fitted to the new views. The reprojection error of the camera in the file reveals wrong lens
-parameters. The poses can absorb a wrong focal length, however, so the target positions that follow
-from the two cameras are compared as well. The check fails
+For the camera in the file, only the board poses are fitted to the new views. This camera is
+compared with one whose parameters are fitted to the new views as well. The reprojection error of
+the camera in the file reveals wrong lens parameters. The poses can absorb a wrong focal length,
+however, so the target positions that follow from the two cameras are compared as well. The check
+fails
 
 - if the RMS error of the camera in the file is more than twice that of the fitted camera and above
   0.3 px, or
 - if the target positions straight ahead differ by more than half of the limit (1 mm, or 1 % of the
   distance) and by more than the 95 % uncertainty of the fitted camera.
 
-If that 95 % uncertainty is above twice the limit, the new images are not accurate enough, and the
-check is refused.
+If the 95 % uncertainty of the fitted camera is above twice the limit, the new images are not
+accurate enough, and the check is refused.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ _HASH_BYTES = 6
 """Length of an image's hash, bytes. With a shorter hash, the probability that two of a thousand
 images have the same hash by chance would exceed 1 in 10^8."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-# no exhaustive search, because it takes a second in an image without a board
+# no exhaustive search, which takes a second in an image without a board
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
@@ -285,7 +285,8 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 
 
 REACH = 0.42
-"""Half the width of the window, in squares; the edges of the next corner begin at 1."""
+"""Half the width of the window around a corner, in squares; the next corner is at a distance of
+1."""
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
 WINDOW_SAMPLES = 21  # number of samples across the largest window
 _CORNER_ITERATIONS = 6
@@ -369,7 +370,7 @@ def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
     if white >= REACH:
         return np.ones(grey.shape)
     positive = uv[..., 0] * uv[..., 1] > 0.0
-    # Near the corner, even the white squares of a ChArUco board are empty, which shows which
+    # Near the corner, even the white squares of a ChArUco board are blank, which shows which
     # squares are white.
     near = np.abs(uv).max(axis=2) < 0.5 * np.abs(uv).max(axis=(1, 2))[:, None]
     brighter = (grey * np.where(positive, 1.0, -1.0) * near).sum(axis=1) > 0.0

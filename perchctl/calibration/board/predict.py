@@ -101,8 +101,8 @@ def position_errors_mm(
 
 
 def _marker_m(camera: CameraModel, z_m: float) -> Array:
-    """Return the corners (4, 3) of the marker that is measured at that distance, in its own
-    axes."""
+    """Return the corners (4, 3) of the marker that is measured at the distance `z_m`, in the
+    marker's own axes."""
     large_m = _SQUARE * LARGE_M
     return (
         large_m

@@ -1,7 +1,7 @@
-"""Find out which board the images show if it is not the specified one.
+"""Find out which board the images show if they do not show the specified board.
 
 For chessboards, this is the grid of corners that is found in the most images, and in at least two.
-For boards with markers, it is the dictionary that decodes most of them, and the layout whose
+For boards with markers, it is the dictionary that decodes most of the markers, and the layout whose
 corners OpenCV then finds. A board is named only if it is identified with certainty.
 """
 
@@ -47,7 +47,7 @@ _GRID_FLAGS = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
     """Describe the board in the grey images and give its notation; empty if no board is clearly
-    visible, or if it is the board that was named."""
+    visible, or if it is the specified board."""
     images = [_small(picture) for picture in pictures[:MOST_PICTURES]]
     if not images:
         return ""

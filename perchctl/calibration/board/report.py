@@ -229,7 +229,8 @@ def calibration_report(result: Calibration, name: str, date: str) -> str:
 
 
 def round_down(value: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is at most `value`, which is positive."""
+    """The largest number of the form 1, 2 or 5 times a power of ten that is not above `value`,
+    which must be positive."""
     power = 10.0 ** np.floor(np.log10(value))
     digit = max(step for step in _STEPS if step * power <= value * (1.0 + 1e-9))
     return float(f"{digit * power:.6g}")

@@ -112,7 +112,8 @@ class Calibration:
         return text
 
     def lines(self) -> list[str]:
-        """Return lines on rejections, lens parameters, shortcomings and the verdict."""
+        """Return the lines of text about rejections, lens parameters, shortcomings and the
+        verdict."""
         lines = [f"left out {r.view}: {r.reason}" for r in self.without_board]
         for r in self.rejections:
             what = (

@@ -79,8 +79,8 @@ class RotationSolution:
 def solve_rotation(recording: MountingRecording) -> RotationSolution:
     """Solve for the camera's rotation in the body and its latency.
 
-    Raises InvalidValue, with advice, for too little motion or a mirrored image, or if vehicle and
-    camera do not agree.
+    Raises InvalidValue, with advice, for too little motion or a mirrored image, or if the rotations
+    of vehicle and camera do not agree.
     """
     check_recording(recording, "carry")
     t_s, first = np.unique([a.t_s for a in recording.attitudes], return_index=True)
@@ -422,7 +422,8 @@ def _weights(distance2: Array) -> Array:
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """Return the curvature and information factors of robust weights for `jackknife_covariance`."""
+    """Return the curvature factor and the information factor that `jackknife_covariance` needs for
+    robust weights."""
     w = _weights(distance2)
     curved = float((w * (1.0 - 2.0 * distance2 / (3 * (FREEDOM + distance2)))).mean())
     pushed = float((w**2 * distance2).mean()) / 3

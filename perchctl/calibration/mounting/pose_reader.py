@@ -25,9 +25,9 @@ from perchctl.vision import (
 class PoseReader:
     """Reads the target's pose from each frame of a stream.
 
-    `mirrored` counts images with only a mirrored target. For the newest image, `outlines` contains
-    the markers' names and corners, (4, 2) px each, and `trouble` names the image's defect, or is
-    empty.
+    `mirrored` counts the images that show only a mirrored target. For the newest image, `outlines`
+    contains the markers' names and corners, (4, 2) px each, and `trouble` names the image's defect,
+    or is empty.
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:

@@ -251,13 +251,14 @@ _KEEP = (1.0 - SUPPLY_FILTER) ** (SUPPLY_RATE_HZ * CONTROL_PERIOD_S)
 
 
 class MotorDriver:
-    """Turns thrust requests into duty cycles, by the filtered battery voltage."""
+    """Converts thrust requests to duty cycles, using the filtered battery voltage."""
 
     def __init__(self, curve: ThrustCurve = CRAZYFLIE_21.thrust) -> None:
         self._voltage = inverse_thrust(curve)
         self._n_per_command = curve.most_n / FULL_COMMAND
         self.thrust_min = FULL_COMMAND * curve.least_n / curve.most_n
-        # Low-pass filter with 0.1 s: the compensation lags behind a sagging battery.
+        # Low-pass filter with a time constant of 0.1 s: the compensation lags behind a sagging
+        # battery.
         self._supply_v = SUPPLY_AT_BOOT_V
 
     def pwm(self, requests: Motors, battery_v: float) -> Motors:

@@ -93,7 +93,7 @@ class Estimator:
             self.outside.reset()
 
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
-        """Correct the estimate by an external position or pose; no effect with a deck."""
+        """Correct the estimate with an external position or pose; no effect with a deck."""
         if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
             self.outside.update_position(position_m)
             if quaternion is not None:

@@ -1,4 +1,4 @@
-"""The firmware as one object: it takes commands, drives the motors, and steps by control
+"""The firmware as one object: it takes commands, drives the motors, and advances by control
 periods."""
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ class Firmware:
     def fly_setpoint(self, setpoint: Setpoint) -> None:
         """Fly this setpoint, which overrides the high-level commander.
 
-        Raw thrust is limited. After boot it is locked at 0 until a packet with thrust 0 arrives
-        (docs/firmware.md, "Raw thrust").
+        Raw thrust is limited. After boot, raw thrust is locked at 0 until a packet with thrust 0
+        arrives (docs/firmware.md, "Raw thrust").
         """
         if setpoint.mode == MODE_RAW:
             thrust = min(setpoint.thrust, RAW_THRUST_MAX)

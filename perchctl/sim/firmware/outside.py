@@ -22,7 +22,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 Vector = tuple[float, float, float]
 Reading = tuple[float, float, float, float, float, float]
-"""Acceleration, m/s^2, and turning rates, rad/s, body axes."""
+"""Acceleration, m/s^2, and rotation rates, rad/s, in body axes."""
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 # --- Gyroscope and accelerometer readings, as means at 100 Hz for the estimator ---
@@ -120,8 +120,8 @@ _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
 _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
-"""Share of the difference to the initial attitude that each step removes while not in flight
-(source: `attitudeReversion`)."""
+"""Share of the difference from the initial attitude that each step removes while the vehicle is not
+flying (source: `attitudeReversion`)."""
 
 
 def first_covariance() -> Array:
@@ -195,7 +195,7 @@ class ExternalFilter:
         w, x, y, z = self.quaternion
         left = multiply_quaternions(measured, (w, -x, -y, -z))
         if abs(left[0]) < 1e-6 * norm:
-            return  # half a turn, whose direction is undefined
+            return  # a rotation by 180 degrees, whose direction is undefined
         twice = 2.0 / left[0]
         wrong = (twice * left[1], twice * left[2], twice * left[3])
         self._correct(ATTITUDE_STATE, wrong, self._parameters["locSrv.extQuatStdDev"])

@@ -30,7 +30,7 @@ class Polynomial:
         self.goal = goal
         self._duration = T = max(duration_s, 1e-9)
         # With u = t / T and the goal subtracted, eight boundary conditions determine eight
-        # coefficients. The first four are the initial state itself (its jerk is zero).
+        # coefficients. The first four coefficients are the initial state itself (its jerk is zero).
         p, v, a = start.value - goal, start.rate * T, start.accel * T * T
         coefficients = (
             start.value,
@@ -81,7 +81,7 @@ class HighLevelPlanner:
         self.state = TRAJECTORY_IDLE
 
     def set_blocked(self, blocked: bool) -> None:
-        """Forbid or allow the motors. While they are forbidden, plans end and new ones are
+        """Forbid or allow the motors. While the motors are forbidden, plans end and new plans are
         refused."""
         if blocked and not self.blocked:
             self.stop()
