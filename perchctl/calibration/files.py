@@ -51,7 +51,7 @@ def load_calibration(file: Path | str) -> CameraModel:
     """Read a camera model from a file, given by path or by name in `calib/`.
 
     Raises:
-        NotFound: there is no such file. InvalidValue: its content is invalid.
+        NotFound: there is no such file. InvalidValue: the content of the file is invalid.
     """
     camera, _ = _parsed(find_calibration(file) if isinstance(file, str) else file)
     return camera

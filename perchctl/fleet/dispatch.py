@@ -43,7 +43,8 @@ as ready. Shorter: a busy computer delays the start."""
 NEAR_MARGIN_M = 2.0 * ROOM_ERROR_M
 """Two vehicles land if their distance is smaller than the plan's separation by more than this
 margin, m; the positions of both may be wrong by `ROOM_ERROR_M`. Larger: two vehicles that approach
-each other are noticed later. Smaller: such errors land vehicles that are far enough apart."""
+each other are noticed later. Smaller: position errors make vehicles land that are far enough
+apart."""
 FRESH_PLACE_S = 0.5
 """Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
 other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a

@@ -83,8 +83,8 @@ class _File(Section):
 
 
 def find_fleet(name: str) -> Path:
-    """Return the file of a fleet that is given by path or name. Raises NotFound, with the available
-    names."""
+    """Return the file of a fleet that is given by path or name. Raises NotFound, which lists the
+    available names."""
     path = Path(name).expanduser()
     if path.is_file():
         return path
@@ -226,7 +226,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
 
 def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> Point:
     """Return the position of the vehicle's target in the room. Raises InvalidValue if neither the
-    file nor the profile contains it."""
+    file nor the profile contains the position."""
     if target_m is not None:
         return target_m
     expected_m = vehicle.profile.target.expected_xy_m

@@ -17,7 +17,7 @@ from perchctl.mission import OperatorRequest
 
 PARENT_SILENCE_S = 1.0
 """Time without a message after which the parent counts as hanging and the vehicle lands, s. Longer:
-nobody can stop the vehicle for longer. Shorter: a busy computer ends flights."""
+the vehicle flies for longer while nobody can stop it. Shorter: a busy computer ends flights."""
 LONGEST_WATCH_STEP_S = 0.25
 """Largest time by which one reading of the command may increase the parent's silence, s. After a
 suspension, this process has not yet read the messages that are waiting for it. Longer: this process

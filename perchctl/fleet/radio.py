@@ -216,7 +216,7 @@ def _channel(item: tuple[str, int]) -> int:
 
 
 def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) -> FleetVehicle:
-    """The vehicle with a telemetry period that fits. Raises InvalidValue if none does."""
+    """The vehicle with a telemetry period that fits. Raises InvalidValue if no period fits."""
     profile, usable = vehicle.profile, USABLE_SHARE * carried_per_s(shared_by)
     periods_s = _periods_s(profile)
     fits = [period_s for period_s in periods_s if needed_per_s(profile, period_s) <= usable]

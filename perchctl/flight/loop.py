@@ -60,8 +60,9 @@ PERMISSION = "permission to take off"
 """The only remaining condition for a vehicle whose own checks have passed while other vehicles fly
 in the same room, as shown to the operator."""
 PERMISSION_PERIOD_S = 0.1
-"""Period of the turns while waiting for permission, s. Longer: take-off begins later after the
-permission. Shorter: vehicles on the floor take computing time from those in the air."""
+"""Period of the turns while waiting for permission, s. Longer: more time passes between the
+permission and the take-off. Shorter: vehicles on the floor take computing time from those in the
+air."""
 
 
 class PositionStatus(Protocol):

@@ -209,7 +209,7 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
 ARMS_WITHIN_S = 5.0
 """Longest time from the first arming request until the supervisor allows flight, s. The firmware
 gives up after 2 s if the motors do not start. Longer: the propellers of a vehicle that cannot fly
-turn for longer."""
+keep turning for longer."""
 REQUEST_PERIOD_S = 0.25
 ARMING_PAUSE_S = 0.5
 """Longest time for which another check may fail once arming has begun, s, for example because of a

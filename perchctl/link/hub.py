@@ -24,7 +24,7 @@ each setting of the dongle at most 1 s. Longer: a hanging hub is detected later.
 fails on a busy computer."""
 HUB_END_TIMEOUT_S = 5.0
 """Time after which a hub that does not end is killed, s. Longer: a hanging hub delays the end.
-Shorter: its dongle may stay claimed until the system has cleaned up."""
+Shorter: the hub's dongle may stay claimed until the system has cleaned up."""
 SILENT_S = 1.0
 """Time without a report after which the hub counts as hanging, s. The hub reports five times a
 second. Longer: a hang is detected later. Shorter: a busy computer looks like a hang."""

@@ -43,8 +43,8 @@ SCHEME = "hub://"
 HELLO, BYE, ROOM, REPORT = (bytes((kind,)) for kind in (0x00, 0x10, 0x20, 0x30))
 _RESERVED_BITS = 0x0C
 MOST_BYTES = 2048
-"""Largest datagram, bytes; a report has fewer than 500. Larger: only costs memory. Smaller: a
-report would be truncated and ignored."""
+"""Largest datagram, bytes; a report has fewer than 500. Larger: the only effect is that more memory
+is used. Smaller: a report would be truncated and ignored."""
 WINDOW = 1
 """Number of packets that may wait in the hub before the flight's sender holds back the next one.
 cflib's radio driver also has a queue of one. Larger: a stop waits behind more packets. With 0,
@@ -58,10 +58,11 @@ request delays the connection. Shorter: no benefit."""
 SIGN_OF_LIFE_S = 1.0
 """Time between two requests of an open link, s. These requests tell the hub that the flight is
 still running. If the hub's process has ended, the operating system refuses them, so the flight
-detects this even when it sends nothing else. Longer: detected later. Shorter: more packets."""
+detects this even when it sends nothing else. Longer: the end of the hub is detected later. Shorter:
+more packets are sent."""
 HUB_STOP_PERIOD_S = 0.2
 """Longest time until the driver's thread reacts to a close or sends the next request, s. Longer:
-its socket is freed later. Shorter: the thread wakes up more often for nothing."""
+the driver's socket is freed later. Shorter: the thread wakes up more often for nothing."""
 HUB_ENDED = "the radio hub of this vehicle has ended"
 
 

@@ -22,7 +22,7 @@ from perchctl.errors import unfit_cflib
 
 CLOSE_STEP_S = 0.01
 """Polling period while a driver is being closed, s. Longer: a dead dongle is reopened later.
-Shorter: more processor time while a slow dongle closes."""
+Shorter: polling takes more processor time while a slow dongle closes."""
 
 
 @dataclass(frozen=True)

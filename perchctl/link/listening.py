@@ -142,12 +142,12 @@ ALL_LEDS, NO_LEDS, FIRMWARES_LEDS = 255, 128, 0
 """Values of `LED_PARAMETER`: bit 7 takes control of the LEDs from the firmware, and the lower bits
 switch them on."""
 BLINK_S = 0.25
-"""Time for which the LEDs are on, and then off, s. Longer: harder to distinguish from the
-firmware's own pattern. Shorter: more packets."""
+"""Time for which the LEDs are on, and then off, s. Longer: the blinking is harder to distinguish
+from the firmware's own pattern. Shorter: more packets are sent."""
 END_BLINKING_TRIES = 3
 """Number of attempts to end blinking. A late answer to an earlier value may be mistaken for the
-answer to the last one. More: longer wait for a vehicle that does not answer. Fewer: the LEDs may
-keep their state until the next restart."""
+answer to the last one. More: the wait for a vehicle that does not answer becomes longer. Fewer: the
+LEDs may keep their state until the next restart."""
 # same length as cflib's own echo, since cflib unpacks every echo as its own
 _ECHO = struct.Struct("<BQ")
 _ECHO_MARK = 1  # cflib's own pings start with 0

@@ -41,20 +41,21 @@ from perchctl.link.hub_driver import BYE, HELLO, HUB_ENDED, ROOM, SCHEME, HubRep
 from perchctl.link.protocol import vehicle_uri
 
 TICK_S = 0.02
-"""Period of the dongle check, s. Longer: a dead dongle is reported later. Shorter: more processor
-time."""
+"""Period of the dongle check, s. Longer: a dead dongle is reported later. Shorter: the checks take
+more processor time."""
 REPORT_PERIOD_S = 0.2
-"""Time between two reports, s. Longer: a lost report is replaced later. Shorter: more processor
-time in each flight."""
+"""Time between two reports, s. Longer: a lost report is replaced later. Shorter: the reports take
+more processor time in each flight."""
 REFUSALS = 10
 """Number of successive packets for one vehicle without any answer from the dongle after which the
 dongle counts as dead. An unplugged dongle rejects each packet at once; a working dongle answers
-even if the vehicle is out of range. More: reported later. Fewer: a transient USB error ends the
-flights."""
+even if the vehicle is out of range. More: a dead dongle is reported later. Fewer: a transient USB
+error ends the flights."""
 STUCK_TICKS = 25
 """Number of ticks without any answer from the dongle after which it counts as dead: 0.5 s, although
 a working dongle reports even a lost packet within 2 ms. Counting ticks avoids a false alarm after
-the computer was suspended. More: reported later. Fewer: a slow USB call ends the flights."""
+the computer was suspended. More: a dead dongle is reported later. Fewer: a slow USB call ends the
+flights."""
 REOPEN_PERIOD_S = 0.1
 """Time between two attempts to open a dead dongle, s. Longer: the dongle is available again later.
 Shorter: the computer scans its USB ports all the time."""
@@ -62,22 +63,23 @@ SAFELINK_PACKETS = 10
 """Number of packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md,
 "Safelink")."""
 SAFELINK_PERIOD_S = 1.0
-"""Time between two safelink offers to a vehicle that has not answered yet, s. Longer: a vehicle
-that is switched on later is found later. Shorter: the offers, 20 ms each, take more of the dongle's
-time from the other vehicles."""
+"""Time between two safelink offers to a vehicle that has not answered yet, s. Longer: it takes more
+time to find a vehicle that is switched on later. Shorter: the offers, 20 ms each, take more of the
+dongle's time from the other vehicles."""
 LEAST_RATE = 10
 """Lowest permitted limit on a vehicle's packet rate, 1/s. Higher: an idle vehicle uses more of the
 dongle's time. Lower: a dongle whose vehicles are all idle seems dead (`STUCK_TICKS`), and commands
 wait longer."""
 ROOM_WAIT_S = 0.005
 """Time for which a packet waits for the radio before its carrier checks the socket again, s.
-Longer: a new link from the flight is answered later. Shorter: more processor time."""
+Longer: a new link from the flight is answered later. Shorter: the carrier takes more processor
+time."""
 IDLE_S = 0.1
 """Time for which a thread waits for a packet before it checks whether it should end, s. Longer: the
-thread ends later. Shorter: more processor time."""
+thread ends later. Shorter: the thread takes more processor time."""
 CLOSE_TIMEOUT_S = 3.0
 """Timeout for closing a driver, s; a USB call may take 2 s. Longer: a hanging dongle is reopened
-later. Shorter: it is reopened while the old driver still uses it."""
+later. Shorter: the dongle is reopened while the old driver still uses it."""
 LINGER_S = 5.0
 """Time without any datagram from a flight after which the flight counts as dead, s; an open link
 sends one at least once a second. The hub then drops the flight's packets, and a hub without a

@@ -158,7 +158,7 @@ class CNumber:
         return (whole & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
 
     def unpack(self, data: bytes) -> float:
-        """The number in `data`. Raises struct.error when the length is not `size`."""
+        """The number in `data`. Raises struct.error if the length is not `size`."""
         return float(struct.unpack("<" + self.letter, data)[0])
 
 

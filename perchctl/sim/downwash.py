@@ -33,21 +33,21 @@ MOTOR_DISTANCE_M = 0.092
 ORIGIN = 5.82
 """Height of the jet's virtual origin above the rotors, in units of l."""
 DECAY = 10.11
-"""Decay of the speed on the axis with distance. Larger: a longer jet."""
+"""Decay of the speed on the axis with distance. Larger: the jet is longer."""
 WIDTH = 0.0767
-"""Growth of the half-width with distance. Larger: a wider jet."""
+"""Growth of the half-width with distance. Larger: the jet is wider."""
 SHAPE = 0.414
 """Shape factor that makes the speed fall to half at the half-width."""
 JET_BEGINS_M = 0.25
 """Distance below the rotors at which the measurements of the jet begin, m. Closer to the rotors,
-the speed at this distance is used. Smaller: higher speeds than were ever measured."""
+the speed at this distance is used. Smaller: the speeds are higher than any that were measured."""
 AXIS_FACTOR = 1.5
 """Factor by which the jet's speed on its axis is multiplied to give the wind that acts on a drag of
 0.009 N/(m/s). A vehicle of 42 g then pushes with 6.3 g at 0.5 m, where the recorded vehicles of 34
-g feel 5.9 g. Larger: a stronger push exactly below the vehicle."""
+g feel 5.9 g. Larger: the push exactly below the vehicle is stronger."""
 FACTOR_RADIUS_M = 0.05
-"""Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: a stronger
-push next to the axis, although the recordings need no factor at 0.1 m."""
+"""Distance from the axis over which the factor falls to 1, m: half a vehicle. Larger: the push next
+to the axis is stronger, although the recordings need no factor at 0.1 m."""
 LEAST_MPS = 0.01
 """Speed below which a jet is ignored, m/s, so that vehicles far apart fly exactly as if alone. The
 jet has this speed 2 m below its source and 1 m from its axis. Larger: the drag force at this speed

@@ -16,7 +16,8 @@ from perchctl.target import Board
 from perchctl.vision import deinterlace_image
 
 MIN_CORNERS = 6
-"""Minimum number of corners in a view. Fewer determine a pose, but nothing about the lens."""
+"""Minimum number of corners in a view. Fewer corners determine a pose, but nothing about the
+lens."""
 SEARCH_PX = 1600
 """Size to which larger images are scaled down for the search; corners are fitted at full size."""
 _HASH_BYTES = 6

@@ -25,8 +25,8 @@ second."""
 MARKER_PICTURES = 3
 """Number of these images that are searched for markers; each search takes about a second."""
 MIN_MARKERS = 4
-"""Minimum number of markers that must be found. Fewer may belong to the perching target, or be
-patterns that look like markers."""
+"""Minimum number of markers that must be found. Fewer markers may belong to the perching target, or
+be patterns that look like markers."""
 MIN_MARKER_CORNERS = 12
 """Number of corners that must be found with a ChArUco board's layout before the board is named."""
 GRID_START = (5, 4)

@@ -31,8 +31,8 @@ from perchctl.target import Board
 
 _VERDICT_GRADES = {"fly": "good", "care": "warn", "stop": "bad"}
 _LONG_SHARE = 0.04
-"""Length at which a long residual is drawn, in image widths. Larger: neighbours cross. Smaller:
-their directions cannot be seen."""
+"""Length at which a long residual is drawn, in image widths. Larger: neighbours cross. Smaller: the
+directions of the residuals cannot be seen."""
 _LONG_PERCENTILE = 95.0
 """Percentile of the residuals' lengths that is used as the length of a long residual. Larger: a few
 outliers shrink the others. Smaller: the longest ones leave the image."""

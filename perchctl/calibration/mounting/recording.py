@@ -71,7 +71,7 @@ class MountingRecording:
 
     @staticmethod
     def write(path: Path, recordings: Sequence[MountingRecording]) -> None:
-        """Write the recordings to one file atomically. Raises InvalidValue if it cannot be
+        """Write the recordings to one file atomically. Raises InvalidValue if the file cannot be
         written."""
         records: list[dict[str, Any]] = []
         for recording in recordings:
