@@ -170,8 +170,8 @@ BLOCKS: dict[str, dict[str, str]] = {
     "state": STATE_BLOCK,
     "attitude": ATTITUDE_BLOCK,
 }
-"""Log blocks in the order in which they are sent at the same time; the block that completes a
-sample is last."""
+"""Log blocks in the order in which they are sent if they are due at the same time; the block that
+completes a sample is last."""
 FAST_BLOCKS = ("state", "attitude")
 """A sample requires these blocks; the others arrive ten times a second if the firmware has them."""
 SLOW_PERIOD_S = 0.1
