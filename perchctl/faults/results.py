@@ -76,8 +76,8 @@ class FaultResult(CampaignFlight):
 WORST_CASES = 20
 SHARES = {
     "wrong": "with a flag that counts against perchctl",
-    "not_known": "perchctl reports that the vehicle hangs or stands",
-    "unconfirmed": "perchctl reports that no landing was seen",
+    "not_known": "whether the vehicle hangs or stands",
+    "unconfirmed": "perchctl did not see the vehicle land",
 }
 """The counts that are given as shares of all flights, and what they mean."""
 

@@ -102,7 +102,7 @@ def test_wrong_usage(place: Path, words: list[str], code: int, expected: list[st
     [
         (["still"], [], ["lacks motion", "tilt"]),
         (["mirrored"], [], ["camera.mirrored"]),
-        (["brief", "pivot"], [], ["the carry lacks motion"]),
+        (["brief", "pivot"], [], ["the carry recording lacks motion"]),
         (["carry"], ["--part", "pivot"], ["no pivot", "only carry"]),
         (["cut"], [], ["cut.jsonl, line"]),
     ],

@@ -84,7 +84,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     assert max(sim.truth()["motors"]) == 0
     assert said.exit_code == 130, said.stderr
     log = Path("calib/mounting_mine.jsonl")
-    assert f"kept the recording: {log}" in said.stderr
+    assert f"kept the recording {log};" in said.stderr
     assert f"--from {log}" in said.stderr
     (recording,) = MountingRecording.read(log)
     assert len(recording.poses) >= 10

@@ -75,7 +75,7 @@ def test_other_flights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     ):
         written(path, profile=load_profile("rough"), faults=["killed"], resume=True)
     monkeypatch.setattr(results_file, "source_sha256", lambda: "ffff")
-    with pytest.raises(InvalidValue, match="another program: "):
+    with pytest.raises(InvalidValue, match="a different program: "):
         written(path, resume=True, force=True)
     assert path.read_bytes() == before
 

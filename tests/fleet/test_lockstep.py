@@ -182,9 +182,17 @@ CROSSING = [((0.0, 0.0), (1.0, 0.0)), ((0.5, -1.0), (0.5, -1.5)), ((5.0, 0.0), (
         (Script(), "perched", ""),
         (Script(outcome="landed"), "perched", ""),  # at its home, as planned
         (Script(outcome="landed", lies_m=(0.6, 0.0)), "refused", "v0 lies 0.60 m from its home"),
-        (Script(outcome="landed", lies_m=(0.5, -0.5)), "refused", "v0 lies 0.15 m from its cor"),
+        (
+            Script(outcome="landed", lies_m=(0.5, -0.5)),
+            "refused",
+            "v0 lies 0.15 m from this vehicle's cor",
+        ),
         (Script(outcome="gone", lies_m=(math.nan, 0.0)), "refused", "it is unknown where v0 lies"),
-        (Script(outcome="landed", lies_m=(0.5, -1.2)), "refused", "v0 lies 0.35 m inside its"),
+        (
+            Script(outcome="landed", lies_m=(0.5, -1.2)),
+            "refused",
+            "v0 lies 0.35 m inside this vehicle's",
+        ),
     ],
 )
 def test_who_lies_away_from_its_home_may_block_others(

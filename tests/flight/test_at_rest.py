@@ -161,7 +161,7 @@ def test_a_time_in_which_nothing_was_heard_is_no_time_at_rest(way_m: float) -> N
     before, after = stands(0.01), [stands(5.0 + 0.1 * k) for k in range(21)]
     after = [replace(sample, position_m=(way_m, 0.0, 0.0)) for sample in after]
     for heard in range(1, 20):
-        assert "stand still" in still_waiting_for(
+        assert "stop moving" in still_waiting_for(
             GroundTurn(PROFILE, 0.0, [before, *after[:heard]])
         )
     assert still_waiting_for(GroundTurn(PROFILE, 0.0, [before, *after])) == ""

@@ -184,7 +184,10 @@ AT_ONCE: list[tuple[dict[str, Any], str]] = [
     ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
 ]
 IN_TIME: list[tuple[dict[str, Any], str]] = [
-    ({"velocity_variance_m2ps2": 0.5}, r"settle.*velocity's variance is 0\.50 \(m/s\)\^2, at most"),
+    (
+        {"velocity_variance_m2ps2": 0.5},
+        r"settle.*velocity's variance is 0\.50 \(m/s\)\^2, but at most",
+    ),
     ({"height_variance_m2": math.nan}, "settle"),
     ({"variance_behind_s": 3.0}, r"settle .the variances are 3\.0 s old"),
     ({"battery_v": math.nan}, r"no battery voltage: .*link\.unreported: \[battery\]"),

@@ -148,7 +148,11 @@ def test_positions_that_lead_astray_are_sent_no_more() -> None:
 @pytest.mark.parametrize(("how", "error", "words"), [
     ({"hidden": lambda t_s: True}, TimedOut, f"positions from the motion-capture system .{HIDDEN}"),
     ({"place": lambda p: at(250.0, -100.0, 12.0)}, SafetyAbort, "millimetres"),
-    ({"place": lambda p: at(1.0, 0.0, 0.0)}, TimedOut, "the motion-capture system .they are 1"),
+    (
+        {"place": lambda p: at(1.0, 0.0, 0.0)},
+        TimedOut,
+        "the motion-capture system .the positions differ by 1",
+    ),
 ])  # fmt: skip
 def test_positions_that_are_none_keep_it_on_the_ground(
     how: dict[str, Any], error: type[Exception], words: str

@@ -100,7 +100,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("target: {large: {dictionary: DICT_4X4_50, id: 5, side_m: 0.15}, "
          "small: {dictionary: DICT_4X4_250, id: 5, side_m: 0.025}}",
          ["target", "the same marker", "DICT_4X4_50/5 and DICT_4X4_250/5", "another id"]),
-        ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep only one"]),
+        ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "only one"]),
         ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 appears twice"]),
         ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
         ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
