@@ -63,7 +63,7 @@ more packets are sent."""
 HUB_STOP_PERIOD_S = 0.2
 """Longest time until the driver's thread reacts to a close or sends the next request, s. Longer:
 the driver's socket is freed later. Shorter: the thread wakes up more often for nothing."""
-HUB_ENDED = "the radio hub of this vehicle has ended"
+HUB_ENDED = "this vehicle's radio hub has stopped"
 
 
 @dataclass(frozen=True)

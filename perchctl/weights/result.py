@@ -208,7 +208,7 @@ def _verdict(result: FitResult) -> str:
         why = (
             f"better than the {name} marker alone by more than the 95 % interval"
             if proven
-            else f"the {name} marker alone: no weight is significantly better"
+            else f"the {name} marker alone: merging both markers is not significantly better"
         )
         lines.append(f"  {axis:<4} {weight:.3f}  {why}")
     return "\n".join(lines)

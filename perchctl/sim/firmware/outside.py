@@ -105,11 +105,11 @@ class Imu:
 
 
 POSITION_STATE = 0
-"""Index of x of the position among the nine states; y and z follow."""
+"""Index of the position's x component among the nine states; y and z follow."""
 VELOCITY_STATE = 3
-"""Index of x of the velocity."""
+"""Index of the velocity's x component."""
 ATTITUDE_STATE = 6
-"""Index of x of the attitude error."""
+"""Index of the attitude error's x component."""
 
 _FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
 """Standard deviations after a reset (source: `stdDevInitial*`)."""
