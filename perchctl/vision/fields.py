@@ -36,7 +36,10 @@ _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
 _NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
-_ROUNDED_TO_NTSC_OR_PAL_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
+_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (
+    0.029,
+    0.045,
+)  # range of periods that are rounded to NTSC or PAL
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
@@ -107,13 +110,13 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
     return result
 
 
-def interpolated_edge_sigma_px(blur_sigma_px: float) -> float:
+def interpolated_field_edge_sigma_px(blur_sigma_px: float) -> float:
     """Return the position error, px (standard deviation), of a nearly horizontal edge in an
     interpolated field. `blur_sigma_px` is the edge's blur (standard deviation)."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_sigma_px * blur_sigma_px)
 
 
-def classify_fields(frame: Frame) -> Frame:
+def classify_interlacing(frame: Frame) -> Frame:
     """Return the frame with its `picture_kind`: ``woven`` if it is interlaced, so that its odd and
     even rows were exposed at different times, or ``whole`` if all rows were exposed together. A
     kind that is already known stays."""
@@ -143,7 +146,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
         and state.picture_kind == "whole"
         and state.frames_since_combing_check + 1 < _COMBING_CHECK_INTERVAL_FRAMES
     )
-    frame = replace(frame, picture_kind="whole") if skip else classify_fields(frame)
+    frame = replace(frame, picture_kind="whole") if skip else classify_interlacing(frame)
     skipped = state.frames_since_combing_check + 1 if skip else 0
     # A stream that was interlaced once is treated as interlaced from then on.
     picture_kind = state.picture_kind if state.picture_kind == "woven" else frame.picture_kind
@@ -187,7 +190,11 @@ def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
     period_s = mean(
         p for p in frame_periods_s if p < _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO * middle_s
     )
-    if _ROUNDED_TO_NTSC_OR_PAL_RANGE_S[0] < period_s < _ROUNDED_TO_NTSC_OR_PAL_RANGE_S[1]:
+    if (
+        _PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[0]
+        < period_s
+        < _PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[1]
+    ):
         return min(_NTSC_AND_PAL_FRAME_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s
 

@@ -188,7 +188,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     )
 
 
-def vector_by_tilt_jacobian(vector_m: Array) -> Array:
+def vector_jacobian_wrt_tilt(vector_m: Array) -> Array:
     """Return the derivative (3, 2), m/rad, of a vector `vector_m` (3,) in level axes with respect
     to small rotations about level x and y."""
     x, y, z = vector_m

@@ -22,7 +22,7 @@ from perchctl.extensions import error_at, load_extension
 from perchctl.opencv_threads import one_thread
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import classify_fields, deinterlace_frame
+from perchctl.vision.fields import classify_interlacing, deinterlace_frame
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import warm_up_truncated_marker_fit
 from perchctl.vision.markers.detect import detect_markers
@@ -38,14 +38,14 @@ from perchctl.vision.pose import PoseCandidate, PoseSetup, target_normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPosition,
     gear_to_target_shift_per_bias_sigma_m,
-    marker_to_own_target_m,
+    marker_to_own_target_distance_m,
     target_level_to_world,
     target_world_to_level,
 )
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
-    expected_corners,
+    predict_corners,
     predict_rival_state,
     update_last_pose,
     update_tracks,
@@ -184,8 +184,8 @@ def step(
     `attitude` is the vehicle's state at the frame's time. If it is None, the vehicle is assumed to
     be level and at rest, and the filter works in the level frame regardless of `kalman.frame`.
     """
-    frame = classify_fields(_convert_to_grey(frame, pipeline.camera))
-    expected_corners_px, start_pose = expected_corners(
+    frame = classify_interlacing(_convert_to_grey(frame, pipeline.camera))
+    expected_corners_px, start_pose = predict_corners(
         state.last_pose, frame.t_s, attitude, pipeline.pose_setup
     )
     if pipeline.custom_detector is not None:
@@ -200,7 +200,7 @@ def step(
         empty = None if first else state.frames_without_markers
         own_target = pipeline.track_setup.own_target
         measure_own_target_distance_m = partial(
-            marker_to_own_target_m, own_target, frame.t_s, attitude, pipeline.pose_setup
+            marker_to_own_target_distance_m, own_target, frame.t_s, attitude, pipeline.pose_setup
         )
         with nullcontext() if state.last_detections is None else one_thread():
             detections = detect_markers(

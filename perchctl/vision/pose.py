@@ -26,10 +26,10 @@ _ATTITUDE_TILT_SIGMA_RAD = math.radians(
     6.0
 )  # combined error of the mounting, the attitude estimate and the ceiling
 _PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
-_MIN_CURLED_CHI2_PER_DOF = (
+_MIN_SHEET_CURL_CHI2_PER_DOF = (
     3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
 )
-_MAX_CHI2_FRACTION_WITH_CURL = (
+_MAX_CHI2_FRACTION_WITH_SHEET_CURL = (
     0.5  # largest share of chi-squared that may remain if curl is the cause
 )
 _PoseSource = Literal["large", "small", "joint"]
@@ -55,12 +55,16 @@ class PoseSetup:
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def lift_per_curl_sigma_m(self) -> dict[_PoseSource, Array]:
+    def corner_lift_per_sheet_curl_sigma_m(self) -> dict[_PoseSource, Array]:
         """Height of each corner above the flat sheet, m, for one standard deviation of the sheet's
-        curl: (8, 2), or (16, 2) for ``joint``. The columns are the two modes of `curl_lift`. Each
-        corner has two equal rows, one for its x and one for its y in the image."""
+        curl: (8, 2), or (16, 2) for ``joint``. The columns are the two modes of
+        `corner_lift_by_sheet_curl`. Each corner has two equal rows, one for its x and one for its y
+        in the image."""
         curl = self.target.curl_per_m
-        return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
+        return {
+            source: corner_lift_by_sheet_curl(corners, curl)
+            for source, corners in self.corners_m.items()
+        }
 
 
 def square_corners(side_m: float) -> Array:
@@ -96,8 +100,8 @@ def estimate_pose(
     image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_points_px):
         return None  # the lens model cannot image these corners
-    K, lift = setup.camera.K, setup.lift_per_curl_sigma_m[source]
-    points = weigh_corners(detections, setup.corners_m[source], image_points_px, K, lift)
+    K, lift = setup.camera.K, setup.corner_lift_per_sheet_curl_sigma_m[source]
+    points = compute_corner_weights(detections, setup.corners_m[source], image_points_px, K, lift)
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
@@ -113,7 +117,7 @@ def estimate_pose(
     pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
     if (
         source != "joint"
-        or pose.chi2_per_dof < _MIN_CURLED_CHI2_PER_DOF
+        or pose.chi2_per_dof < _MIN_SHEET_CURL_CHI2_PER_DOF
         or setup.target.curl_per_m == 0.0
     ):
         return pose
@@ -121,14 +125,14 @@ def estimate_pose(
         return pose  # interpolated rows make sides look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
-    points = replace(points, allows_for_curl=True)
+    points = replace(points, allows_for_sheet_curl=True)
     settled = _refine_from_start(points, solution, prior, max_rms_reprojection_px)
     if settled is None:
         return pose
     bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
     return (
         replace(bent, chi2_per_dof=pose.chi2_per_dof)
-        if bent.chi2_per_dof < _MAX_CHI2_FRACTION_WITH_CURL * pose.chi2_per_dof
+        if bent.chi2_per_dof < _MAX_CHI2_FRACTION_WITH_SHEET_CURL * pose.chi2_per_dof
         else pose
     )
 
@@ -232,7 +236,7 @@ def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) ->
 
 
 _MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # solutions closer than this are the same
-_MIN_SCORE_SIGMA_PX = 0.05  # lens and print errors make smaller values meaningless
+_MIN_COST_CORNER_SIGMA_PX = 0.05  # lens and print errors make smaller values meaningless
 _MAX_GAUSS_NEWTON_STEPS = 8
 # weight of the detections' own standard deviation against the residuals, in degrees of freedom
 _CORNER_SIGMA_PRIOR_DOF = 8.0
@@ -309,8 +313,8 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         scored = _score_candidate(candidate, points)
         A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
         B, weighed = A, error
-        if points.allows_for_curl:
-            weight = curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
+        if points.allows_for_sheet_curl:
+            weight = sheet_curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -348,7 +352,7 @@ class PoseCovariance(NamedTuple):
 
     rvec_tvec_cov: Array
     chi2_per_dof: float
-    rvec_tvec_shift_per_curl_sigma: Array
+    rvec_tvec_shift_per_sheet_curl_sigma: Array
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
@@ -361,7 +365,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
     curl = _whitened_paper_curl_shift(points, scored)
-    weight = curl_weight_matrix(curl) if points.allows_for_curl else None
+    weight = sheet_curl_weight_matrix(curl) if points.allows_for_sheet_curl else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
@@ -369,7 +373,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
     growth = max((_CORNER_SIGMA_PRIOR_DOF + chi2) / (_CORNER_SIGMA_PRIOR_DOF + freedom), 0.7)
-    common = gain.dot(points.whitened_shift_per_error_sigma)
+    common = gain.dot(points.whitened_shift_per_common_error_sigma)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
     curled, twisted = gain.dot(curl).T
@@ -385,7 +389,7 @@ def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> A
     # In the image, a corner above the sheet's plane moves as if the target moved along its normal.
     moved = (
         scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None]
-        * points.lift_per_curl_sigma_m
+        * points.corner_lift_per_sheet_curl_sigma_m
     )
     return np.asarray(points.whitening_matrix.dot(moved))
 
@@ -456,7 +460,7 @@ def _choose_most_likely_pose(
 ) -> ScoredPose:
     if len(scored) == 1:
         return scored[0]
-    sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
+    sigma = np.maximum(points.sigma_px, _MIN_COST_CORNER_SIGMA_PX)[:, None]
 
     def cost(s: ScoredPose) -> float:
         total = float(((s.reprojection_error_px / sigma) ** 2).sum())
@@ -472,26 +476,26 @@ def _choose_most_likely_pose(
 # --- A sheet that is not flat: effect of its curl on corners, and their weights ---
 
 
-def curl_lift(object_points_m: Array, curl_sigma_per_m: float) -> Array:
+def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: float) -> Array:
     """Return the height of corners (n, 3) above the flat sheet for one standard deviation of two
     curl modes: a bowl (all corners on one side) and a saddle (neighbouring corners on opposite
-    sides). `curl_sigma_per_m` is the height per squared distance from the centre. Shape (2n,
+    sides). `sheet_curl_sigma_per_m` is the height per squared distance from the centre. Shape (2n,
     2), m; each corner has two equal rows, for its x and y."""
     x, y = object_points_m[:, 0], object_points_m[:, 1]
-    lift: Array = curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
+    lift: Array = sheet_curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
-def curl_weight_matrix(whitened_shift_per_curl_sigma: Array) -> Array:
+def sheet_curl_weight_matrix(whitened_shift_per_sheet_curl_sigma: Array) -> Array:
     """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is
-    `whitened_shift_per_curl_sigma` (2n, k), one column per mode."""
+    `whitened_shift_per_sheet_curl_sigma` (2n, k), one column per mode."""
     inner = np.linalg.inv(
-        np.eye(whitened_shift_per_curl_sigma.shape[1])
-        + whitened_shift_per_curl_sigma.T @ whitened_shift_per_curl_sigma
+        np.eye(whitened_shift_per_sheet_curl_sigma.shape[1])
+        + whitened_shift_per_sheet_curl_sigma.T @ whitened_shift_per_sheet_curl_sigma
     )
     weight: Array = (
-        np.eye(len(whitened_shift_per_curl_sigma))
-        - whitened_shift_per_curl_sigma @ inner @ whitened_shift_per_curl_sigma.T
+        np.eye(len(whitened_shift_per_sheet_curl_sigma))
+        - whitened_shift_per_sheet_curl_sigma @ inner @ whitened_shift_per_sheet_curl_sigma.T
     )
     return weight
 
@@ -534,34 +538,35 @@ class WeightedCorners:
             pinhole camera `K` (3, 3).
         sigma_px: standard deviations (n,).
         whitening_matrix: matrix (2n, 2n) that makes the errors independent, with unit variance.
-        whitened_shift_per_error_sigma: whitened shift of the corners by one standard deviation of
-            each error common to several of them, one column per error (2n, k): white grown over
-            black at all edges, `corner_shift_per_readout_sigma_px` of the detections, and the
-            jitter of each detection's rows.
-        lift_per_curl_sigma_m: result (2n, 2) of `curl_lift`.
-        allows_for_curl: True if the sheet may be curled, which reduces the weight of corners that
-            curl would move; False if the sheet is assumed to be flat.
+        whitened_shift_per_common_error_sigma: whitened shift of the corners by one standard
+            deviation of each error common to several of them, one column per error (2n, k): white
+            grown over black at all edges, `corner_shift_per_readout_sigma_px` of the detections,
+            and the jitter of each detection's rows.
+        corner_lift_per_sheet_curl_sigma_m: result (2n, 2) of `corner_lift_by_sheet_curl`.
+        allows_for_sheet_curl: True if the sheet may be curled, which reduces the weight of corners
+            that curl would move; False if the sheet is assumed to be flat.
     """
 
     object_points_m: Array
     image_points_px: Array
     sigma_px: Array
     whitening_matrix: Array
-    whitened_shift_per_error_sigma: Array
+    whitened_shift_per_common_error_sigma: Array
     K: Array
-    lift_per_curl_sigma_m: Array
-    allows_for_curl: bool = False
+    corner_lift_per_sheet_curl_sigma_m: Array
+    allows_for_sheet_curl: bool = False
 
 
-def weigh_corners(
+def compute_corner_weights(
     detections: Sequence[Detection],
     object_points_m: Array,
     image_points_px: Array,
     K: Array,
-    lift_per_curl_sigma_m: Array,
+    corner_lift_per_sheet_curl_sigma_m: Array,
 ) -> WeightedCorners:
     """Compute the weights of the detections' corners. `image_points_px` are the corners in a
-    pinhole camera with matrix K; `lift_per_curl_sigma_m` is the result of `curl_lift`."""
+    pinhole camera with matrix K; `corner_lift_per_sheet_curl_sigma_m` is the result of
+    `corner_lift_by_sheet_curl`."""
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
@@ -600,7 +605,13 @@ def weigh_corners(
             error_shifts[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_jitter_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
     return WeightedCorners(
-        object_points_m, image_points_px, sigma_px, W, W.dot(error_shifts), K, lift_per_curl_sigma_m
+        object_points_m,
+        image_points_px,
+        sigma_px,
+        W,
+        W.dot(error_shifts),
+        K,
+        corner_lift_per_sheet_curl_sigma_m,
     )
 
 

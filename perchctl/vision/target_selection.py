@@ -19,7 +19,7 @@ from perchctl.vision.filter import (
     TILTS,
     FilterSetup,
     TrackMeasurement,
-    vector_by_tilt_jacobian,
+    vector_jacobian_wrt_tilt,
 )
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Detection, MarkerName, MarkerPose, VehicleState
@@ -47,7 +47,7 @@ _NO_POSE_DISTANCE_M = 1e9
 but not refused."""
 
 
-def marker_to_own_target_m(
+def marker_to_own_target_distance_m(
     own_target: OwnTargetPosition,
     t_s: float,
     attitude: VehicleState | None,
@@ -79,7 +79,7 @@ def horizontal_distance_to_own_target_m(
     return math.hypot(seen_m[0] - own_target.xy_world_m[0], seen_m[1] - own_target.xy_world_m[1])
 
 
-def refusal_text(
+def foreign_target_message(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
     """Return the message that a detected target belongs to another vehicle; None if it may be this
@@ -152,7 +152,7 @@ def make_track_measurement(
     shift_per_bias_sigma[1:, PRINT] = pose.shift_per_print_error_sigma_m
     if attitude is not None:
         shift_per_bias_sigma[1:, TILTS] = (
-            vector_by_tilt_jacobian(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
+            vector_jacobian_wrt_tilt(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
         )
     if is_in_world_frame and attitude is not None:
         turn = _IDENTITY_4.copy()
@@ -179,5 +179,5 @@ def gear_to_target_shift_per_bias_sigma_m(
     gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
-    moved[:, TILTS] -= vector_by_tilt_jacobian(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
+    moved[:, TILTS] -= vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
     return np.asarray(moved)

@@ -23,7 +23,11 @@ from perchctl.vision.filter import (
 from perchctl.vision.lens import project
 from perchctl.vision.markers.cut import make_coarse_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import OwnTargetPosition, make_track_measurement, refusal_text
+from perchctl.vision.target_selection import (
+    OwnTargetPosition,
+    foreign_target_message,
+    make_track_measurement,
+)
 from perchctl.vision.types import (
     LastPose,
     MarkerName,
@@ -114,7 +118,9 @@ def update_tracks(
         goes_on = not verdict.restarts_track or verdict.restarts_at_locked_target
         goes_on = goes_on and drop_expired_lock_and_rival(state.lock, None, t_s)[0] is not None
         another = (
-            None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose_setup)
+            None
+            if goes_on
+            else foreign_target_message(pose, attitude, setup.own_target, setup.pose_setup)
         )
         if another is not None and verdict.is_accepted:
             verdict = GateVerdict(False, rival=state.rival, reason=another, is_foreign_target=True)
@@ -147,9 +153,9 @@ def update_tracks(
 #
 # A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
 # lacks, so a rival is most likely the target from a different viewpoint. The lock then changes
-# after `MIN_ONLY_RIVAL_SEEN_S` in which only the rival was seen, if the rival has both markers or
-# the lock never had. A rival that was seen before the target was lost is a second target and waits
-# `REACQUIRE_S`.
+# after `MIN_ONLY_RIVAL_SEEN_DURATION_S` in which only the rival was seen, if the rival has both
+# markers or the lock never had. A rival that was seen before the target was lost is a second target
+# and waits `REACQUIRE_S`.
 #
 # While a rival is seen and the target is not, the target's predicted position may be wrong, and its
 # covariance covers the rival's position, too.
@@ -165,7 +171,7 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
-MIN_ONLY_RIVAL_SEEN_S = 0.3
+MIN_ONLY_RIVAL_SEEN_DURATION_S = 0.3
 """Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
 has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
 LOCK_TIMEOUT_S = 10.0
@@ -538,10 +544,11 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     """True if the rival is most likely the target itself, displaced from the track because the
     camera moved during lost frames. Since the target was last seen, only the rival has been seen
-    for `MIN_ONLY_RIVAL_SEEN_S`, in enough frames and with as many markers as the target."""
+    for `MIN_ONLY_RIVAL_SEEN_DURATION_S`, in enough frames and with as many markers as the
+    target."""
     if (
         rival.first_seen_at_s < lock.track.t_s
-        or frame_pose.t_s - rival.first_seen_at_s < MIN_ONLY_RIVAL_SEEN_S
+        or frame_pose.t_s - rival.first_seen_at_s < MIN_ONLY_RIVAL_SEEN_DURATION_S
     ):
         return False
     if not lock.has_shown_both_markers:
@@ -557,10 +564,10 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
 # and as velocity times time. Each is weighted by its recent errors in the target's own images.
 
 
-_MOTION_ERROR_UPDATE_FRACTION = 0.1  # weight of a new frame in the running mean of squared errors
+_MOTION_ERROR_SMOOTHING_FACTOR = 0.1  # weight of a new frame in the running mean of squared errors
 
 
-def expected_corners(
+def predict_corners(
     last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Predict the corners of both markers, (4, 2) px, and the pose of the target at `t_s` from the
@@ -609,7 +616,7 @@ def update_last_pose(
         for displacement_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
-        old + _MOTION_ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
+        old + _MOTION_ERROR_SMOOTHING_FACTOR * (float(new.dot(new)) - old)
         for old, new in zip(previous.motion_errors, residual, strict=True)
     )
     return LastPose(pose, attitude, MotionErrors(by_place, by_speed))

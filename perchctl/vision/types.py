@@ -357,8 +357,8 @@ class MotionErrors(NamedTuple):
     from the camera, rad^2: for the motion from the difference of two estimated positions, and for
     the motion from velocity times time."""
 
-    position_based_error_rad2: float = 0.0
-    velocity_based_error_rad2: float = 0.0
+    position_based_mean_squared_error_rad2: float = 0.0
+    velocity_based_mean_squared_error_rad2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
     LOCK_TIMEOUT_S,
     MIN_ESTABLISHED_TRACK_FRAMES,
-    MIN_ONLY_RIVAL_SEEN_S,
+    MIN_ONLY_RIVAL_SEEN_DURATION_S,
     REACQUIRE_S,
     FramePose,
     _is_clearly_consistent,
@@ -129,7 +129,7 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     assert all(measured(watch.show(LOCKED)))
     decoy = DECOYS[name]
     lasts = watch.in_world or "markers" in decoy
-    outputs = watch.show(72 if lasts else int(MIN_ONLY_RIVAL_SEEN_S * HZ), **decoy)
+    outputs = watch.show(72 if lasts else int(MIN_ONLY_RIVAL_SEEN_DURATION_S * HZ), **decoy)
     assert all(output.poses for output in outputs)  # it was seen
     assert not any(measured(outputs))
     assert all(o.lock_note.startswith("not the tracked target: ") for o in outputs)
@@ -205,7 +205,7 @@ def test_without_the_gate_all_of_them_steer(build: Build) -> None:
 
 def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
     watch.show(LOCKED)
-    while_s = REACQUIRE_S if watch.in_world else MIN_ONLY_RIVAL_SEEN_S
+    while_s = REACQUIRE_S if watch.in_world else MIN_ONLY_RIVAL_SEEN_DURATION_S
     outputs = watch.show(int(1.2 * while_s * HZ) + 2, away_m=(0.3, 0.0, 0.0))
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2

@@ -42,7 +42,7 @@ from perchctl.vision import (
     estimate,
     step,
 )
-from perchctl.vision.tracks import expected_corners, update_last_pose
+from perchctl.vision.tracks import predict_corners, update_last_pose
 from perchctl.vision.types import LastPose, VisibleMarkers
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -259,18 +259,18 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
     sight = LastPose(output.poses["joint"], then)
-    expected, near = expected_corners(sight, now.t_s, now, setup.pose_setup)
+    expected, near = predict_corners(sight, now.t_s, now, setup.pose_setup)
     _, later = step(PipelineState(), Frame(1, now.t_s, view(now)), now, setup)
     for name in ("large", "small"):
         seen = later.detections.get(name)
         assert np.abs(expected[name] - seen.corners_px).max() < 1.0
     assert np.allclose(near.tvec_m, later.poses["joint"].tvec_m, atol=0.002)
-    corners, unmoved = expected_corners(sight, now.t_s, None, setup.pose_setup)
+    corners, unmoved = predict_corners(sight, now.t_s, None, setup.pose_setup)
     assert corners is None
     assert np.array_equal(unmoved.tvec_m, sight.pose.tvec_m)
     assert np.array_equal(unmoved.rvec_rad, sight.pose.rvec_rad)
-    assert expected_corners(None, now.t_s, now, setup.pose_setup) == (None, None)
-    assert expected_corners(sight, then.t_s + 5.0, now, setup.pose_setup) == (None, None)
+    assert predict_corners(None, now.t_s, now, setup.pose_setup) == (None, None)
+    assert predict_corners(sight, then.t_s + 5.0, now, setup.pose_setup) == (None, None)
 
 
 # --- Which of the vehicle's two accounts of its way tells where the target goes is learned -----
@@ -319,7 +319,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
         if not told:
             attitude = replace(attitude, velocity_mps=None)
         if sight is not None:
-            expected, _ = expected_corners(sight, pose.t_s, attitude, SETUP)
+            expected, _ = predict_corners(sight, pose.t_s, attitude, SETUP)
             points = SETUP.corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())

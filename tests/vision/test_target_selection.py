@@ -25,7 +25,7 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
-from perchctl.vision.target_selection import OwnTargetPosition, marker_to_own_target_m
+from perchctl.vision.target_selection import OwnTargetPosition, marker_to_own_target_distance_m
 from tests.helpers.markers import box
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -200,6 +200,6 @@ def test_a_marker_without_a_pose_yet_is_refused_only_by_a_known_place() -> None:
     level = VehicleState(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
     anywhere, known = OwnTargetPosition(), OwnTargetPosition((0.0, 0.0), 0.3)
     for place, attitude in ((anywhere, None), (known, None), (anywhere, level)):
-        offset_m = marker_to_own_target_m(place, 0.0, attitude, setup, "large", spoilt)
+        offset_m = marker_to_own_target_distance_m(place, 0.0, attitude, setup, "large", spoilt)
         assert 1e3 < offset_m < math.inf  # behind all that have a pose
-    assert marker_to_own_target_m(known, 0.0, level, setup, "large", spoilt) == math.inf
+    assert marker_to_own_target_distance_m(known, 0.0, level, setup, "large", spoilt) == math.inf

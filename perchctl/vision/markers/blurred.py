@@ -59,7 +59,7 @@ _CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # grey of areas with unknown content
 _MAX_DUPLICATE_DISTANCE_SIDES = (
     0.15  # distance, as a share of a side, of candidates that count as one
 )
-_CERTAIN_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
+_MIN_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
@@ -151,7 +151,7 @@ def _align_by_correlation(
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _CERTAIN_PAPER_REACH_HALF_SIDES
+    half = float(np.abs(corners_px - centre).max()) * _MIN_PAPER_REACH_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -190,7 +190,7 @@ def _render_template(
         white[
             np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
         ] = _CENTRE_GREY
-    white[np.abs(sample_points_half_sides).max(axis=2) > _CERTAIN_PAPER_REACH_HALF_SIDES] = (
+    white[np.abs(sample_points_half_sides).max(axis=2) > _MIN_PAPER_REACH_HALF_SIDES] = (
         _OUTSIDE_GREY
     )
     sigma = max(1.0, 0.5 * side_px / n)
@@ -201,7 +201,9 @@ def _render_template(
 
 
 _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
-_CORNER_SIGMA_PER_BLUR = 0.012  # share of the blur: no image equals its drawing with uniform blur
+_CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = (
+    0.012  # share of the blur: no image equals its drawing with uniform blur
+)
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
 _MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
@@ -258,7 +260,7 @@ def align_marker(
         return None
     sigma_px = math.hypot(
         max(alignment.sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
-        _CORNER_SIGMA_PER_BLUR * alignment.blur_sigma_px,
+        _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO * alignment.blur_sigma_px,
     )
     (left, top), (right, bottom) = (
         alignment.corners_px.min(axis=0),

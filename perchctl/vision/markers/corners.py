@@ -27,7 +27,7 @@ SIDE_OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1
 """Outward normal of each side in the marker's own coordinates."""
 _CENTRED_SQUARE_F32 = CENTRED_SQUARE.astype(np.float32)
 _CENTRED_SQUARE_HOMOGENEOUS: Array = np.column_stack([CENTRED_SQUARE, np.ones(4)])
-_CORNER_BY_INCREMENT_JACOBIANS: Array = np.array(
+_CORNER_JACOBIANS_WRT_HOMOGRAPHY_INCREMENT: Array = np.array(
     [
         [[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]]
         for u, v in CENTRED_SQUARE
@@ -54,13 +54,13 @@ def apply_homography(H: Array, points: Array) -> Array:
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
-def corners_by_increment_jacobian(homography: Array) -> Array:
+def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
     respect to the `homography_increment` of `increment_homography`."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
-    return np.asarray((A @ _CORNER_BY_INCREMENT_JACOBIANS).reshape(8, 8))
+    return np.asarray((A @ _CORNER_JACOBIANS_WRT_HOMOGRAPHY_INCREMENT).reshape(8, 8))
 
 
 def increment_homography(H: Array, homography_increment: Array) -> Array:

@@ -305,7 +305,7 @@ _LATTICE_COLUMNS = 80  # across the image, approximately
 _SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2  # samples per node in both directions
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
 _POINTS_PER_IMAGE_SIDE = 40
-_VALID_TO_IMAGE_RADIUS_RATIO = 1.02
+_VALID_LENS_TO_IMAGE_RADIUS_RATIO = 1.02
 _SEARCH_RANGE_NODES = 6  # nodes to each side
 _MIN_PAPER_NODES = 200  # least number of nodes on paper
 
@@ -355,7 +355,7 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     rays = np.clip(
         np.nan_to_num(rays, nan=0.0), -_MAX_VIEW_RADIUS_NORMALISED, _MAX_VIEW_RADIUS_NORMALISED
     )
-    reach = _VALID_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
+    reach = _VALID_LENS_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
     step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
@@ -478,7 +478,7 @@ def correlate_drawing(
         np.abs(
             apply_homography(np.asarray(np.linalg.inv(H_normalised_drawing), np.float64), at)
         ).max(axis=1)
-        < PAPER_REACH_LARGE_HALF_SIDES
+        < PAPER_REACH_LARGE_MARKER_HALF_SIDES
     )
     if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return DrawingMatch(0.0, 0.0)
@@ -495,11 +495,13 @@ def correlate_drawing(
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
 
 
-PAPER_REACH_LARGE_HALF_SIDES = 1.25  # half sides of the large marker that are certainly paper
+PAPER_REACH_LARGE_MARKER_HALF_SIDES = (
+    1.25  # half sides of the large marker that are certainly paper
+)
 _POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # points along a cell's side
 # share of a cell's side near its ends, where the next cell's corner blurs the edge
 _EDGE_END_MARGIN_CELLS = 0.15
-_HIDDEN_BY_SMALL_MARKER_ITS_HALF_SIDES = (
+_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = (
     1.2  # half sides of the central marker, which hides the large one
 )
 _TEXTURE_SIZE_PX = 320
@@ -513,7 +515,7 @@ class TargetOutline:
         points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
             from the target's centre, and unit normals (n, 2) from black to white.
         line_index: index (n,) of the straight line that contains the point.
-        print_sigma_half_sides: standard deviation (n,) of that line's print error.
+        print_error_sigma_half_sides: standard deviation (n,) of that line's print error.
         cell_width_half_sides: width (n,) of the adjacent cell.
         is_small_marker: True for edges of the small marker, (n,).
     """
@@ -521,7 +523,7 @@ class TargetOutline:
     points_half_sides: Array
     drawing_normal_to_white: Array
     line_index: NDArray[np.intp]
-    print_sigma_half_sides: Array
+    print_error_sigma_half_sides: Array
     cell_width_half_sides: Array
     is_small_marker: NDArray[np.bool_]
 
@@ -540,7 +542,7 @@ def make_outline(
 ) -> TargetOutline:
     """Return the edges of both markers as points. The tolerances are standard deviations of the
     position of a printed edge, in cells."""
-    hidden = _HIDDEN_BY_SMALL_MARKER_ITS_HALF_SIDES * drawing.small_to_large_side_ratio
+    hidden = _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
         for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
@@ -562,7 +564,7 @@ def make_outline(
         points_half_sides=np.concatenate(at),
         drawing_normal_to_white=np.repeat(normals, points_per_edge, axis=0),
         line_index=np.repeat([numbers[name] for name in names], points_per_edge),
-        print_sigma_half_sides=np.where(
+        print_error_sigma_half_sides=np.where(
             small, small_print_tolerance_cells, large_print_tolerance_cells
         )
         * cell,
@@ -573,14 +575,15 @@ def make_outline(
 
 @lru_cache(maxsize=8)
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
-    """Render the target and its white paper to `PAPER_REACH_LARGE_HALF_SIDES` from the centre."""
+    """Render the target and its white paper, out to `PAPER_REACH_LARGE_MARKER_HALF_SIDES` from the
+    centre."""
     axis = make_sampling_grid(
-        _TEXTURE_SIZE_PX, PAPER_REACH_LARGE_HALF_SIDES
+        _TEXTURE_SIZE_PX, PAPER_REACH_LARGE_MARKER_HALF_SIDES
     ).node_positions_half_sides
-    wide = render_cells(drawing, axis, PAPER_REACH_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
+    wide = render_cells(drawing, axis, PAPER_REACH_LARGE_MARKER_HALF_SIDES / _TEXTURE_SIZE_PX)
     more = (len(wide) - _TEXTURE_SIZE_PX) // 2
-    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_HALF_SIDES)
-    first = PAPER_REACH_LARGE_HALF_SIDES * scale - 0.5 + more
+    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_MARKER_HALF_SIDES)
+    first = PAPER_REACH_LARGE_MARKER_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
     return DrawingTexture(np.clip(wide, 0.0, 1.0), T)
 
@@ -646,7 +649,7 @@ _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     1.0,
 )
 _EDGE_SHIFT_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
-_PREDICTION_INFORMATION: Array = (
+_POSE_PREDICTION_INFORMATION: Array = (
     np.array(
         [
             _TILT_SIGMA_RAD,
@@ -705,15 +708,16 @@ class _EdgePoints:
     Attributes:
         points_px, image_normal_to_white: points (n, 2) px, and unit normals (n, 2) from black to
             white.
-        J: derivative (n, 7) of each point's motion along its normal with respect to rotation (rad),
-            translation (half sides) and the shift of all edges (px, white over black).
+        normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal with
+            respect to rotation (rad), translation (half sides) and the shift of all edges (px,
+            white over black).
         px_per_half_side: scale (n,) across the edge.
         outline_point_index: index (n,) of the point in the outline.
     """
 
     points_px: Array
     image_normal_to_white: Array
-    J: Array
+    normal_motion_jacobian: Array
     px_per_half_side: Array
     outline_point_index: NDArray[np.intp]
 
@@ -773,7 +777,7 @@ def fit_pose(
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
         pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_drawing_half_sides + step[3:])
         pose_and_edge_shift_change_from_start[:6] += step
-        moved_px = float(np.abs(edge_points.J[:, :6] @ step).max())
+        moved_px = float(np.abs(edge_points.normal_motion_jacobian[:, :6] @ step).max())
         if moved_px < _CONVERGED_FIT_PX:
             break
     if fit_step is None or not (
@@ -894,7 +898,7 @@ def _solve_gauss_newton_step(
     """Return one robust Gauss-Newton step; None if too few edges were found.
     `edge_offset_to_white_px` (n,) is the result of `_measure_offsets`. A prior pulls
     `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps, towards zero."""
-    J, weight = edge_points.J, is_edge_found.astype(np.float64)
+    J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
         error = edge_offset_to_white_px - J @ step
@@ -907,11 +911,11 @@ def _solve_gauss_newton_step(
         if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
         variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(_PREDICTION_INFORMATION)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_POSE_PREDICTION_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (
             J.T @ (weight * edge_offset_to_white_px) / variance
-            - _PREDICTION_INFORMATION * pose_and_edge_shift_change_from_start
+            - _POSE_PREDICTION_INFORMATION * pose_and_edge_shift_change_from_start
         )
     return _GaussNewtonStep(step, inverse, weight, variance)
 
@@ -919,17 +923,17 @@ def _solve_gauss_newton_step(
 def _make_pose_fit(
     pose: RigidPose, fit_step: _GaussNewtonStep, edge_points: _EdgePoints, outline: TargetOutline
 ) -> PoseFit:
-    J, (_, inverse, w, variance) = edge_points.J, fit_step
+    J, (_, inverse, w, variance) = edge_points.normal_motion_jacobian, fit_step
     line = outline.line_index[edge_points.outline_point_index]
     common_px = np.hypot(
-        outline.print_sigma_half_sides[edge_points.outline_point_index]
+        outline.print_error_sigma_half_sides[edge_points.outline_point_index]
         * edge_points.px_per_half_side,
         _WHOLE_LINE_OFFSET_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    cov = inverse @ (middle / variance**2 + np.diag(_PREDICTION_INFORMATION)) @ inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_POSE_PREDICTION_INFORMATION)) @ inverse
     shown = w > 0.0
     return PoseFit(
         pose=pose,

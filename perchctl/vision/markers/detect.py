@@ -22,7 +22,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
 from perchctl.values import replace
-from perchctl.vision.fields import interpolate_fields, interpolated_edge_sigma_px
+from perchctl.vision.fields import interpolate_fields, interpolated_field_edge_sigma_px
 from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
 from perchctl.vision.markers.corners import (
     CORNER_SIGMA_FROM_OTHER_MARKER_PX,
@@ -574,7 +574,9 @@ def _make_detection(
         r.remaining_edge_shift_sigma_px,
         cov_px2=r.cov_px2,
         row_jitter_sigma_px=r.row_jitter_sigma_px,
-        horizontal_side_extra_sigma_px=interpolated_edge_sigma_px(r.sharpest_side_blur_sigma_px)
+        horizontal_side_extra_sigma_px=interpolated_field_edge_sigma_px(
+            r.sharpest_side_blur_sigma_px
+        )
         if interpolated
         else 0.0,
     )
@@ -583,7 +585,7 @@ def _make_detection(
 # --- Motion of the markers from image to image, and their predicted positions ---
 
 
-_WEIGHTS_OF_MEAN_OF_FOUR: Array = np.full(4, 0.25)
+_MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
 _MAX_FLOW_AGE_S = 0.25  # older image motion does not predict positions
 
 
@@ -612,7 +614,7 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
             flow[name] = (b.corners_px - a.corners_px) / (current.t_s - previous.t_s)
     if not flow:
         return current
-    mean = _WEIGHTS_OF_MEAN_OF_FOUR @ next(iter(flow.values()))
+    mean = _MEAN_OF_FOUR_WEIGHTS @ next(iter(flow.values()))
     return replace(current, flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
 
 
@@ -624,7 +626,7 @@ _MIN_ACCURATE_LINE_FIT_CELL_PX = (
 )
 # the same limit as a ratio of a cell's width to the blur's standard deviation
 _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
-_MAX_ALIGN_MOTION_SIDES = 0.3  # share of the side
+_MAX_ALIGNMENT_MOTION_SIDES = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
 _MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12  # share of the side
 _DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5  # initial guess if the blur is unknown
@@ -679,7 +681,7 @@ def refine_photometrically(
             detector_input,
             name,
             start,
-            _MAX_ALIGN_MOTION_SIDES,
+            _MAX_ALIGNMENT_MOTION_SIDES,
             blur_px,
             max_corner_sigma_sides,
             is_single,

@@ -63,7 +63,7 @@ SAMPLES_PER_PROFILE = 16  # gradient samples per profile
 Floats = NDArray[np.float32]
 
 # positions along a side, between its margins
-SIDE_POSITIONS: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
+PROFILE_POSITIONS_ALONG_SIDE: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
 _SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(
     np.float32
 )
@@ -75,11 +75,13 @@ GRADIENT_POSITIONS_HALF_LENGTHS: Floats = (
     _SAMPLE_POSITIONS_HALF_LENGTHS[1:] + _SAMPLE_POSITIONS_HALF_LENGTHS[:-1]
 ) * np.float32(0.5)
 # Values and slopes at the profiles from a polynomial through the nodes.
-_SIDE_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
-_INVERSE_VANDERMONDE: Array = np.linalg.inv(_SIDE_NODES[:, None] ** np.arange(5.0))
-_NODES_TO_VALUES: Array = (SIDE_POSITIONS[:, None] ** np.arange(5)) @ _INVERSE_VANDERMONDE
-_NODES_TO_SLOPES: Array = (
-    np.arange(1, 5) * SIDE_POSITIONS[:, None] ** np.arange(4)
+_NODE_POSITIONS_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
+_INVERSE_VANDERMONDE: Array = np.linalg.inv(_NODE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5.0))
+_NODE_TO_PROFILE_VALUES_MATRIX: Array = (
+    PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5)
+) @ _INVERSE_VANDERMONDE
+_NODE_TO_PROFILE_SLOPES_MATRIX: Array = (
+    np.arange(1, 5) * PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(4)
 ) @ _INVERSE_VANDERMONDE[1:]
 
 
@@ -91,7 +93,7 @@ def profile_fractions_along_side(lengths_px: Array) -> Array:
     lines across the edge) cross the sides with lengths `lengths_px` (rows,). The profiles keep a
     margin from the corners, where the next side blurs the edge."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
-    return np.asarray(margin + (0.5 - margin) * (1.0 + SIDE_POSITIONS))
+    return np.asarray(margin + (0.5 - margin) * (1.0 + PROFILE_POSITIONS_ALONG_SIDE))
 
 
 def make_side_profiles(
@@ -108,15 +110,15 @@ def make_side_profiles(
     `fractions_along_side` (rows, n) come from `profile_fractions_along_side`. The image of a side
     through the lens is a smooth curve, so it is computed at five points and interpolated."""
     first, last = fractions_along_side[:, :1], fractions_along_side[:, -1:]
-    at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
+    at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODE_POSITIONS_ALONG_SIDE)[..., None]
     points = (
         side_starts_normalised[:, None]
         + at * (side_ends_normalised - side_starts_normalised)[:, None]
     )
     nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
-    origin = np.matmul(_NODES_TO_VALUES, nodes)
+    origin = np.matmul(_NODE_TO_PROFILE_VALUES_MATRIX, nodes)
     # As complex numbers x + iy, a quarter turn is a single product.
-    tangent = np.matmul(_NODES_TO_SLOPES, nodes).view(np.complex128)
+    tangent = np.matmul(_NODE_TO_PROFILE_SLOPES_MATRIX, nodes).view(np.complex128)
     normal = tangent * (_ROTATE_90_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
 
@@ -201,8 +203,10 @@ CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
 _PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
 _PROFILE_ONES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
-_WEIGHTS_OF_MEAN_OF_FOUR: Array = np.full(4, 0.25)
-_ZERO_MEAN_PARABOLA: Array = SIDE_POSITIONS**2 - (SIDE_POSITIONS**2).mean()
+_MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
+_ZERO_MEAN_PARABOLA: Array = (
+    PROFILE_POSITIONS_ALONG_SIDE**2 - (PROFILE_POSITIONS_ALONG_SIDE**2).mean()
+)
 _MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
 
 
@@ -256,7 +260,7 @@ def _refine_lines_once(
         np.count_nonzero(outer_edges.profile_greys[:, :, -1] > CLIPPED_GREY, axis=1)
         / PROFILES_PER_SIDE
     )
-    is_white_clipped = glaring.reshape(-1, 4) @ _WEIGHTS_OF_MEAN_OF_FOUR > MIN_CLIPPED_FRACTION
+    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light.
         return _refine_lines_once(image, raw_corners_px, cells_along_border, camera, None)
@@ -448,7 +452,7 @@ def _side_bow_px(
     )
     mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
     bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
-    mean_px = float(bow_px @ _WEIGHTS_OF_MEAN_OF_FOUR)
+    mean_px = float(bow_px @ _MEAN_OF_FOUR_WEIGHTS)
     noise_px = 0.25 * math.sqrt(float((rms_residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
 
@@ -456,7 +460,7 @@ def _side_bow_px(
 def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners_normalised
-    out = (corners - (_WEIGHTS_OF_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
+    out = (corners - (_MEAN_OF_FOUR_WEIGHTS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
 
 
@@ -596,7 +600,7 @@ def prepare_marker_sides(
         return None
     along = corners.take(NEXT_CORNER, axis=1) - corners
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
-    cell_size_px = sides_px @ _WEIGHTS_OF_MEAN_OF_FOUR / cells
+    cell_size_px = sides_px @ _MEAN_OF_FOUR_WEIGHTS / cells
     return MarkerSides(
         raw_corners_px=raw_corners_px,
         cells_along_border=cells_along_border,
@@ -727,7 +731,7 @@ def find_neighbour_edges(
 # on the side's own line. Values per side are (rows,), values per profile (rows, n).
 
 
-_SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
+_PROFILE_POSITIONS_ALONG_SIDE_F32 = PROFILE_POSITIONS_ALONG_SIDE.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
 _MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9  # share of the gradient that neighbouring edges may cause
@@ -736,7 +740,9 @@ _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
 _WIDE_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
-_SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
+_PROFILE_POSITION_POWERS: Floats = (PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(3)).astype(
+    np.float32
+)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
 _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = (
     0.3  # a profile is usable if its gradient is at least this share of the row's mean
@@ -747,18 +753,18 @@ _MAX_WIDE_WINDOW_ERROR_PX = (
 )
 _MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
-_OUT_OF_RANGE = 1e6
-_QUARTER_PROFILES = PROFILES_PER_SIDE // 4
-_QUARTER_ONES: Floats = np.ones(_QUARTER_PROFILES, dtype=np.float32)
+_OUT_OF_RANGE_PX = 1e6
+_PROFILES_PER_QUARTER_SIDE = PROFILES_PER_SIDE // 4
+_QUARTER_SIDE_ONES: Floats = np.ones(_PROFILES_PER_QUARTER_SIDE, dtype=np.float32)
 # The line through the values in the middles of both halves of the profiles, (2, n).
-_HALF_MIDMEANS_TO_SLOPE: Floats = _SIDE_POSITIONS_F32 * (
-    0.5 / float(SIDE_POSITIONS[PROFILES_PER_SIDE // 2 :].mean())
+_HALF_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
+    0.5 / float(PROFILE_POSITIONS_ALONG_SIDE[PROFILES_PER_SIDE // 2 :].mean())
 )
 _HALF_MIDMEANS_TO_LINE: Floats = np.stack(
     [0.5 - _HALF_MIDMEANS_TO_SLOPE, 0.5 + _HALF_MIDMEANS_TO_SLOPE]
 )
-_MEDIAN_NEUTRAL_FILL: Floats = np.where(
-    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE, -_OUT_OF_RANGE
+_MEDIAN_PRESERVING_FILL_PX: Floats = np.where(
+    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE_PX, -_OUT_OF_RANGE_PX
 ).astype(np.float32)
 
 
@@ -911,16 +917,16 @@ def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bo
     """Fit a line to each side through the midmeans (the means of the middle 50 %) of the offsets in
     both halves of its profiles. Up to a quarter of the profiles in each half may be outliers.
     Returns the line's offsets (rows, n)."""
-    halves = np.where(is_usable, edge_offsets_px, _MEDIAN_NEUTRAL_FILL).reshape(
-        -1, 2, 2 * _QUARTER_PROFILES
+    halves = np.where(is_usable, edge_offsets_px, _MEDIAN_PRESERVING_FILL_PX).reshape(
+        -1, 2, 2 * _PROFILES_PER_QUARTER_SIDE
     )
     halves.sort(axis=2)
-    first = _QUARTER_PROFILES // 2
-    middle = halves[:, :, first : first + _QUARTER_PROFILES]
+    first = _PROFILES_PER_QUARTER_SIDE // 2
+    middle = halves[:, :, first : first + _PROFILES_PER_QUARTER_SIDE]
     # Excluded before the sum: next to huge values, an edge's position would be rounded away.
-    shown = np.abs(middle) < _OUT_OF_RANGE
-    count = shown @ _QUARTER_ONES
-    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
+    shown = np.abs(middle) < _OUT_OF_RANGE_PX
+    count = shown @ _QUARTER_SIDE_ONES
+    mean = (middle * shown) @ _QUARTER_SIDE_ONES / np.maximum(count, 1.0)
     return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALF_MIDMEANS_TO_LINE)
 
 
@@ -939,19 +945,19 @@ def _fit_robust_line(
         weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
         weight *= is_usable
-        w = weight.dot(_SIDE_POWERS)
-        e = (weight * edge_offsets_px).dot(_SIDE_POWERS)
+        w = weight.dot(_PROFILE_POSITION_POWERS)
+        e = (weight * edge_offsets_px).dot(_PROFILE_POSITION_POWERS)
         w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
         slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, 1e-9)
-        line = slope[:, None] * (_SIDE_POSITIONS_F32 - middle[:, None])
+        line = slope[:, None] * (_PROFILE_POSITIONS_ALONG_SIDE_F32 - middle[:, None])
         line += mean[:, None]
     return line, weight
 
 
 def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     """Return each row's median over its usable values, (rows,); 0 if it has none."""
-    values = np.where(is_usable, values, _MEDIAN_NEUTRAL_FILL)
+    values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
-    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE, found, 0.0))
+    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE_PX, found, 0.0))

@@ -35,7 +35,7 @@ from perchctl.vision.markers.corners import (
     SIDE_OUTWARD_NORMALS,
     RefinedCorners,
     apply_homography,
-    corners_by_increment_jacobian,
+    corners_jacobian_wrt_homography_increment,
     homography_from_centred_square,
     increment_homography,
     is_inside_image,
@@ -230,7 +230,7 @@ def _make_refined_corners(
     cell_size_px = side_px / pattern.cells_along_border.cells_per_side
     # The square alone; `remaining_edge_shift_sigma_px` covers the uncertainty of the shift of all
     # edges.
-    J = corners_by_increment_jacobian(H_pinhole_marker)
+    J = corners_jacobian_wrt_homography_increment(H_pinhole_marker)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = (
         MIN_LINE_SIGMA_PX**2

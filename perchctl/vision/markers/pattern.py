@@ -26,7 +26,9 @@ MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = (
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
-_SMALL_MARKER_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
+_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = (
+    1.25  # half sides of a central marker that may hide cells
+)
 _SAMPLE_OFFSETS_CELLS: Array = np.array(
     [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
 )
@@ -115,7 +117,7 @@ def make_marker_pattern(
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_CELLS))
     free = (
         np.abs(sample_points_half_sides).max(axis=1)
-        > _SMALL_MARKER_COVER_HALF_SIDES * drawing.small_to_large_side_ratio
+        > _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     )
     kept = np.unique(owner[free])
     turns, at = [], sample_points_half_sides[free]
@@ -233,7 +235,7 @@ def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Ar
 # --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_COMPARED_WHITE_MARGIN_CELLS = 0.6  # white around the border
+_FITTED_WHITE_MARGIN_CELLS = 0.6  # white around the border
 BLUR_MARGIN_NODES = 12
 """Number of additional nodes on all sides, for the blur."""
 
@@ -256,7 +258,7 @@ class MarkerDrawing:
     def photometric_fit_reach_half_sides(self) -> float:
         """Half the side of the square that the photometric fit compares with the image, in half
         sides of the marker."""
-        return 1.0 + _COMPARED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
+        return 1.0 + _FITTED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
 def make_marker_drawing(

@@ -35,7 +35,7 @@ from perchctl.vision.lens import distort_to_px, undistort_px
 from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     apply_homography,
-    corners_by_increment_jacobian,
+    corners_jacobian_wrt_homography_increment,
     homography_from_centred_square,
     increment_homography,
 )
@@ -56,7 +56,7 @@ _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 """Number of rounds after which the fit fails unless its correlation reaches
 `_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two rounds."""
 _CONVERGED_STEP_PX = 0.05  # after a step this small, the next one is usually a tenth of it
-_MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
+_MAX_DISTORTION_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
 _MAX_HOMOGRAPHY_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
 # Standard deviations of the shape from its start, in half sides: rotations and scales; the
 # perspective.
@@ -73,7 +73,7 @@ _MIN_GAIN_GREY = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 # indices of the unknowns: increment, blur, light
 _SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
-_INCREMENT_PRIOR_INFORMATION: Array = (
+_HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
     np.array(
         [
             _SHAPE_SIGMA,
@@ -130,17 +130,19 @@ class _NormalEquations:
         contrast_grey: grey levels from black to white.
         grey_residual: grey values of the image minus those of the drawing under the best-fitting
             illumination, (n * n,).
-        J: derivatives of the drawing's grey values with respect to the unknowns (k, n * n).
+        grey_jacobian: derivatives (k, n * n) of the drawing's grey values with respect to the
+            unknowns.
         noise_variance_grey2: variance of a residual.
-        N, g: normal equations N x = g of the next increment, divided by that variance.
+        normal_matrix, right_hand_side: N and g of the normal equations N x = g for the next
+            increment x, both divided by that variance.
     """
 
     contrast_grey: float
     grey_residual: Array
-    J: Array
+    grey_jacobian: Array
     noise_variance_grey2: float
-    N: Array
-    g: Array
+    normal_matrix: Array
+    right_hand_side: Array
 
 
 def align_drawing(
@@ -167,8 +169,8 @@ def align_drawing(
     )
     node_px, cell_size_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
     grid, H_pinhole_marker = make_sampling_grid(n, reach), homography_from_centred_square(start)
-    node_lens_shift_px = lens_shift_px(grid, H_pinhole_marker, camera)
-    patch = _extract_patch(image, grid, H_pinhole_marker, node_lens_shift_px)
+    node_distortion_shift_px = lens_distortion_shift_px(grid, H_pinhole_marker, camera)
+    patch = _extract_patch(image, grid, H_pinhole_marker, node_distortion_shift_px)
     if patch is None:
         return None
     around, first = patch
@@ -180,18 +182,18 @@ def align_drawing(
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_size_px)
 
     rendered_drawing = drawn(limit_blur_px(initial_blur_sigma_px))
-    lens_shift_minus_patch_corner_px, since_lens_px, homography_increment_from_start = (
-        node_lens_shift_px - first,
+    distortion_shift_minus_patch_corner_px, since_lens_px, homography_increment_from_start = (
+        node_distortion_shift_px - first,
         0.0,
         np.zeros(8),
     )
     for k in range(_MAX_ITERATIONS):
-        if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
-            lens_shift_minus_patch_corner_px, since_lens_px = (
-                lens_shift_px(grid, H_pinhole_marker, camera) - first,
+        if since_lens_px > _MAX_DISTORTION_REUSE_MOTION_PX:
+            distortion_shift_minus_patch_corner_px, since_lens_px = (
+                lens_distortion_shift_px(grid, H_pinhole_marker, camera) - first,
                 0.0,
             )
-        grey = _sample_patch(around, grid, H_pinhole_marker, lens_shift_minus_patch_corner_px)
+        grey = _sample_patch(around, grid, H_pinhole_marker, distortion_shift_minus_patch_corner_px)
         equations = _linearize_greys(grey, rendered_drawing, homography_increment_from_start)
         if equations is None:
             return None
@@ -200,7 +202,9 @@ def align_drawing(
             and fit_correlation(grey, equations.grey_residual) < _MIN_EARLY_CORRELATION
         ):
             return None
-        step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
+        step = np.asarray(
+            np.linalg.solve(equations.normal_matrix, equations.right_hand_side), dtype=np.float64
+        )
         p = step[_SHAPE_SLICE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT):
             return None
@@ -217,7 +221,7 @@ def align_drawing(
         drawn_px = rendered_drawing.blur_sigma_nodes * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_size_px):
             rendered_drawing = drawn(wanted_px)
-        elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_LENS_REUSE_MOTION_PX:
+        elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX:
             break
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
@@ -229,11 +233,11 @@ def align_drawing(
     nodes_per_independent_sample = _estimate_nodes_per_independent_sample(
         grey_residual.reshape(n, n)
     )
-    inverse_normal_matrix = np.asarray(np.linalg.inv(equations.N))
+    inverse_normal_matrix = np.asarray(np.linalg.inv(equations.normal_matrix))
     worst_cell_flip_fraction, largest_cell_flip_fraction_sigma = _measure_worst_cell_flip_fraction(
         rendered_drawing, equations, inverse_normal_matrix, nodes_per_independent_sample
     )
-    J = corners_by_increment_jacobian(H_pinhole_marker)
+    J = corners_jacobian_wrt_homography_increment(H_pinhole_marker)
     variance = (
         float(
             np.trace(
@@ -284,8 +288,8 @@ def _linearize_greys(
     N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
-    N[range(8), range(8)] += _INCREMENT_PRIOR_INFORMATION
-    g[_SHAPE_SLICE] -= _INCREMENT_PRIOR_INFORMATION * homography_increment_from_start
+    N[range(8), range(8)] += _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION
+    g[_SHAPE_SLICE] -= _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION * homography_increment_from_start
     return _NormalEquations(contrast_grey, grey_residual, J, noise, N, g)
 
 
@@ -320,7 +324,9 @@ def _measure_worst_cell_flip_fraction(
     )
     n, m = soft.shape
     found = contrast_grey * (soft.T @ equations.grey_residual.reshape(n, n) @ soft).ravel()
-    shared = contrast_grey * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
+    shared = contrast_grey * (soft.T @ equations.grey_jacobian.reshape(-1, n, n) @ soft).reshape(
+        -1, m * m
+    )
     squared = (soft**2).sum(axis=0)
     energy = contrast_grey**2 * np.outer(squared, squared).ravel()
     taken = np.einsum("ij,ij->j", shared, (inverse_normal_matrix / noise).dot(shared))
@@ -407,7 +413,7 @@ def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Arra
 # --- A grid over a marker in its own coordinates, and the image at its nodes ---
 
 
-_CHEBYSHEV_NODES = 9  # per side
+_CHEBYSHEV_NODES_PER_AXIS = 9  # per side
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,22 +461,26 @@ def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
     return distort_to_px(rays, camera).T
 
 
-def lens_shift_px(grid: SamplingGrid, H_pinhole_marker: Array, camera: CameraModel) -> Array:
+def lens_distortion_shift_px(
+    grid: SamplingGrid, H_pinhole_marker: Array, camera: CameraModel
+) -> Array:
     """Return the shift of each node due to lens distortion, px (2, n * n), interpolated from a few
     nodes."""
     node_uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H_pinhole_marker, node_uv1)
-    shift = (distort_px(pin, camera) - pin).reshape(2, _CHEBYSHEV_NODES, _CHEBYSHEV_NODES)
+    shift = (distort_px(pin, camera) - pin).reshape(
+        2, _CHEBYSHEV_NODES_PER_AXIS, _CHEBYSHEV_NODES_PER_AXIS
+    )
     return np.asarray((between @ shift @ between.T).reshape(2, -1))
 
 
 @lru_cache(maxsize=64)
 def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
-    """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES^2), and the weights (n,
-    _CHEBYSHEV_NODES) for the grid's own nodes."""
+    """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES_PER_AXIS^2), and the weights (n,
+    _CHEBYSHEV_NODES_PER_AXIS) for the grid's own nodes."""
     reach = float(grid.node_positions_half_sides[-1])
-    x = chebyshev.chebpts2(_CHEBYSHEV_NODES)
-    degree = _CHEBYSHEV_NODES - 1
+    x = chebyshev.chebpts2(_CHEBYSHEV_NODES_PER_AXIS)
+    degree = _CHEBYSHEV_NODES_PER_AXIS - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
     return _grid_coordinates(reach * x), chebyshev.chebvander(
         grid.node_positions_half_sides / reach, degree
@@ -478,12 +488,15 @@ def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
 
 
 def _extract_patch(
-    image: NDArray[np.uint8], grid: SamplingGrid, H_pinhole_marker: Array, node_lens_shift_px: Array
+    image: NDArray[np.uint8],
+    grid: SamplingGrid,
+    H_pinhole_marker: Array,
+    node_distortion_shift_px: Array,
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the part of the image that contains all nodes, and the position (2, 1) of its top-left
     pixel; None if a node is outside the image."""
     h, w = image.shape
-    x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_lens_shift_px
+    x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_distortion_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
@@ -498,14 +511,14 @@ def _sample_patch(
     patch: NDArray[np.float32],
     grid: SamplingGrid,
     H_pinhole_marker: Array,
-    lens_shift_minus_patch_corner_px: Array,
+    distortion_shift_minus_patch_corner_px: Array,
 ) -> Array:
     """Return the grey values (n * n,) of the patch at the nodes projected by `H_pinhole_marker` and
-    shifted by `lens_shift_minus_patch_corner_px` (2, n * n): the lens distortion at each node minus
-    the position of the patch's top-left pixel."""
-    at = (project_nodes(H_pinhole_marker, grid.node_uv1) + lens_shift_minus_patch_corner_px).astype(
-        np.float32
-    )
+    shifted by `distortion_shift_minus_patch_corner_px` (2, n * n): the lens distortion at each node
+    minus the position of the patch's top-left pixel."""
+    at = (
+        project_nodes(H_pinhole_marker, grid.node_uv1) + distortion_shift_minus_patch_corner_px
+    ).astype(np.float32)
     x, y = at.reshape(2, grid.nodes_per_side, grid.nodes_per_side)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
