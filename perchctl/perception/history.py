@@ -32,8 +32,8 @@ class History:
     """Telemetry of the last `KEEP_S`, oldest first, plus one earlier sample, so that the samples
     cover all of that time at any sample rate.
 
-    `jumped`: True if the state estimate jumped within the newest samples. `turned_rad`: largest
-    change of the heading within the newest samples in excess of any possible rotation.
+    `jumped`: True if the state estimate jumped within the newest samples. `turned_rad`: by how
+    much, at most, a heading change within the newest samples exceeds any possible rotation.
     `battery_changed_s`: time at which the battery's reading first arrived or last changed. `imu`:
     motion from the accelerometer over the whole flight.
     """
@@ -59,9 +59,10 @@ def add_samples(
 ) -> History:
     """Return the history with new samples.
 
-    `jumped` and `turned_rad` describe the new samples; with `late`, also the earlier samples of the
-    same tick. A sample without position or velocity gets both from the previous sample. Other
-    samples with NaN, and samples that are out of order, are dropped (fault 35).
+    `jumped` and `turned_rad` describe the new samples; if `late` is True, they also cover the
+    earlier samples of the same tick. A sample without position or velocity gets both from the
+    previous sample. Other samples with NaN, and samples that are out of order, are dropped (fault
+    35).
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
@@ -148,8 +149,8 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
 
 
 def _turned_rad(a: Telemetry, b: Telemetry) -> float:
-    """Return by how much the heading changed between two samples in excess of any possible
-    rotation, rad."""
+    """Return the part of the heading change between two samples, rad, that exceeds any possible
+    rotation."""
     return abs(wrap_rad(b.yaw_rad - a.yaw_rad)) - FASTEST_TURN_RADPS * (b.t_s - a.t_s)
 
 
@@ -163,7 +164,7 @@ def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
 
 def _between_s(a: Telemetry, b: Telemetry) -> float:
     """Return the time between two position measurements, s, taking into account how old each
-    position was in its sample."""
+    position was when its sample was taken."""
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 

@@ -23,8 +23,8 @@ from perchctl.vision import CameraCalibrationErrors, MarkerPose, PoseSetup, Vehi
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
 LIKELY_S = 0.02
-"""Standard deviation of the delay below which the factors of the next images are computed with
-that delay, s."""
+"""Once the standard deviation of the delay is below this value, s, the factors of the next images
+are computed with the estimated delay."""
 USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
 oscillate."""
@@ -32,11 +32,12 @@ SLEW = 0.02
 """Rate at which the applied latency changes, s/s: at 0.4 m/s, the target appears to move by 8 mm/s,
 as with a drift."""
 FAST_SLEW = 0.5
-"""The same rate while images and accelerometer agree on a very different latency. It is below 1
-because the images' times would otherwise run backwards. Smaller: a vehicle with late positions
-oscillates for longer."""
+"""Rate at which the applied latency changes, s/s, while images and accelerometer agree on a very
+different latency. This rate is below 1 because the images' times would otherwise run backwards.
+Smaller: a vehicle with late positions oscillates for longer."""
 CHANGED_S = 0.05
-"""Difference from a certain estimate above which the latency has changed in flight, s."""
+"""If a correction differs from a certain estimate by more than this value, s, the latency has
+changed in flight."""
 UNKNOWN_SIGMA_S = (USED_LATENCY_S[1] - USED_LATENCY_S[0]) / math.sqrt(12.0)
 """Standard deviation of a latency that may be anywhere within `USED_LATENCY_S`, s."""
 LONGEST_STEP_S = 0.1
@@ -47,11 +48,11 @@ LONGEST_STEP_S = 0.1
 class OnlineCalibration:
     """Estimate of the camera's latency and mounting from images and telemetry.
 
-    `newest` is the solution of `sums` at `solved_s`. All latencies are in excess of the profile's.
-    `applied_delay_s` is the latency that is subtracted from the images' times since the image at
-    `last_picture_s`. `coarse_delay_s` is the goal of a correction in progress; None once it is
-    reached. `changed_s` contains the old and the new value, s, of the newest change of a latency
-    that had already been certain.
+    `newest` is the solution of `sums` at `solved_s`. All latencies are relative to the profile's
+    latency. `applied_delay_s` is the latency that is subtracted from the images' times since the
+    image at `last_picture_s`. `coarse_delay_s` is the goal of a correction in progress; None once
+    it is reached. If a latency that was already certain has changed, `changed_s` contains its old
+    and new values, s, at the newest change.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
@@ -64,8 +65,8 @@ class OnlineCalibration:
 
     @property
     def delay_sigma_s(self) -> float:
-        """Standard deviation of a measured latency, s: that of `newest`, limited to that of an
-        unknown latency."""
+        """Standard deviation of a measured latency, s: the one in `newest`, but at most the
+        standard deviation of an unknown latency."""
         if self.newest is None:
             return UNKNOWN_SIGMA_S
         return min(UNKNOWN_SIGMA_S, self.newest.latency_sigma_s)
@@ -79,8 +80,7 @@ def update_calibration(
     setup: PoseSetup,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more image in its sums and, once a second, the solution of the
-    sums.
+    """Return the estimate after adding one image to its sums and, once a second, solving them.
 
     `t_s` is the image's arrival time minus the profile's latency. A pose is ignored if it is not
     finite or too close, or if the attitude at its time is unknown.
@@ -108,14 +108,14 @@ def update_calibration(
 def apply_latency(
     old: OnlineCalibration, t_s: float, start_latency_s: float, correction_s: float | None
 ) -> OnlineCalibration:
-    """Return the calibration with the latency by which the next image's time is to be corrected,
-    for `camera.latency_s: measured`; `t_s` as in `update_calibration`.
+    """Return the calibration with the latency that is to be subtracted from the next image's time
+    if the profile has `camera.latency_s: measured`. `t_s` is as in `update_calibration`.
 
     If the accelerometer shows that the latency is far from the one in use,
     `VisualInertialWindow.correction_s` is set, and is applied within half a second. The sums would
-    take several seconds to converge, and meanwhile a vehicle that flies by the target alone would
-    oscillate. A certain solution of the sums is more accurate and is approached slowly. Sums that
-    contradict the correction belong to an earlier latency, and are restarted.
+    take several seconds to converge, and a vehicle whose only position source is the target would
+    oscillate meanwhile. A certain solution of the sums is more accurate and is approached slowly.
+    Sums that contradict the correction belong to an earlier latency, and are restarted.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
     sure_s = (
@@ -140,44 +140,46 @@ def apply_latency(
 
 
 # --- Estimation of latency and mounting from a flight ---
-# If the images are later than the profile says by d, the target appears displaced by d times the
-# speed at which the vehicle's translation and rotation sweep the line of sight. If the camera is
-# rotated, the target appears displaced by the rotation times the vector to it. The target's
-# position in the estimate's world is therefore linear in the delay and the rotation, and one
-# least-squares fit over a flight yields both.
+# If the camera's latency exceeds the profile's by d, the target appears displaced by d times the
+# speed at which the vehicle's translation and rotation sweep the line of sight. If the camera's
+# mounting is rotated, the target appears displaced by the rotation times the vector to the target.
+# The target's position in the estimate's world is therefore linear in the delay and the rotation,
+# and one least-squares fit over a flight yields both.
 #
 # The remaining variation of the position is not white noise: the vehicle's estimate is a random
-# walk with drift. Each row (`X`, `Y`, `HEADING`) and the factors therefore pass the Kalman filter
-# of a random-walk level, and the sums contain the innovations (de Jong 1991, "The diffuse Kalman
-# filter").
+# walk with drift. A Kalman filter for a random-walk level therefore filters each row (`X`, `Y`,
+# `HEADING`) together with its factors, and the sums contain the innovations (de Jong 1991, "The
+# diffuse Kalman filter").
 
 
 X, Y, HEADING = range(3)
-"""Rows of a frame's measurement."""
+"""Rows of a frame's measurement: x, y and heading of the target."""
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
-"""Columns: the position (rad for the heading), and the possible causes of its motion."""
+"""Columns of a frame's measurement: the target's position (rad in the row `HEADING`), and the
+possible causes of its apparent motion."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
 """Prior standard deviations of all columns but the first."""
 
 ATTITUDE_STEP_S = 0.02
 """Half the time difference over which speeds are computed, s."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
-"""Noise of the vehicle's speed and rotation rates; a motion that is not well above it counts as
-rest."""
+"""Noise of the vehicle's speed and rotation rates; a motion that is not well above this noise
+counts as rest."""
 PICTURE_JITTER_S = 0.008
-"""Jitter of single images' times, s."""
+"""Jitter of each image's time, s."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
-"""Lower bounds of the rows' noise, standard deviations."""
+"""Lower bounds for the noise of the rows, as standard deviations."""
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
-"""Random walk of the estimate's position and attitude within one second, standard deviations."""
+"""Random walk of the estimated position and attitude within one second, as standard deviations."""
 MOST_GAP_S = 0.5
 """Longest gap between frames, s; after a longer one, the level restarts."""
 GATE_SIGMAS = 5.0
 """Number of standard deviations beyond which a change of the target's position counts as a jump."""
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
-"""Factors for the gate beyond the noise: 200 ms, and 0.4 rad."""
+"""Delay (0.2 s) and mounting rotations (0.4 rad) up to which they may explain a change of the
+target's position that exceeds the noise; a larger change counts as a jump."""
 LEAST_RANGE_M = 0.15
-"""Least range of the target, m; at closer range, the line of sight hardly moves and the press
+"""Minimum range of the target, m; at closer range, the line of sight hardly moves and the press
 follows soon."""
 STAMPS_S = 0.003
 """Errors of the time stamps of telemetry and exposure that averaging does not reduce, s."""
@@ -185,12 +187,12 @@ LARGE_TURN = 0.03
 """Relative error of the estimate if the rotation is large, because the speeds assume the profile's
 mounting."""
 LEAST_FRAMES = 30
-"""Number of frames that a solution requires."""
+"""Minimum number of frames for a solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConsistencySums:
-    """A flight's sums for `solve_consistency`.
+    """Sums over the frames of a flight, for `solve_consistency`.
 
     `level` (3, 8) contains the filtered rows, and `variance` (3,) their variance after the newest
     frame; `level` is None before the first frame. `information` (8, 8) is the information matrix of
@@ -213,8 +215,8 @@ def consistency_rows(
     delay_s: float,
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
-    """Return a frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
-    variance (3,) of each row's noise; and the target's range, m.
+    """Return three values for a frame: its rows (3, 8) for x, y and heading, with the columns
+    `PLACE` to `DRIFT_Y`; the variance (3,) of each row's noise; and the target's range, m.
 
     `before` and `after` are the vehicle's attitudes `ATTITUDE_STEP_S` before and after the frame's
     time minus `delay_s`, the probable delay. `velocity_mps` is the vehicle's velocity at that time.
@@ -258,7 +260,7 @@ def _above(size: float, noise: float) -> float:
 
 
 def _upper_rows(attitude: VehicleState) -> tuple[tuple[float, float, float], ...]:
-    """Return the first two rows of ``R_world_body`` without arrays."""
+    """Return the first two rows of ``R_world_body`` as plain tuples."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -277,7 +279,8 @@ def add_rows(
 ) -> ConsistencySums:
     """Return the sums with one more frame, given by its `consistency_rows`.
 
-    After a gap or a jump, the level is restarted; the information on delay and rotation is kept.
+    After a gap or a jump, the filtered level restarts at the new rows; the information on delay and
+    rotation is kept.
     """
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -309,7 +312,8 @@ def add_rows(
 def solve_consistency(
     sums: ConsistencySums, attitude_sigma_rad: float
 ) -> CameraCalibrationErrors | None:
-    """Return the errors of latency and mounting; None if the frames cover less than a second.
+    """Return the errors of latency and mounting; None if the sums contain fewer than `LEAST_FRAMES`
+    frames.
 
     `attitude_sigma_rad` is the standard deviation of the bias of the estimated roll and pitch.
     """

@@ -2,7 +2,7 @@
 
 Flying, tracking, measuring the mounting and replaying all use a `Perception`. It decides whether a
 frame can be used as a measurement, separates the fields of an interlaced frame, runs each image
-through the pipeline of `perchctl.vision`, and keeps the required memory.
+through the pipeline of `perchctl.vision`, and remembers what later frames need.
 """
 
 from __future__ import annotations
@@ -41,12 +41,13 @@ from perchctl.vision import (
 )
 
 MIRRORED_FRAMES = 5
-"""Number of successive frames that show a mirrored target."""
+"""Number of successive frames with a mirrored target after which the camera image counts as
+mirrored."""
 
 
 @dataclass(eq=False)
 class Perception:
-    """Estimates the target from the frames of one stream, with everything that is remembered
+    """Estimates the target from the frames of one stream, and stores everything that it remembers
     between frames.
 
     Attributes:
@@ -55,8 +56,8 @@ class Perception:
         attitude: function that returns the vehicle's attitude at a given time; used instead of the
             history.
         state: the pipeline's memory.
-        calibration, motion: estimates of latency and mounting, and of the vehicle's motion, from
-            images and telemetry.
+        calibration, motion: estimates from images and telemetry: of the camera's latency and
+            mounting, and of the vehicle's motion.
         refused: why a target was rejected as belonging to another vehicle; None if none was.
         health: decides whether a frame can be used as a measurement.
     """
@@ -71,7 +72,7 @@ class Perception:
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
     attitude: Callable[[float], VehicleState | None] | None = None
-    _mirrored: int = 0  # successive frames with the target's mirror image
+    _mirrored: int = 0  # number of successive frames that show the target's mirror image
 
     def exposure_s(self, frame: Frame) -> float:
         """Return the best estimate of a frame's exposure time, s, on the loop's clock.
@@ -82,8 +83,8 @@ class Perception:
         return frame.t_s - self.calibration.applied_delay_s
 
     def process_fields(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput]]:
-        """Yield each field of an interlaced frame, or the whole frame, with its time of exposure,
-        and the pipeline's output. `frame` is the frame as received from its source."""
+        """Yield each field of an interlaced frame, or the whole frame, with its exposure time,
+        together with the pipeline's output. `frame` is the frame as received from its source."""
         used_s = self.calibration.applied_delay_s
         frame = replace(frame, t_s=self.exposure_s(frame)) if used_s else frame
         if self.stills:
@@ -111,8 +112,8 @@ class Perception:
         return self._mirrored >= MIRRORED_FRAMES
 
     def target(self, t_s: float) -> TargetEstimate | None:
-        """Return the target's pose at `t_s` (now) for the vehicle's newest attitude; None before
-        the first sighting."""
+        """Return the target estimate at the current time `t_s`, for the vehicle's newest attitude;
+        None before the first sighting."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline)

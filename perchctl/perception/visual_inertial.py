@@ -1,4 +1,4 @@
-"""Check that the images show the same motion as the accelerometer measures.
+"""Check that the images show the motion that the accelerometer measures.
 
 Take the vector from the body to the target, rotated by the attitude at the exposure, and add the
 body's own motion from the accelerometer. This sum is a fixed position, except for the unknown speed
@@ -35,33 +35,35 @@ AGREED = 3
 """Number of successive checks that must agree. Larger: a mismatch is found later. Smaller: a false
 mismatch may be reported."""
 AGREED_MEASURED = 2
-"""The same number for a latency that is measured in flight. It can be smaller because a false
-correction is undone, and at ten images per second a third check would take another tenth of a
-second."""
+"""Number of successive checks that must agree if the latency is measured in flight. It can be
+smaller than `AGREED` because a false correction is undone, and at ten images per second a third
+check would take another tenth of a second."""
 STEP_S = 0.02
 """Step of the delay hypotheses, s."""
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
-"""The hypotheses: delays beyond the profile's without rotation, then rotations of the camera at the
-delay in use."""
-# standard deviations of the offset (with 1 deg of attitude) and of a sighting
+"""Camera rotation of each hypothesis, rad: zero for the hypotheses with a delay (`_DELAYS_S`,
+beyond the profile's), then the rotations, which are tested at the delay in use."""
+# standard deviations of the acceleration's offset (including 1 deg of attitude error) and of a
+# sighting
 OFFSET_MPS2, SIGMA_M = 0.2, 0.003
 # a smaller error only makes the alignment oscillate by centimetres, and is reported after the
 # flight
 LEAST_LATER_S = 0.1
 BEYOND_S = 0.03
-"""Tolerance of a measured latency beyond the usable range, s: the step of the grid plus an image's
-jitter. Larger: an error that cannot be corrected counts as correctable."""
+"""By how much a measured latency may be outside the usable range, s: the step of the grid plus the
+jitter of an image's time. Larger: an error that cannot be corrected counts as correctable."""
 MEASURED_LATER_S = 0.03
 """Smallest error of a measured latency that is corrected here, s; a smaller one is left to the more
 accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment
-oscillates for longer. Smaller: the step of the grid and the jitter of single images count as an
+oscillates for longer. Smaller: the step of the grid and the jitter of an image's time count as an
 error."""
-# least motion of the sum, m, and least ratio to its motion with the best hypothesis, for a mismatch
+# For a mismatch, the sum must move by at least this distance, m, and by at least this multiple of
+# its motion under the best hypothesis.
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
 ROUGH_M = 0.03  # a sum that moves by this much within a second yields the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
-"""Largest difference between delays that agree, s."""
+"""Two delays agree if they differ by at most this, s."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ class MeasuredLatency:
 
 @dataclass(frozen=True, eq=False)
 class FeltSamples:
-    """The values from telemetry samples that are needed to test the hypotheses. They are cached
-    between sightings, because computing them for two seconds of samples takes as long as the fit
+    """Values computed from telemetry samples, with which the hypotheses are tested. They are cached
+    between sightings because computing them for two seconds of samples takes as long as the fit
     itself.
 
     Attributes:
@@ -118,27 +120,29 @@ class VisualInertialWindow:
     """The sightings of the last `MISMATCH_WINDOW_S`, and the mismatch and motion computed from
     them.
 
-    Times and delays are relative to the profile's latency. `mismatch` is for the planner; None if
-    there is none, or if it is being corrected. `correction_s` is the delay to which a measured
-    latency should be corrected; None while the latency in use fits.
+    Times and delays are relative to the profile's latency. `mismatch` is for the planner; it is
+    None if there is no mismatch, or if the mismatch is being corrected. `correction_s` is the delay
+    to which a measured latency should be corrected; None while the latency in use fits.
     """
 
-    sights: tuple[tuple[float, Vector], ...] = ()  # time, vector from body to target, body axes, m
+    # time of each sighting, and vector from the body to the target in body axes, m
+    sights: tuple[tuple[float, Vector], ...] = ()
     judged_s: float = -math.inf
-    # result of the newest check; kept once enough checks agree
+    # Result of the newest check; it is kept once enough checks agree.
     latest: CameraImuMismatch | None = None
     latest_s: float = -math.inf
-    agree_count: int = 0  # number of successive checks that agree
-    is_corrected: bool = False  # `latest` is an error of a measured latency
-    in_use_s: float = 0.0  # delay relative to which `mismatch` is given
-    motion: VisualInertialMotion | None = None  # newest motion for which the sum moved by at most
-    motion_within_m: float = WANDERS_M  # this distance
+    agree_count: int = 0  # Number of successive checks that agree.
+    is_corrected: bool = False  # True if `latest` is an error of a measured latency.
+    in_use_s: float = 0.0  # `mismatch` is relative to this delay.
+    # newest motion for which the sum moved by at most `motion_within_m`
+    motion: VisualInertialMotion | None = None
+    motion_within_m: float = WANDERS_M
     felt: FeltSamples = field(default_factory=FeltSamples, compare=False, repr=False)
 
     @property
     def mismatch(self) -> CameraImuMismatch | None:
         """The newest mismatch, once enough successive checks agree; None before that, or while it
-        is being corrected. Its `later_s` is relative to the latency in use."""
+        is being corrected. Its `camera_latency_error_s` is relative to the latency in use."""
         if self.latest is None or self.is_corrected or self.agree_count < AGREED:
             return None
         later_s = (
@@ -150,14 +154,15 @@ class VisualInertialWindow:
 
     @property
     def correction_s(self) -> float | None:
-        """The measured latency in excess of the profile's if it differs from the latency in use,
-        else None."""
+        """The measured latency minus the profile's latency, s, if it differs from the latency in
+        use; otherwise None."""
         enough = self.is_corrected and self.agree_count >= AGREED_MEASURED
         return self.latest.camera_latency_error_s if self.latest is not None and enough else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """Return the window without its sightings. From then on, it accepts a less accurate motion."""
+    """Return the window without its sightings. From then on, the window accepts a less accurate
+    motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -237,7 +242,7 @@ def delay_hypotheses(in_use_s: float) -> Array:
 
 
 def _best_about(mismatch: CameraImuMismatch, wanders_m: Array, later_s: Array) -> int:
-    """Return the index with the least motion among the hypotheses close to `mismatch`."""
+    """Return the index of the hypothesis with the least motion among those close to `mismatch`."""
     about = np.abs(later_s - mismatch.camera_latency_error_s) < LEAST_LATER_S
     about &= mismatch.camera_yaw_error_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))
@@ -249,10 +254,11 @@ def _found(
     """Return the mismatch that explains the images; None if the current latency, or one close to
     it, explains them.
 
-    A measured latency is first searched for among the usable ones: just after lift-off, any delay
-    explains a target that stood still. A usable latency explains nothing if it leaves more motion
-    than the images' noise, and hardly less than the latency in use: it is then only the closest one
-    to a latency that is too long to be used.
+    If the latency is measured in flight, the usable latencies are tried first: just after lift-off,
+    any delay explains a target that has not moved relative to the camera. A usable latency does not
+    explain the images if it leaves more motion than their noise, and hardly less than the latency
+    in use does. It is then only the usable value closest to a true latency that is too long to be
+    used.
     """
     in_use_s, least_later_s = 0.0, LEAST_LATER_S
     if measured is not None:
@@ -280,8 +286,9 @@ def _found(
 
 
 def _refined_s(wanders_m: Array, later_s: Array, best: int) -> float:
-    """Return the delay at the minimum of a parabola through the squares around the `best` of
-    `_DELAYS_S`; the grid's delay at its ends, and for a rotation."""
+    """Return the delay, s, at the minimum of a parabola through the squared motion at the
+    hypothesis `best` and its two neighbours. At an end of `_DELAYS_S`, or for a rotation, return
+    the delay of the hypothesis itself."""
     if not 0 < best < len(_DELAYS_S) - 1:
         return float(later_s[best])
     before, here, after = np.square(wanders_m[best - 1 : best + 2]).tolist()
@@ -294,12 +301,12 @@ def fit_hypotheses(
     felt: FeltSamples,
     later_s: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Fit the motion under each of n hypotheses: the delay `later_s[i]` and the rotation
-    `TURNS_RAD[i]`.
+    """Fit the motion under each of n hypotheses; hypothesis i has the delay `later_s[i]` and the
+    rotation `TURNS_RAD[i]`.
 
-    `sights` are times, and vectors from body to target, m, body axes. Returns the target's apparent
-    motion, rms in m, lateral (n,) and vertical (n,); the vehicle's velocity at the newest sample,
-    m/s, (3, n); and the offset of its acceleration, m/s^2, (3, n).
+    Each of the `sights` is a time and the vector from the body to the target, m, in body axes.
+    Returns the target's apparent motion, rms in m, lateral (n,) and vertical (n,); the vehicle's
+    velocity at the newest sample, m/s, (3, n); and the offset of its acceleration, m/s^2, (3, n).
     """
     stamps_s, attitudes, forces = felt.rows[:, 0], felt.rows[:, 1:4].copy(), felt.rows[:, 4:]
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
@@ -316,7 +323,8 @@ def fit_hypotheses(
     x, y = _turned(x, y, yaw)
     x, y, z = (a + np.interp(then_s, stamps_s, b) for a, b in zip((x, y, z), moved.T, strict=True))
 
-    # Residual of both after the fit of a position, a speed and an offset.
+    # Residual motion of the sum after fitting a position, a velocity and an offset of the
+    # acceleration.
     u = seen_s - seen_s.mean()
     unknown = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
     known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])
@@ -337,6 +345,7 @@ def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
 
 
 def _integral(t_s: Array, values: Array) -> Array:
-    """Return the integral by the trapezoidal rule, (n, k); 0 at the first sample."""
+    """Return the integral (n, k) of `values` over time by the trapezoidal rule, starting with 0 at
+    the first sample."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
