@@ -1,8 +1,8 @@
 """Deinterlace the frames of analogue cameras: detect, separate and order their fields. Pure.
 
-An interlaced frame consists of two fields, half a frame period apart, each in every second row.
-Motion between the fields shows as combing: a row differs from its neighbours. Only strong
-differences count, so that a small target in a noisy image is enough. The order of the fields
+An interlaced frame consists of two fields, exposed half a frame period apart. Each field has every
+second row. Motion between the fields shows as combing: a row differs from its neighbours. Only
+strong differences count, so a small target in a noisy image is enough. The order of the fields
 follows from successive frames: the later field of a frame is more similar to the earlier field of
 the next one.
 """
@@ -21,38 +21,34 @@ from perchctl.vision.types import FieldState, Frame
 
 GreyImage = NDArray[np.uint8]
 
-# energy of the strong differences between the two fields over that within the fields; exceeded by
-# fields one pixel apart
+# Minimum ratio of the energy of strong differences between the two fields to the energy within the
+# fields. Fields that are one pixel apart exceed it.
 _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
-# a pixel counts if its difference exceeds this multiple of the mean difference within the fields
+# A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
 _MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
-_NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
+_NOISE_FLOOR_GREY2 = 0.25  # energy per pixel of strong differences that noise alone may cause
 _COMBING_CHECK_INTERVAL_FRAMES = 3
 _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 # cubic interpolation at the midpoint
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
-_NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
-_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (
-    0.029,
-    0.045,
-)  # range of periods that are rounded to NTSC or PAL
+_NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)
+_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (0.029, 0.045)
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
-_MAX_FRAME_GAP_S = (
-    0.25  # s; after a longer gap, the previous frame says nothing about the field order
-)
-_MIN_ABS_FIELD_ORDER_VOTE_SUM = (
-    1.0  # sum of votes, each at most 1, that decides the order: two frames at least
-)
-_MAX_ABS_FIELD_ORDER_VOTE_SUM = (
-    3.0  # limit of the sum, so that a change of the order is detected soon
-)
-_MIN_FIELD_ORDER_REVERSAL_VOTE_SUM = 1.0  # sum of votes that reverses an earlier decision
+# After a longer gap, the previous frame says nothing about the field order.
+_MAX_FRAME_GAP_S = 0.25
+# The votes decide the field order if their sum exceeds this value. Each vote is at most 1, so the
+# decision takes at least two frames.
+_MIN_ABS_FIELD_ORDER_VOTE_SUM = 1.0
+# The sum is limited to this value so that a change of the field order is detected soon.
+_MAX_ABS_FIELD_ORDER_VOTE_SUM = 3.0
+# A sum above this value reverses an earlier decision.
+_MIN_FIELD_ORDER_REVERSAL_VOTE_SUM = 1.0
 
 
 def is_combed(image: GreyImage) -> bool:
@@ -61,14 +57,15 @@ def is_combed(image: GreyImage) -> bool:
     groups, width = len(image) // _ROWS_PER_COMBING_GROUP, image.shape[1]
     if groups == 0:
         return False
-    # Groups of rows in one row: the next row is `width` further on. Every third group is enough.
+    # Each group of rows is flattened, so the next image row begins `width` elements further on. It
+    # is enough to check every third group.
     flat = np.ascontiguousarray(image[: groups * _ROWS_PER_COMBING_GROUP]).reshape(
         groups, _ROWS_PER_COMBING_GROUP * width
     )[::3]
     above2, above, row, below, below2 = (
         flat[:, k * width : (k + _ROWS_PER_COMBING_GROUP - 4) * width] for k in range(5)
     )
-    # In place, to keep the frame in the processor's cache for the next steps.
+    # Compute in place to keep the frame in the processor's cache for the next steps.
     other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
@@ -87,17 +84,18 @@ def is_combed(image: GreyImage) -> bool:
 
 
 def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
-    """Return the top and bottom field, each (h, w), of a combed image; otherwise the result
-    alone."""
+    """Return the top and the bottom field, each (h, w), if the image is combed; otherwise return
+    the image alone."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
 def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
-    """Return the top (`first_row` 0) or bottom (1) field, with the missing rows interpolated."""
+    """Return the top field (`first_row` 0) or the bottom field (`first_row` 1), with the missing
+    rows interpolated."""
     own = image[first_row::2]
-    # Row k of the result is between rows k and k + 1 of the field.
+    # Row k of the interpolation is between rows k and k + 1 of the field.
     between = cv2.filter2D(
         own, -1, _INTERPOLATION_TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE
     )
@@ -111,22 +109,23 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
 
 
 def interpolated_field_edge_sigma_px(blur_sigma_px: float) -> float:
-    """Return the position error, px (standard deviation), of a nearly horizontal edge in an
-    interpolated field. `blur_sigma_px` is the edge's blur (standard deviation)."""
+    """Return the standard deviation of the position of a nearly horizontal edge, px, in an
+    interpolated field. `blur_sigma_px` is the standard deviation of the edge's blur."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_sigma_px * blur_sigma_px)
 
 
 def classify_interlacing(frame: Frame) -> Frame:
-    """Return the frame with its `picture_kind`: ``woven`` if it is interlaced, so that its odd and
-    even rows were exposed at different times, or ``whole`` if all rows were exposed together. A
-    kind that is already known stays."""
+    """Return the frame with its `picture_kind`: ``woven`` if its odd and even rows were exposed at
+    different times (interlaced), or ``whole`` if all rows were exposed together. A kind that is
+    already known does not change."""
     if frame.picture_kind is not None:
         return frame
     return replace(frame, picture_kind="woven" if is_combed(frame.image) else "whole")
 
 
 def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
-    """Return the top and the bottom field of a woven frame, both with the frame's time."""
+    """Return the top and the bottom field of a woven (interlaced) frame. Both have the time of the
+    frame."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), picture_kind="top", encoded=None),
         replace(
@@ -136,7 +135,7 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the new state, and the images to process in time order: the frame itself, or its two
+    """Return the new state and the images to process, in time order: the frame itself, or its two
     fields. The fields' times are a quarter of the frame period before and after the frame's time.
 
     Until combing is found in a frame, only every third frame is checked.
@@ -148,7 +147,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     )
     frame = replace(frame, picture_kind="whole") if skip else classify_interlacing(frame)
     skipped = state.frames_since_combing_check + 1 if skip else 0
-    # A stream that was interlaced once is treated as interlaced from then on.
+    # Once a stream has been interlaced, it is treated as interlaced from then on.
     picture_kind = state.picture_kind if state.picture_kind == "woven" else frame.picture_kind
     frame_periods_s = _update_frame_periods_s(state, frame)
     if frame.picture_kind == "whole":
@@ -185,8 +184,8 @@ def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
     if not frame_periods_s:
         return _NTSC_AND_PAL_FRAME_PERIODS_S[1]
     middle_s = median(frame_periods_s)
-    # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
-    # ms apart.
+    # The receiver's own rate makes the periods vary: at 60 Hz, the frames of a 25 Hz camera arrive
+    # 33 and 50 ms apart.
     period_s = mean(
         p for p in frame_periods_s if p < _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO * middle_s
     )

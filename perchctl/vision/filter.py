@@ -1,7 +1,8 @@
-"""The paper's Kalman filter (section II-A.1): constant velocity, eight states.
+"""The paper's Kalman filter (section II-A.1), a constant-velocity model with eight states.
 
 The state order is the paper's: yaw, yaw rate, then position and velocity of x, y, z. The time step
-is the actual one: with 15 % late frames, a fixed step gave 0.63 cm RMS, the actual step 0.19 cm.
+is the actual time between frames: with 15 % late frames, the error was 0.63 cm RMS with a fixed
+step and 0.19 cm with the actual one.
 
 The biases (the vehicle's roll and pitch, the print's size and curl) are consider states: they
 increase the reported covariance but do not change the gain.
@@ -23,15 +24,17 @@ from perchctl.values import cached_property
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
-"""Indices of the state."""
+"""Indices of the elements of the state."""
 MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
-TILTS, PRINT = slice(0, 2), slice(2, 4)  # columns of the biases
+# columns of the biases: the vehicle's roll and pitch, and the print's size and curl
+TILTS, PRINT = slice(0, 2), slice(2, 4)
 
 MAX_TRACK_GAP_S = 1.0
-"""Longest gap between two frames of a track, s."""
+"""Longest gap between two frames of a track, s; a longer gap ends the track."""
 MAX_PREDICTION_S = 1.0
-"""Longest prediction, s; after it, the target is assumed to stay at the predicted position."""
+"""Longest prediction, s; for a later time, the target is assumed to stay where it was predicted
+after this time."""
 
 _IDENTITY_3: Array = np.eye(3)
 _IDENTITY_8: Array = np.eye(8)
@@ -42,32 +45,32 @@ _M_PER_CM = 0.01
 _RAD_PER_DEG = math.radians(1.0)
 _SI_PER_PAPER_UNIT = np.array(
     [_RAD_PER_DEG, _RAD_PER_DEG, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM]
-)  # units of the paper, per state
+)  # SI value of the paper's unit for each element of the state
 
 _ACCELERATION_CORRELATION_TIME_S = 0.1
-"""Duration of an acceleration, s: the density of the white noise is its square times this,
-(m/s^2)^2 s."""
+"""Correlation time of an acceleration, s: the spectral density of the white noise, (m/s^2)^2 s, is
+the variance of the acceleration times this time."""
 _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
-"""Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
-m^2)."""
-_WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
+"""Variances (rad^2, m^2) of the random walk of the state estimate's yaw, x, y and z within one
+second."""
+_WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1
 _MAX_NIS_WITHOUT_RESTART = 25.0
-"""Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
-5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
-velocity. Smaller: noise restarts the track."""
+"""Limit of the normalized innovation squared (NIS) with four degrees of freedom; by chance, 5 of
+100 000 updates exceed it. Larger: after a lost frame, the track of a camera without a vehicle
+learns a wrong velocity. Smaller: noise restarts the track."""
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Process noise of the tracks, as standard deviations of white accelerations.
+    """Process noise of the tracks, given as standard deviations of white-noise accelerations.
 
     Attributes:
-        target_acceleration_sigma_mps2: of the target along each axis.
-        target_heading_acceleration_sigma_radps2: of the target's heading.
+        target_acceleration_sigma_mps2: acceleration of the target along each axis.
+        target_heading_acceleration_sigma_radps2: angular acceleration of the target's heading.
         level_frame_angular_acceleration_sigma_radps2: angular acceleration of the level frame about
-            its origin, the gear; it moves a target in proportion to its distance.
+            its origin, the gear; it moves the target in proportion to the target's distance.
         is_world_frame_drifting: True if the tracks are in the world frame of the state estimate,
-            which drifts against the room.
+            which drifts relative to the room.
     """
 
     target_acceleration_sigma_mps2: float
@@ -77,7 +80,8 @@ class ProcessNoise:
 
     @cached_property
     def yaw_xyz_rate_noise_cov_per_s(self) -> Array:
-        """Covariance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
+        """Covariance (4, 4) that white-noise acceleration of the target adds per second to the
+        rates of (yaw, x, y, z)."""
         push = np.array(
             [
                 self.target_heading_acceleration_sigma_radps2,
@@ -95,20 +99,22 @@ class FilterSetup:
         R, Q: covariance of the measurement noise (4, 4) and of the process noise per step (8, 8):
             ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2), converted to SI.
         P0: covariance (8, 8) after the first measurement.
-        velocity_factor_per_unseen_frame: factor on the velocity and the yaw rate in a frame without
-            a measurement, ``kalman.alpha`` of the profile (equation 3).
+        velocity_factor_per_unseen_frame: factor by which the velocity and the yaw rate are
+            multiplied in each frame without a measurement, ``kalman.alpha`` of the profile
+            (equation 3).
         max_unseen_frames: frames without a measurement after which a track ends, ``kalman.n_max``
             of the profile.
-        acceleration_noise: process noise that replaces Q, while the covariance of each pose
-            replaces R; None: Q and R are used.
+        acceleration_noise: process noise that replaces Q; the covariance of each pose then replaces
+            R. If None, Q and R are used.
         roll_pitch_bias_sigma_rad: standard deviation of the bias of the vehicle's roll and pitch.
-        max_target_speed_mps: upper limit of the target's speed in the track's frame while there is
-            no measurement: the drift speed of the world frame; infinite in the level frame.
+        max_target_speed_mps: upper limit of the target's speed, in the track's frame, while there
+            is no measurement. In the world frame it is the frame's drift speed; in the level frame
+            it is infinite.
         max_nis_without_restart: largest normalized innovation squared (NIS) of a measurement that
             updates the track; with a larger one, the track restarts.
 
     With the innovation v = z - H x of a measurement z and its covariance S = H P H^T + R, NIS is
-    v^T S^-1 v. The motion model cannot explain a larger one, for example after lost frames, and an
+    v^T S^-1 v. The motion model cannot explain a larger NIS, for example after lost frames, and an
     update would turn the jump into a wrong velocity. The track therefore restarts at z with the
     covariance R + v v^T, which still covers the old position until another measurement decides.
     """
@@ -119,21 +125,19 @@ class FilterSetup:
     velocity_factor_per_unseen_frame: float
     max_unseen_frames: int
     acceleration_noise: ProcessNoise | None = None
-    roll_pitch_bias_sigma_rad: float = 0.0  # bias of the vehicle's roll and pitch
-    max_target_speed_mps: float = (
-        math.inf
-    )  # largest speed of the target in its frame without measurements
+    roll_pitch_bias_sigma_rad: float = 0.0
+    max_target_speed_mps: float = math.inf
     max_nis_without_restart: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class TrackMeasurement:
-    """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
-    means the setup's R.
+    """A measurement of a target, `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4). If `R`
+    is None, the R of the filter setup is used.
 
     `yaw_xyz_shift_per_bias_sigma` (4, 4) has one row per element of z and one column per bias: the
     vehicle's roll and pitch, the print's size and curl. A column is the change of z for one
-    standard deviation of that bias. None means no biases.
+    standard deviation of that bias. If it is None, there are no biases.
     """
 
     z: Array
@@ -155,7 +159,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     """Return the filter's parameters. The initial standard deviation of the velocity is 5 cm/s in
     the world frame. In the level frame, it is 30 cm/s, or 1 m/s if ``kalman.noise`` is
     ``measured``."""
-    _import_filterpy_predict()  # now, so that no frame waits for it
+    _import_filterpy_predict()  # import it now so that no frame has to wait for the import
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -181,7 +185,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
         acceleration_noise=acceleration_noise,
         roll_pitch_bias_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         max_target_speed_mps=config.drift_mps if is_world_frame else math.inf,
-        # In flight, the gate detects jumps of the state estimate (`perchctl.vision.tracks`).
+        # In flight, the gate in `perchctl.vision.tracks` detects jumps of the state estimate.
         max_nis_without_restart=_MAX_NIS_WITHOUT_RESTART
         if measured and not is_world_frame
         else math.inf,
@@ -189,8 +193,8 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
 
 
 def vector_jacobian_wrt_tilt(vector_m: Array) -> Array:
-    """Return the derivative (3, 2), m/rad, of a vector `vector_m` (3,) in level axes with respect
-    to small rotations about level x and y."""
+    """Return the derivative (3, 2), m/rad, of `vector_m` (3,), a vector in level axes, with respect
+    to small rotations about the level x and y axes."""
     x, y, z = vector_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
@@ -203,12 +207,13 @@ def transition_matrix(dt_s: float) -> Array:
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
     """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in the
     track's frame: relative to the gear in level axes, or in the world. The noise grows with the
-    target's distance because rotations of the level frame move a distant target further."""
+    target's distance because rotations of the level frame move a distant target further than a
+    close one."""
     noise = setup.acceleration_noise
     if noise is None:
         return setup.Q
     pushed = _acceleration_covariance(noise, target_position_m) * dt_s
-    # A value and its rate are adjacent in the state.
+    # In the state, each value is followed by its rate.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_world_frame_drifting:
@@ -217,7 +222,8 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
 
 
 def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
-    """Return the process noise of the rates of (yaw, x, y, z) per second, (4, 4)."""
+    """Return the covariance (4, 4) that process noise adds per second to the rates of (yaw, x, y,
+    z)."""
     if noise.level_frame_angular_acceleration_sigma_radps2 == 0.0:
         return noise.yaw_xyz_rate_noise_cov_per_s
     turned2 = (
@@ -256,14 +262,15 @@ def step_track(
     """Predict the track to a frame's time and, if the marker was measured, update it.
 
     Args:
-        track: the track so far, None before the first measurement.
-        measurement: the measurement; None or not finite if the marker was not measured.
+        track: the track so far; None before the first measurement.
+        measurement: the frame's measurement; None or not finite if the marker was not measured.
         t_s: the frame's time.
 
-    Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
-    3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap of more than
-    `MAX_TRACK_GAP_S` in either direction restarts the track, and so does a measurement that the
-    motion model does not explain (`FilterSetup.max_nis_without_restart`).
+    Returns None if there is no track, because the marker was never measured or was not seen for
+    more than `n_max` frames (k_n <= n_max in equation 3). A frame that is not newer than the track
+    changes nothing. A gap of more than `MAX_TRACK_GAP_S` in either direction restarts the track,
+    and so does a measurement that the motion model does not explain
+    (`FilterSetup.max_nis_without_restart`).
     """
     if measurement is not None and not is_finite(measurement.z):
         measurement = None
@@ -314,7 +321,7 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
     """Return the updated state, its covariance in Joseph form, and the Kalman gain (8, 4)."""
     off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
-    if not regular:  # S is not a covariance, so the measurement has no weight
+    if not regular:  # S is not positive definite, so the measurement is ignored
         return x, P, np.zeros((8, 4))
     gain = np.asarray(solved.T, dtype=np.float64)
     x = x + gain.dot(off)
@@ -325,7 +332,7 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
 
 
 def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """Return the track predicted to `t_s`."""
+    """Return the track predicted to time `t_s`, without a measurement."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track

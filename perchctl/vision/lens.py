@@ -1,7 +1,7 @@
 """Convert pixels to rays and back: the only module with a lens model.
 
-Corners are undistorted, never images: undistorting the frame first loses markers at its edge and
-blurs the others.
+perchctl undistorts corners, never whole images: undistorting a frame before the detection would
+lose markers at its edge and blur the others.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
 # OpenCV's default stops after five iterations, with errors of up to 0.12 px in the image's
-# corners.
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
+# corners. The tolerance is in pixels.
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
 _ZERO_VECTOR = np.zeros(3)
 
 
 def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
-    A point outside the valid range of the lens model becomes NaN or lies far outside the image; no
-    exception is raised.
+    A point outside the valid range of the lens model becomes NaN or a point far outside the image;
+    no exception is raised.
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
     if len(points) == 0:
@@ -34,13 +34,13 @@ def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
 
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
-    """Convert pixels (n, 2) of the distorted image to those (n, 2) of an undistorted one, taken
+    """Convert pixels (n, 2) of the distorted image to pixels (n, 2) of an undistorted image, taken
     by a pinhole camera with the same `K`."""
     return pinhole_px(undistort_to_normalised(points_px, camera), camera)
 
 
 def pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole camera with the same
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole camera with the camera's
     `K`."""
     K = camera.K
     result = np.empty_like(points_normalised)
@@ -58,8 +58,8 @@ def distort_to_px(points_normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Project points (n, 3), whose frame has the pose (rvec, tvec) in the camera, to pixels (n,
-    2)."""
+    """Project points (n, 3) to pixels (n, 2). The points' frame has the pose (rvec, tvec) in the
+    camera frame."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _project_points(points, rvec, tvec, camera)

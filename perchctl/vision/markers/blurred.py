@@ -1,17 +1,18 @@
-"""Blurred search: find markers in images that are too blurred for any search to decode them.
+"""Blurred search: find markers that are too blurred for any other search to decode.
 
 Near an expected marker, the fit starts at the shift s at which a blurred template T of the marker's
 drawing correlates best with the image I:
 
     max of  sum (I(x+s) - mean I) (T(x) - mean T) / (|I - mean I| |T - mean T|)
 
-Without an expectation, the fits start at the quadrilaterals whose cells correlate best with the
-drawing. Any start is safe because the photometric fit must verify it (`is_alignment_confirmed`,
-`excludes_other_codewords`) and measures the corners.
+Without an expected marker, the fits start at the quadrilaterals whose cells correlate best with the
+drawing. Any start is safe because the photometric fit measures the corners and verifies the marker
+(`is_alignment_confirmed`, `excludes_other_codewords`).
 
-The result is wrong where the photometric fit is (`perchctl.vision.markers.photometric_fit`). It is
-empty if another codeword would look the same, or if the marker is further from its expected
-position than 0.5 sides or 10 px, whichever is larger. Corners are (4, 2) px.
+The result is wrong whenever the photometric fit is wrong
+(`perchctl.vision.markers.photometric_fit`). The result is empty if another codeword would look the
+same, or if the marker is further from its expected position than 0.5 sides or 10 px, whichever is
+larger. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
@@ -47,19 +48,20 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
-_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
-# largest error of an expected position
+_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # Initial guesses of the blur.
+# Largest error of a marker's expected position.
 _MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_QUAD_CORRELATION = 0.5
-# minimum at an expected position; textures seldom reach it, and each costs a fit
+# Minimum correlation at an expected position. Textures seldom reach it, and each one that does costs
+# a fit.
 _MIN_EXPECTED_MARKER_CORRELATION = 0.45
 _MAX_QUADS_TO_FIT = 3
-_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # grey of areas with unknown content
-_MAX_DUPLICATE_DISTANCE_SIDES = (
-    0.15  # distance, as a share of a side, of candidates that count as one
-)
-_MIN_PAPER_REACH_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
+_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # Grey of areas with unknown content.
+# Candidates closer to each other than this fraction of a side count as one.
+_MAX_DUPLICATE_DISTANCE_SIDES = 0.15
+# Distance from the marker's centre up to which the surroundings are certainly paper.
+_MIN_PAPER_REACH_HALF_SIDES = 1.3
 
 
 def find_expected_blurred(
@@ -67,12 +69,12 @@ def find_expected_blurred(
     expected_corners_px: Mapping[MarkerName, Array],
     initial_blur_frame_counter: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Find blurred markers near their expected corners (4, 2) px. Return the first one that is
-    found; empty if there is none.
+    """Find blurred markers near their expected corners (4, 2) px. Return the first marker found, or
+    an empty dict if there is none.
 
     The caller increments `initial_blur_frame_counter` with each frame. To save time, the fits start
-    with a small blur if it is even and with a large blur if it is odd; None tries both in this
-    frame."""
+    with a small blur if the counter is even and with a large blur if it is odd. If the counter is
+    None, both are tried in this frame."""
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _START_BLURS_PX
@@ -100,8 +102,8 @@ def find_expected_blurred(
 
 def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorners]:
     """Find a blurred marker anywhere in the image. The photometric fit is tried on the
-    quadrilaterals whose cells correlate best with a marker's; the first one that it confirms is
-    returned. Empty if there is none."""
+    quadrilaterals whose cells correlate best with a marker's. Return the first marker that the fit
+    confirms, or an empty dict if there is none."""
     image, setup = detector_input.image, detector_input.setup
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -116,7 +118,7 @@ def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, MarkerPattern]
 ) -> list[tuple[MarkerName, Array]]:
     """Return the quadrilaterals among `quads` (m, 4, 2) whose cells resemble a marker's, best first
-    and without duplicates. The order of their corners is that of the marker."""
+    and without duplicates. Their corners are in the same order as the marker's."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -197,21 +199,21 @@ def _render_template(
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
 
-# --- Measure a marker by its drawing, and accept it only if the image matches beyond doubt ---
+# --- Fit a marker's drawing, and accept the marker only if the image matches beyond doubt ---
 
 
 _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
-_CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = (
-    0.012  # share of the blur: no image equals its drawing with uniform blur
-)
+# The error of the corners grows with the blur, because no image equals its drawing with a uniform
+# blur.
+_CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = 0.012
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
 _MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
 _MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
-_MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06  # share of the side
+_MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
 _ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
-_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # ratio of the mean sides
-_MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
+_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # mean side after the fit over the one at its start
+_MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6
 
 
 def align_marker(
@@ -223,14 +225,15 @@ def align_marker(
     max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
     must_exclude_other_codewords: bool = True,
 ) -> RefinedCorners | None:
-    """Fit a marker's drawing to the image and return its corners; None unless the image matches
+    """Fit a marker's drawing to the image and return its corners; None if the image does not match
     the drawing.
 
     The fit starts at `start_corners_px` (4, 2) with the initial blur `initial_blur_sigma_px`
-    (standard deviation). Both limits are in side lengths: `max_motion_from_start_sides` for the
-    distance of the fitted corners from the start, and `max_corner_sigma_sides` for their standard
-    deviation. `must_exclude_other_codewords` requires that the image excludes every other codeword
-    (`excludes_other_codewords`); set it to False if the other marker already identifies this one.
+    (standard deviation). `max_motion_from_start_sides` limits the distance of the fitted corners
+    from the start, and `max_corner_sigma_sides` limits their standard deviation; both are in side
+    lengths. If `must_exclude_other_codewords` is True, the image must also exclude every other
+    codeword (`excludes_other_codewords`); set it to False if the other marker already identifies
+    this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:
@@ -247,7 +250,7 @@ def align_marker(
         > max(max_motion_from_start_sides * side_px, _ALWAYS_ALLOWED_MOTION_FROM_START_PX)
     ):
         return None
-    # The square must remain a square of about the same size and orientation.
+    # The fitted marker must still be a square of about the same size and orientation.
     sides_px, areas = (
         side_lengths_px(alignment.corners_px),
         [alignment.corners_px, start_corners_px],
@@ -268,7 +271,7 @@ def align_marker(
     )
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
     if int(np.count_nonzero(part > CLIPPED_GREY)) > MIN_CLIPPED_FRACTION * part.size:
-        # The light model does not explain clipped white.
+        # The illumination model does not explain clipped white.
         sigma_px = math.hypot(sigma_px, CLIPPED_CORNER_SIGMA_PX)
     return RefinedCorners(alignment.corners_px, sigma_px, True)
 
@@ -278,8 +281,8 @@ def is_alignment_confirmed(
 ) -> bool:
     """True if the image matches the fitted drawing and determines the corners accurately enough.
 
-    Without a marker, the correlation of the inner pattern stays below 0.72 at a plausible contrast;
-    with a marker, it is above 0.95.
+    If there is no marker, the correlation of the inner pattern stays below 0.72 at any plausible
+    contrast; if there is one, it is above 0.95.
     """
     return (
         alignment.pattern_correlation > _MIN_INNER_CORRELATION

@@ -21,7 +21,7 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 CENTRED_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of the centred square, -1 to 1, in the marker's own coordinates, (4, 2)."""
-# indices of corner i's neighbours
+# Index of the next and of the previous corner of each corner.
 NEXT_CORNER, PREVIOUS_CORNER = (np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2]))
 SIDE_OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
@@ -33,17 +33,20 @@ _CORNER_JACOBIANS_WRT_HOMOGRAPHY_INCREMENT: Array = np.array(
         for u, v in CENTRED_SQUARE
     ]
 )
-"""Motion of each corner with the terms of an increment, in the marker's own coordinates."""
+"""Derivative of each corner with respect to the elements of a homography increment, in the marker's
+own coordinates."""
 
 
 def homography_from_centred_square(corners: Array) -> Array:
-    """Return the homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
+    """Return the homography (3, 3) that maps the centred square, with corners at -1 and 1, to
+    `corners` (4, 2)."""
     H = cv2.getPerspectiveTransform(_CENTRED_SQUARE_F32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def homography_to_centred_square(corners: Array) -> Array:
-    """Return the homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
+    """Return the homography (3, 3) that maps `corners` (4, 2) to the centred square, with corners
+    at -1 and 1."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _CENTRED_SQUARE_F32)
     return np.asarray(H, dtype=np.float64)
 
@@ -78,19 +81,20 @@ def increment_homography(H: Array, homography_increment: Array) -> Array:
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """Return the side lengths (..., 4) of squares with corners (..., 4, 2)."""
+    """Return the side lengths (..., 4), px, of squares with corners (..., 4, 2)."""
     d = corners_px.take(NEXT_CORNER, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 
 def mean_side_px(corners_px: Array) -> float:
-    """Return the mean side length of one square (4, 2)."""
+    """Return the mean side length, px, of a square with corners (4, 2)."""
     a, b, c, d = corners_px.tolist()
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
 def signed_double_area(corners: Array) -> Array:
-    """Return twice the area (m,) of corners (m, 4, 2), positive if clockwise."""
+    """Return twice the area (m,) of m quadrilaterals with corners (m, 4, 2); positive if the
+    corners are clockwise."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
@@ -106,9 +110,9 @@ def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float 
 def scale_square(
     corners_px: Array, new_to_given_side_ratio: float, camera: CameraModel | None = None
 ) -> Array:
-    """Return the corners (4, 2) px of a square with the same centre and plane as the given one,
-    whose side is `new_to_given_side_ratio` times the given side; without a camera, lens distortion
-    is ignored."""
+    """Return the corners (4, 2) px of a square with the same centre and plane as the given one. Its
+    side is `new_to_given_side_ratio` times the given side. If `camera` is None, lens distortion is
+    ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_centred_square(straight),
@@ -122,8 +126,9 @@ def add_missing_marker_corners(
     small_to_large_side_ratio: float,
     camera: CameraModel,
 ) -> dict[MarkerName, Array]:
-    """Return both markers' corners (4, 2) px; a missing marker follows from the other one and
-    `small_to_large_side_ratio`, the side of the small marker over that of the large one."""
+    """Return the corners (4, 2) px of both markers. If one marker is missing, its corners are
+    computed from the other one and `small_to_large_side_ratio`, the side of the small marker
+    divided by the side of the large one."""
     both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], small_to_large_side_ratio, camera)
@@ -132,16 +137,17 @@ def add_missing_marker_corners(
     return both
 
 
-# --- Refined corners, and refinement of each corner by its own neighbourhood ---
-# Corners refined by their own neighbourhood are biased inwards (0.15 to 0.55 px), so that the
-# target looks too far away.
+# --- Refined corners, and refinement of each corner from its own neighbourhood ---
+# If each corner is refined from its own neighbourhood, the corners are biased inwards by 0.15 to
+# 0.55 px, and the target seems too far away.
 
 
 DETECTOR_CORNER_SIGMA_PX = 0.6
 """Standard deviation of corners from OpenCV's detector, px."""
 SUBPIX_CORNER_SIGMA_PX = 0.25
 """Standard deviation of corners from `cv2.cornerSubPix`, px."""
-CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6  # derived from the other marker, not measured
+CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6
+"""Standard deviation of corners that are derived from the other marker, not measured, px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +158,14 @@ class RefinedCorners:
         corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
         are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
             they come from OpenCV or from the other marker, which is less accurate.
-        removed_edge_shift: how far white has grown over black at all edges of the image
-            (blooming, gamma), measured on this frame's markers or in an earlier frame. The corners
-            are corrected for it. None: unknown, not corrected.
-        remaining_edge_shift_sigma_px: standard deviation of the remaining growth after the
-            correction.
-        blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: largest and smallest blur of a
-            side.
+        removed_edge_shift: how far white has grown over black at all edges of the image (blooming,
+            gamma), measured on this frame's markers or in an earlier frame. The corners are
+            corrected for this growth. None if the growth is unknown; the corners are then not
+            corrected.
+        remaining_edge_shift_sigma_px: standard deviation of the growth of white that remains after
+            the correction.
+        blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: standard deviations of the blur
+            of the marker's blurriest and sharpest side.
     """
 
     corners_px: Array
@@ -175,12 +182,12 @@ class RefinedCorners:
 def refine_subpix(
     image: NDArray[np.uint8], raw_corners_px: Array, cells_per_side: int
 ) -> RefinedCorners:
-    """Refine corners (4, 2) px with `cv2.cornerSubPix`. If any corner leaves its window, return the
-    raw corners.
+    """Refine corners (4, 2) px with `cv2.cornerSubPix`. If any corner moves out of its search
+    window, return the raw corners.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
     extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,
-    so that the target seems too far away. The result's `are_corners_fitted` is therefore False.
+    and the target then seems too far away. The result's `are_corners_fitted` is therefore False.
     """
     side_px = float(side_lengths_px(raw_corners_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))
