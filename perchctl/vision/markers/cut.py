@@ -1,21 +1,21 @@
-"""Cut-view fit: a target so close, or so far off the axis, that no marker is completely in the
-image.
+"""Cut-view fit: measure a target that is so close, or so far off the axis, that no marker is
+completely in the image.
 
-The edges of the whole drawing, of both markers, are located across their predicted positions. A
-part of a drawing does not determine the eight terms of a homography, so the unknowns are those of a
-rigid body. Gauss-Newton finds the rotation w and the translation t, together with the shift d of
-all edges (white over black), from the distances r_k, px, between the drawing's edges and the
-image's:
+The fit looks for all edges of the drawing, which contains both markers, across their predicted
+positions. A part of a drawing does not determine the eight elements of a homography, so the
+unknowns are those of a rigid body's pose. Gauss-Newton finds the rotation w and the translation t,
+together with the shift d of all edges (white over black), from the distances r_k, px, between the
+drawing's edges and the image's:
 
     min sum v_k (r_k - J_k (w, t, d))^2 / sigma^2 + sum ((w, t, d)_j / sigma_j)^2
 
-with Tukey's weights v. The second sum keeps unobserved terms at the prediction. The corners of one
-marker follow by projection, with their covariance (8, 8) px^2.
+with Tukey's weights v. The second sum keeps unobserved unknowns at their predicted values. The
+fitted pose then yields the corners of one marker and their covariance (8, 8) px^2.
 
-The result is wrong if the predicted tilt is wrong by much more than its standard deviation, 2 deg,
-and no edge shows it. A part of a drawing resembles many other objects: this fit never starts a
-track, and it counts only if the image matches the drawing everywhere (correlation above 0.9) and
-three quarters of the edges in view are found.
+The result is wrong if the error of the predicted tilt is much larger than its standard deviation, 2
+deg, and no edge reveals the error. Many other objects resemble a part of the drawing. This fit
+therefore never starts a track. Its result is only used if the image matches the drawing everywhere
+(correlation above 0.9) and three quarters of the edges in view are found.
 
 The unit of length is half the side of the large marker.
 """
@@ -53,26 +53,25 @@ from perchctl.vision.markers.photometric_fit import fit_correlation, make_sampli
 from perchctl.vision.types import CameraModel, MarkerName
 
 MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S = 0.5
-"""Largest time since the target was last measured, s; after it, a visible part of the target is no
-evidence."""
-_UNCERTAIN_TRUNCATION_MARGIN_PX = (
-    40  # from the edge of the image, where a marker may just have been cut
-)
-# cell of the small marker; if it is smaller, the large marker is in view
+"""Maximum time since the target was last measured, s. After a longer time, a part of the target is
+not sufficient evidence of the target."""
+# Distance from the image border within which an expected marker may or may not be truncated.
+_UNCERTAIN_TRUNCATION_MARGIN_PX = 40
+# If the cells of the small marker are smaller, the large marker is in view.
 _MIN_SMALL_MARKER_CELL_PX = 8.0
-_MIN_COARSE_CORRELATION = 0.6  # correlation required at the moved prediction
-_SUFFICIENT_COARSE_CORRELATION = 0.95  # correlation at which no other size is tried
+_MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose has been shifted.
+_SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
 _RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
-_MIN_FOUND_POINT_FRACTION = 0.75  # share of the edge points in view
+_MIN_FOUND_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
 _MAX_TRUNCATED_FIT_RESIDUAL_PX = 1.2
-_MAX_CENTRE_SIGMA_HALF_SIDES = 0.04  # of the centre, in half sides
+_MAX_CENTRE_SIGMA_HALF_SIDES = 0.04
 _MIN_CORNER_SIGMA_PX = 0.02
-_MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
-_MAX_LENS_INVERSION_ERROR_NORMALISED = (
-    1e-3  # normalised; the lens model is valid where its inverse exists
-)
-# rotation from a marker's own coordinates to its axes
+# The small marker is reported if at least this number of its edge points is found.
+_MIN_SMALL_MARKER_POINTS = 12
+# The lens model is valid where its inverse exists.
+_MAX_LENS_INVERSION_ERROR_NORMALISED = 1e-3
+# Rotation from the coordinates of the drawing to the axes of the marker.
 _R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 
 
@@ -117,9 +116,9 @@ def can_complete_marker_be_in_view(
 def fit_truncated_markers(
     detector_input: DetectorInput, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the pose of the target to its visible part and return one marker's corners, projected
-    from that pose; empty if the fit fails. `expected_corners_px` are the predicted corners (4, 2)
-    px."""
+    """Fit the pose of the target to its visible part, and return the corners of one marker,
+    projected from that pose; the result is empty if the fit fails. `expected_corners_px` are the
+    predicted corners of each marker, (4, 2) px."""
     image, camera, patterns = (
         detector_input.image,
         detector_input.camera,
@@ -255,7 +254,8 @@ def _search_near_pose(
 
 
 def _is_reliable(pose_fit: PoseFit) -> bool:
-    """True if most of the visible edge points were found and if they determine the position."""
+    """True if most of the visible edge points were found and if they determine the position
+    accurately."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
@@ -277,9 +277,10 @@ def _project_marker_corners(
     )
     X = r + pose_fit.pose.t_cam_drawing_half_sides
     if X[:, 2].min() <= 0.0:
-        return None  # one corner is next to or behind the camera
+        return None  # at least one corner is beside or behind the camera
     x = X[:, :2] / X[:, 2:]
-    J = np.zeros((8, 6))  # pixels of a pinhole camera by rotation and translation
+    # derivative of pixels in a pinhole camera with respect to rotation and translation
+    J = np.zeros((8, 6))
     for k in range(4):
         P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
         P = camera.K[:2, :2] @ P
@@ -296,18 +297,18 @@ def _project_marker_corners(
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
 
-# --- A reduced image through a pinhole camera, and the drawing rendered into it ---
+# --- A downsampled image without lens distortion, and the drawing rendered into it ---
 
 
 FloatImage = NDArray[np.float32]
 
-_LATTICE_COLUMNS = 80  # across the image, approximately
-_SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2  # samples per node in both directions
-_MAX_VIEW_RADIUS_NORMALISED = 1.5  # normalised: 56 degrees off the axis
+_LATTICE_COLUMNS = 80  # approximate number of nodes across the image
+_SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2
+_MAX_VIEW_RADIUS_NORMALISED = 1.5  # corresponds to 56 degrees off the optical axis
 _POINTS_PER_IMAGE_SIDE = 40
 _VALID_LENS_TO_IMAGE_RADIUS_RATIO = 1.02
-_SEARCH_RANGE_NODES = 6  # nodes to each side
-_MIN_PAPER_NODES = 200  # least number of nodes on paper
+_SEARCH_RANGE_NODES = 6  # The search covers this number of nodes to each side.
+_MIN_PAPER_NODES = 200  # Minimum number of visible nodes on the paper.
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +321,8 @@ class CoarseLattice:
         node_spacing_normalised: distance between neighbouring nodes.
         valid_radius_normalised: distance from the optical axis up to which the lens model is used;
             further out, it may map two directions to the same pixel.
-        map_x_px, map_y_px: maps for cv2.remap: the position of each sample in the reduced image.
+        map_x_px, map_y_px: maps for cv2.remap, with the position of each sample in the reduced
+            image.
         reduced_image_size_px: width and height of the reduced image.
         is_in_image: True for nodes inside the image, (rows, columns).
     """
@@ -427,8 +429,8 @@ def render_drawing(
     lattice: CoarseLattice,
     margin_nodes: int = 0,
 ) -> FloatImage:
-    """Return the whiteness, 0 to 1, of the drawing projected by H (3, 3), at the lattice's nodes
-    and at `margin_nodes` more nodes on each side."""
+    """Return the whiteness, 0 to 1, of the drawing projected by `H_normalised_drawing` (3, 3), at
+    the lattice's nodes and at `margin_nodes` additional nodes on each side."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
@@ -467,8 +469,8 @@ class DrawingMatch(NamedTuple):
 def correlate_drawing(
     H_normalised_drawing: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
-    """Compare the coarse image with the drawing projected by H (3, 3). Contrast and offset are
-    those that fit best."""
+    """Compare the coarse image with the drawing projected by `H_normalised_drawing` (3, 3), after
+    fitting the brightness and the contrast of the drawing to the image."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -495,27 +497,25 @@ def correlate_drawing(
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
 
 
-PAPER_REACH_LARGE_MARKER_HALF_SIDES = (
-    1.25  # half sides of the large marker that are certainly paper
-)
-_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # points along a cell's side
-# share of a cell's side near its ends, where the next cell's corner blurs the edge
+# Distance from the target's centre up to which there is certainly paper.
+PAPER_REACH_LARGE_MARKER_HALF_SIDES = 1.25
+_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # Points along a cell's side.
+# Margin at both ends of a cell's side, where the corner of the next cell blurs the edge.
 _EDGE_END_MARGIN_CELLS = 0.15
-_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = (
-    1.2  # half sides of the central marker, which hides the large one
-)
+# Distance from the centre, in half sides of the small marker, within which it hides the large one.
+_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = 1.2
 _TEXTURE_SIZE_PX = 320
 
 
 @dataclass(frozen=True, eq=False)
 class TargetOutline:
-    """Points along the edges of the target's drawing.
+    """Points along the black-white edges of the target's drawing.
 
     Attributes:
         points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
             from the target's centre, and unit normals (n, 2) from black to white.
-        line_index: index (n,) of the straight line that contains the point.
-        print_error_sigma_half_sides: standard deviation (n,) of that line's print error.
+        line_index: index (n,) of the straight line that each point is on.
+        print_error_sigma_half_sides: standard deviation (n,) of the print error of that line.
         cell_width_half_sides: width (n,) of the adjacent cell.
         is_small_marker: True for edges of the small marker, (n,).
     """
@@ -530,7 +530,7 @@ class TargetOutline:
 
 class DrawingTexture(NamedTuple):
     """The target and its white paper as a texture: `whiteness` (m, m), 0 to 1, and the homography
-    (3, 3) from the drawing's coordinates to the texture's pixels."""
+    `H_pixels_drawing` (3, 3) from the drawing's coordinates to the texture's pixels."""
 
     whiteness: FloatImage
     H_pixels_drawing: Array
@@ -589,8 +589,9 @@ def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
 
 
 class _CellEdge(NamedTuple):
-    """An edge between a black and a white cell: points (n, 2), unit normal from black to white, a
-    key that is equal for edges on one straight line, and the width of the cell."""
+    """An edge between a black and a white cell: points (n, 2) along the edge, its unit normal from
+    black to white, a key that is the same for all edges on one straight line, and the width of the
+    cell."""
 
     points_half_sides: Array
     drawing_normal_to_white: tuple[float, float]
@@ -625,24 +626,28 @@ def _iterate_cell_edges(
 
 
 # --- Pose of the target from the edges in view ---
-# Gauss-Newton rotates and moves the drawing until its edges match those located across them in the
-# image. The unknowns are those of a rigid body: a part of a drawing does not determine the eight
-# terms of a homography, and an unobserved tilt stays at the prediction. The unit is half the side
-# of the large marker.
+# Gauss-Newton iterations rotate and move the drawing until its edges match the edges in the image,
+# which are located on profiles across them. The unknowns are those of a rigid body's pose: a part
+# of a drawing does not determine the eight elements of a homography, and an unobserved tilt stays
+# at its prediction. The unit of length is half the side of the large marker.
 
 
-# Half lengths of the profiles per round. An ascent blurs edges near the image's border by several
-# pixels.
+# Half lengths of the profiles in each iteration. An ascent blurs edges near the image's border by
+# several pixels.
 _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
-# a step below the first limit ends the fit; a last step above the second one is a failure
+# A step below the first limit ends the fit. If the last step exceeds the second limit, the fit has
+# failed.
 _CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
-_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35  # grey levels; share of the median
+# Minimum contrast of an edge: in grey levels, and as a fraction of the median contrast.
+_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35
 _MIN_EDGE_POINTS = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
-_ROBUST_VARIANCE_FACTOR = 1.3  # compensates for the smaller squared residuals under robust weights
-_WHOLE_LINE_OFFSET_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
-# standard deviations of a prediction
+# Robust weights make the squared residuals smaller; this factor compensates for it.
+_ROBUST_VARIANCE_FACTOR = 1.3
+# Error of a whole line, due to the lens and the illumination.
+_WHOLE_LINE_OFFSET_SIGMA_PX = 0.02
+# Standard deviations of the predicted pose.
 _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     math.radians(2.0),
     math.radians(20.0),
@@ -687,10 +692,10 @@ class PoseFit:
         pose: the pose of the drawing.
         rotation_translation_cov: covariance (6, 6) of small rotations about (rad) and translations
             along (half sides of the large marker) the camera's x, y, z.
-        visible_point_count: number of edge points in the image.
-        found_point_count: number of these points at which an edge was found.
+        visible_point_count: number of edge points of the drawing that are in the image.
+        found_point_count: number of visible edge points at which an edge was found in the image.
         found_small_marker_point_count: number of found points on the small marker.
-        rms_residual_px: RMS distance of the found edges from the drawing's.
+        rms_residual_px: RMS distance of the edges found in the image from the edges of the drawing.
     """
 
     pose: RigidPose
@@ -703,7 +708,7 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """Edge points of an outline that are in the image.
+    """Those edge points of a target outline that are in the image.
 
     Attributes:
         points_px, image_normal_to_white: points (n, 2) px, and unit normals (n, 2) from black to
@@ -711,8 +716,8 @@ class _EdgePoints:
         normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal with
             respect to rotation (rad), translation (half sides) and the shift of all edges (px,
             white over black).
-        px_per_half_side: scale (n,) across the edge.
-        outline_point_index: index (n,) of the point in the outline.
+        px_per_half_side: image scale (n,) across the edge at each point.
+        outline_point_index: index (n,) of each point in the outline.
     """
 
     points_px: Array
@@ -837,8 +842,8 @@ def _edge_points_in_view(
         ],
         axis=2,
     )
-    # Motion of a point with rotation (about the drawing's centre) and translation: dx / d(X), (n,
-    # 2, 3).
+    # Derivative dx/dX (n, 2, 3) of a projected point x with respect to its position X in the camera
+    # frame. Rotations are about the drawing's centre.
     P = np.zeros((len(x), 2, 3))
     P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]
     P[:, :, 2] = -x / X[:, 2:]
@@ -852,7 +857,7 @@ def _edge_points_in_view(
     px = (normal * towards).sum(axis=1)
     normal *= np.sign(px)[:, None]
     move = np.einsum("ni,nij->nj", normal, A)
-    turn = np.cross(X - pose.t_cam_drawing_half_sides, move)  # (w x r) . m = w . (r x m)
+    turn = np.cross(X - pose.t_cam_drawing_half_sides, move)  # since (w x r)' m = w' (r x m)
     free = np.ones(len(near), dtype=np.bool_)
     if hidden_mask_u8 is not None:
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
@@ -867,8 +872,9 @@ def _edge_points_in_view(
 def _measure_offsets(
     image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the distance of each edge in the image from its expected position along the point's
-    normal, positive towards white, (n,) px, and whether an edge was found."""
+    """Return two values for each edge point: the distance (n,), px, of the edge in the image from
+    its expected position along the point's normal, positive towards white; and whether an edge was
+    found (n,)."""
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
     grey = sample_profiles(
         image,
@@ -895,7 +901,7 @@ def _solve_gauss_newton_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one robust Gauss-Newton step; None if too few edges were found.
+    """Return one Gauss-Newton step with robust weights; None if too few edges were found.
     `edge_offset_to_white_px` (n,) is the result of `_measure_offsets`. A prior pulls
     `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps, towards zero."""
     J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
