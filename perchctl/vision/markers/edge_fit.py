@@ -1,31 +1,33 @@
 """Edge fit: fit lines to a marker's four sides and intersect them.
 
-On 24 profiles across each side, the edge is the centroid of the grey gradient g under a Gaussian
-window w around the side's line. A blur that is symmetric across the edge does not move it:
+On each of 24 profiles across a side, the edge is the centroid of the grey gradient g, at the
+positions u, under a Gaussian window w around the side's line. A blur that is symmetric across the
+edge does not move the centroid:
 
     e = sum(w g u) / sum(w g)
 
-The window pulls the centroid towards its own middle by a known factor, and a neighbouring edge one
-cell away adds a known share; both are corrected. The edge points x of a side are undistorted, a
-line n.x = c is fitted by total least squares with Tukey's weights, and neighbouring lines are
-intersected:
+The window pulls the centroid towards the window's middle by a known factor, and a neighbouring edge
+one cell away adds a known share to it. Both effects are corrected. The edge points x of a side are
+undistorted, a line n.x = c is fitted to them by total least squares with Tukey's weights, and
+neighbouring lines are intersected:
 
     min over |n| = 1 of sum w_k (n.x_k - c)^2,    n_a.p = c_a,  n_b.p = c_b
 
-White that is clipped, glares or passed a gamma curve moves all edges towards black by the same
-number of pixels, d. The inner edges of the border move in the opposite direction. At the share r of
-the outer square, they appear d (1 + r) too far out. The border's width, known to be one cell,
-therefore determines d, and the lines are moved back.
+Clipping, glare and a gamma curve make white areas grow: all edges move towards black by the same
+number of pixels, d. The border's outer edges move inwards, and its inner edges move outwards. On
+the scale of the measured outer square, an inner edge at the fraction r of its size appears d (1 +
+r) too far out. The border is known to be one cell wide, so its measured width determines d, and the
+lines are moved back by d.
 
     profiles -> edges -> lines -> shift of all edges -> corners -> gates
 
-The result is wrong if light clips the white of some sides only, if a cell is only two or three
-blurs wide and its neighbours bend the sides, or if the sheet curls; the standard deviation includes
-the first two. `refine_corners_by_lines` returns None if a corner moved by more than 0.6 cells, the
-points are 0.6 px off their line, less than half of the profiles count, or the blur fills the
-window.
+The result is wrong if the white of only some sides is clipped, if a cell is only two or three times
+as wide as the blur and its neighbours bend the sides, or if the sheet is curled. The standard
+deviation covers the first two cases. `refine_corners_by_lines` returns None for a marker if a
+corner moved by more than 0.6 cells (and by more than 1.6 px), if the edge points deviate from their
+line by 0.6 px, if less than half of the profiles are inliers, or if the blur fills the window.
 
-Lengths are px in the image; lines and points are in normalised image coordinates.
+Lengths are in image pixels; lines and points are in normalised image coordinates.
 """
 
 from __future__ import annotations
@@ -58,11 +60,11 @@ from perchctl.vision.types import CameraModel, EdgeShift
 # --- Grey profiles across the sides of markers ---
 
 
-PROFILES_PER_SIDE = 24  # number across each side
-SAMPLES_PER_PROFILE = 16  # gradient samples per profile
+PROFILES_PER_SIDE = 24
+SAMPLES_PER_PROFILE = 16  # number of gradient samples; there is one more grey sample
 Floats = NDArray[np.float32]
 
-# positions along a side, between its margins
+# Positions of the profiles along a side, from -1 to 1 between the margins at its ends.
 PROFILE_POSITIONS_ALONG_SIDE: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
 _SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(
     np.float32
@@ -70,11 +72,11 @@ _SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROF
 _PROFILE_BASIS: Floats = np.stack(
     [np.ones_like(_SAMPLE_POSITIONS_HALF_LENGTHS), _SAMPLE_POSITIONS_HALF_LENGTHS]
 )
-# positions of the gradients
+# Positions of the gradient samples along a profile.
 GRADIENT_POSITIONS_HALF_LENGTHS: Floats = (
     _SAMPLE_POSITIONS_HALF_LENGTHS[1:] + _SAMPLE_POSITIONS_HALF_LENGTHS[:-1]
 ) * np.float32(0.5)
-# Values and slopes at the profiles from a polynomial through the nodes.
+# The two matrices evaluate the polynomial through the nodes, and its slope, at the profiles.
 _NODE_POSITIONS_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE_VANDERMONDE: Array = np.linalg.inv(_NODE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5.0))
 _NODE_TO_PROFILE_VALUES_MATRIX: Array = (
@@ -103,8 +105,8 @@ def make_side_profiles(
     camera: CameraModel,
 ) -> tuple[Array, Array]:
     """Return the points, px, at which the profiles cross the sides, and the unit normals at these
-    points; both (rows, n, 2). The normals point to the left when going from start to end in the
-    image, which is outwards for a marker with clockwise corners.
+    points; both (rows, n, 2). Seen from the start of a side towards its end, the normals point to
+    the left in the image, which is outwards for a marker with clockwise corners.
 
     `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the normalised ends of the sides;
     `fractions_along_side` (rows, n) come from `profile_fractions_along_side`. The image of a side
@@ -117,7 +119,7 @@ def make_side_profiles(
     )
     nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
     origin = np.matmul(_NODE_TO_PROFILE_VALUES_MATRIX, nodes)
-    # As complex numbers x + iy, a quarter turn is a single product.
+    # With complex numbers x + iy, a rotation by 90 degrees is a single multiplication.
     tangent = np.matmul(_NODE_TO_PROFILE_SLOPES_MATRIX, nodes).view(np.complex128)
     normal = tangent * (_ROTATE_90_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
@@ -129,13 +131,14 @@ def sample_profiles(
     profile_direction: Array,
     profile_half_length_px: Array,
 ) -> Floats:
-    """Return the grey values along the profiles, (rows, n, steps + 1), from -profile_half_length_px
-    to +profile_half_length_px (rows,) about `profile_centre_px` along `profile_direction`:
-    interpolated bilinearly. Outside the image, the border pixels are repeated.
+    """Return the grey values (rows, n, steps + 1) along the profiles, interpolated bilinearly. Each
+    profile extends from -profile_half_length_px to +profile_half_length_px (rows,) from its
+    `profile_centre_px` along its `profile_direction`. Outside the image, the border pixels are
+    repeated.
 
     The image is converted to float because OpenCV 5 interpolates float images at the exact
-    position. For 8-bit images, OpenCV rounds positions to 1/32 px, which would be as large as the
-    intended standard deviation of the edges.
+    position. For 8-bit images, OpenCV rounds positions to 1/32 px. This would be as large as the
+    intended standard deviation of the edge positions.
     """
     h, w = image.shape
     reach = float(profile_half_length_px.max()) + 2.0
@@ -146,7 +149,8 @@ def sample_profiles(
     right, bottom = max(right, left + 2), max(bottom, top + 2)
     patch = image[top:bottom, left:right].astype(np.float32)
     rows, n = profile_centre_px.shape[:2]
-    lines = np.empty((2, rows, n, 2), dtype=np.float32)  # x and y: origin, and direction
+    # x, y; then for each profile: origin, direction
+    lines = np.empty((2, rows, n, 2), dtype=np.float32)
     np.subtract(profile_centre_px[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
     np.subtract(profile_centre_px[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
     np.multiply(
@@ -175,30 +179,32 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
-# compensates for the smaller squared residuals and number of samples under robust weights
+# Robust weights reduce the squared residuals and the number of samples; this factor compensates.
 _ROBUST_LINE_VARIANCE_FACTOR = 1.7
-# error of an edge due to a neighbouring edge one cell away, in units of blur
+# Size and range, in units of the blur, of the error that a neighbouring edge one cell away causes.
 _NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
-_EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = (
-    0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
-)
-CLIPPED_CORNER_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
-MIN_CLIPPED_FRACTION = 0.05  # share of the profiles
-# a wide edge that is off centre extends beyond its profile
+# Profiles are too short for wide edges. The error, px, grows with the cube of the blur.
+_EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = 0.0022
+# If white is clipped, edges move by different amounts.
+CLIPPED_CORNER_SIGMA_PX = 0.1
+# White counts as clipped if more than this fraction of the profiles (or pixels) is clipped.
+MIN_CLIPPED_FRACTION = 0.05
+# A wide edge that is off centre extends beyond its profile.
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
-# of 7 px: an edge 6 px off the centre extended beyond the profile and moved by up to 0.3 px
+# Profiles reach at most 7 px to each side. An edge 6 px off the centre extended beyond its profile
+# and moved by up to 0.3 px.
 _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX = 4.0
-_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = (
-    2.0  # ratio of variances of the sides that shows jittering rows
-)
-_MIN_SIDE_ORIENTATION_VARIANCE = 0.05  # of the sides' orientations (0 to 1), to separate them
-_MIN_FLANK_CONTRAST_GREY = 6.0  # grey levels between the flanks
+# A larger ratio of the two variances shows that the image rows jitter.
+_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = 2.0
+# Vertical and horizontal sides can only be separated if their orientations (0 to 1) vary enough.
+_MIN_SIDE_ORIENTATION_VARIANCE = 0.05
+_MIN_FLANK_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side of an edge
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
-_MAX_EDGE_BLUR_CELLS = 0.45  # beyond it, the two edges of a border merge
-_MIN_SIDE_WEIGHT_SUM = 3.0  # total weight required of a side
-_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # standard deviation due to glare and gamma
-_CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.4  # standard deviation due to clipping
+_MAX_EDGE_BLUR_CELLS = 0.45  # with more blur, the two edges of a border merge
+_MIN_SIDE_WEIGHT_SUM = 3.0
+_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # The shift is due to glare and gamma.
+_CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.4  # The shift is due to clipping.
 CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
 _PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
@@ -207,7 +213,7 @@ _MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
 _ZERO_MEAN_PARABOLA: Array = (
     PROFILE_POSITIONS_ALONG_SIDE**2 - (PROFILE_POSITIONS_ALONG_SIDE**2).mean()
 )
-_MIN_SIGNIFICANT_BOW_SIGMAS = 3.0  # standard deviations
+_MIN_SIGNIFICANT_BOW_SIGMAS = 3.0
 
 
 def refine_corners_by_lines(
@@ -218,11 +224,11 @@ def refine_corners_by_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers with corners (m, 4, 2) px and intersect them to get
-    refined corners. The entry of a marker is None if not all four sides were found.
+    refined corners. The result for a marker is None if not all four of its sides were found.
 
-    `cells_along_border` are the cells inside each marker's border. The common shift of all edges is
-    measured unless the caller passes `known_edge_shift`. If a marker's edges are wide or near the
-    ends of the profiles, the fit is repeated with the profiles centred on the edges.
+    `cells_along_border` describes the cells just inside each marker's border. The common shift of
+    all edges is measured unless the caller passes `known_edge_shift`. If a marker's edges are wide
+    or near the ends of the profiles, the fit is repeated with the profiles centred on the edges.
     """
     found = _refine_lines_once(image, raw_corners_px, cells_along_border, camera, known_edge_shift)
     centred = raw_corners_px.copy()
@@ -262,7 +268,7 @@ def _refine_lines_once(
     )
     is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
-        # The edge shift due to clipping changes with the light.
+        # The edge shift due to clipping changes with the light, so it is measured again.
         return _refine_lines_once(image, raw_corners_px, cells_along_border, camera, None)
     line_nx_ny_c, rms_residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
@@ -286,7 +292,8 @@ def _refine_lines_once(
         return found
     corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
     accepted = _are_sides_accepted(markers, outer_edges, rms_residual_px, corners_px)
-    # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
+    # The standard deviation of a line fitted to n samples is twice as large at its ends as in its
+    # middle.
     independent = np.maximum(
         np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
     )
@@ -320,8 +327,9 @@ def _refine_lines_once(
 
 
 def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Array]:
-    """Return the coefficients (4m, 3) of the sides' lines in normalised coordinates: nx, ny, c with
-    n.x = c and |n| = 1; and the weighted RMS distance of the points from the lines, px (4m,)."""
+    """Return two values for the lines fitted to the sides: the coefficients (4m, 3) in normalised
+    coordinates, nx, ny, c with n.x = c and |n| = 1; and the weighted RMS distance, px (4m,), of the
+    points from the lines."""
     w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
     x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
@@ -345,8 +353,8 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
 
 
 def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
-    """Return the intersections of side i - 1 and side i of each marker, (m, 4, 2), normalised.
-    `line_nx_ny_c` (4m, 3) as from `_fit_lines`."""
+    """Return the intersections (m, 4, 2) of side i - 1 and side i of each marker in normalised
+    coordinates. `line_nx_ny_c` (4m, 3) is the result of `_fit_lines`."""
     sides = line_nx_ny_c.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -360,8 +368,8 @@ def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
 
 
 def edge_shift_prior_sigma_px(white_grey: float) -> float:
-    """Return the prior standard deviation, px, of the growth of white over black before it is
-    measured. It is larger if the grey level of the white paper, `white_grey`, is clipped."""
+    """Return the prior standard deviation, px, of the growth of white over black, before any
+    measurement. It is larger if `white_grey`, the grey level of the white paper, is clipped."""
     return (
         _CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX
         if white_grey > CLIPPED_GREY
@@ -378,12 +386,12 @@ def _measure_edge_shift(
     corners_normalised: Array,
 ) -> EdgeShift | None:
     """Measure how far white has grown over black, px, from the width of a marker's black border.
-    `corners_normalised` (m, 4, 2) are the measured corners of the outer edges. None if no inner
-    edge was sampled.
+    `corners_normalised` (m, 4, 2) are the measured corners of the outer edges. Returns None if no
+    inner edges were sampled.
 
-    A growth by d moves the border's outer edge in, and its inner edge out, by d. In the marker's
-    own scale, whose unit is the outer edge as measured, an inner edge at r then appears at r + d (1
-    + r), and this is solved for d.
+    A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. On a
+    scale whose unit is the measured outer edge, an inner edge at r then appears at r + d (1 + r).
+    This is solved for d.
     """
     if inner_edges is None:
         return None
@@ -408,7 +416,8 @@ def _measure_edge_shift(
     some = mass > _MIN_SIDE_WEIGHT_SUM
     if not some.any():
         return EdgeShift(0.0, prior_px)
-    # A curled sheet moves outer edges further than inner ones, and ends further than middles.
+    # If the sheet is curled, the outer edges move further than the inner ones, and the ends of a
+    # side move further than its middle.
     bent_px = (
         8.0
         * r
@@ -423,7 +432,7 @@ def _measure_edge_shift(
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
-    # Sides that disagree reduce the weight.
+    # If the sides disagree, the measurement gets less weight.
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
@@ -440,8 +449,8 @@ def _measure_edge_shift(
 def _side_bow_px(
     markers: MarkerSides, outer_edges: EdgeData, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
-    """Return the bow of the widest marker's sides, px: by how much their ends are further out than
-    their middles. 0 if it is not significant."""
+    """Return the bow of the sides of the marker with the widest cells: by how much, px, their ends
+    are further out than their middles. The result is 0 if the bow is not significant."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
@@ -458,7 +467,8 @@ def _side_bow_px(
 
 
 def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
-    """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
+    """Return the direction (4m,) of each line's normal: +1 if it points out of its marker,
+    otherwise -1."""
     corners = markers.corners_normalised
     out = (corners - (_MEAN_OF_FOUR_WEIGHTS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
@@ -468,7 +478,7 @@ def _are_sides_accepted(
     markers: MarkerSides, outer_edges: EdgeData, rms_residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
-    # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
+    # Contrast between two samples near the ends of each profile: dark inside, white outside.
     contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
         _PROFILE_ONES_F32
     )
@@ -492,7 +502,8 @@ def _corner_sigma_px(
     print_tolerance_cells: float,
 ) -> float:
     blur_sigma_px = max(blur_sigma_px, 1e-3)
-    # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
+    # If cells are only a few pixels wide, the blur of the inner pattern reaches the border's outer
+    # edge.
     bend_px = (
         _NEIGHBOUR_BEND
         * blur_sigma_px
@@ -513,8 +524,8 @@ def _row_jitter_sigma_px(
     it is not significant. Jitter only moves vertical sides, so they scatter more than horizontal
     ones.
 
-    `side_normals_x` are the x components of the four sides' unit normals, and
-    `line_end_variances_px2` the variances of the ends of the lines fitted to them."""
+    `side_normals_x` are the x components of the four sides' unit normals. `line_end_variances_px2`
+    are the variances at the ends of the lines fitted to the sides."""
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -531,10 +542,11 @@ def _row_jitter_sigma_px(
 
 
 # --- Measurement of the markers' sides: position of the edge on profiles across each side ---
-# Rows 4 i to 4 i + 3 belong to marker i; then the inner edges of one marker's border may follow.
+# Rows 4 i to 4 i + 3 belong to marker i. The inner edges of one marker's border may follow as four
+# more rows.
 
 
-_MIN_EDGE_SHIFT_CELL_PX = 6.0  # cell of a border whose inner edge is measured too
+_MIN_EDGE_SHIFT_CELL_PX = 6.0  # with smaller cells, the border's inner edge is not measured
 _SIDE_INDICES = np.arange(4)[:, None]
 
 
@@ -543,14 +555,14 @@ class MarkerSides:
     """The sides of m markers before their edges are measured.
 
     Attributes:
-        raw_corners_px: corners (m, 4, 2) in the image.
+        raw_corners_px: corners (m, 4, 2) in the image, before any refinement.
         cells_along_border: the cells inside each marker's border.
         corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
         side_lengths_px: lengths (m, 4).
-        cell_width_across_side_px: width (m, 4) of the border across each side.
+        cell_width_across_side_px: width (m, 4) of the border, perpendicular to each side.
         cell_size_px: mean width of a cell, (m,).
         widest_marker_index: index of the marker with the widest cells.
-        winding_sign: direction of the corners, +1 or -1, (m,).
+        winding_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
         px_per_normalised: pixels per unit of normalised coordinates along each side, (4m,).
     """
 
@@ -606,7 +618,7 @@ def prepare_marker_sides(
         cells_along_border=cells_along_border,
         corners_normalised=corners,
         side_lengths_px=sides_px,
-        # The inner row is one cell further in, along the neighbouring sides.
+        # The inner edge is one cell further in, measured along the neighbouring sides.
         cell_width_across_side_px=0.5 * across_px / cells[:, None],
         cell_size_px=cell_size_px,
         widest_marker_index=int(cell_size_px.argmax()),
@@ -619,8 +631,8 @@ def measure_edges(
     image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner_edges: bool
 ) -> tuple[EdgeData, EdgeData | None]:
     """Return the edges of all sides (4m rows), and the four inner edges of the black border of the
-    marker with the widest cells (`widest_marker_index`); None without `with_inner_edges`, or if
-    that marker's cells are too narrow."""
+    marker with the widest cells (`widest_marker_index`). The inner edges are None if
+    `with_inner_edges` is False or if that marker's cells are too narrow."""
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
         markers.side_lengths_px,
@@ -641,7 +653,8 @@ def measure_edges(
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
         of = np.append(of, (widest, widest, widest, widest))
-    # Normals point out of a marker with clockwise corners; dark must come first.
+    # The normals point out of a marker with clockwise corners. A profile must start on its dark
+    # side.
     sign = markers.winding_sign[of]
     if with_inner_edges:
         sign[-4:] *= -1.0
@@ -677,8 +690,8 @@ def measure_edges(
 
 
 def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Array]:
-    """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
-    size."""
+    """Return two half lengths, px, for cells of the given size: of the windows around edges, and of
+    the profiles."""
     window_half_length_px = np.minimum(np.maximum(0.85 * cell_size_px, 1.5), 7.0)
     return window_half_length_px, np.minimum(np.maximum(1.5 * cell_size_px, 1.75), 7.0)
 
@@ -690,7 +703,7 @@ def find_neighbour_edges(
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
     """Return which parallel edges, one cell further in or out, blur into the measured edges.
-    `fractions_along_side` (rows, n) are fractions of a side.
+    `fractions_along_side` (rows, n) are the positions of the profiles as fractions of a side.
 
     The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
     four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
@@ -706,10 +719,9 @@ def find_neighbour_edges(
             _SIDE_INDICES, (fractions_along_side[four] * rim.cells_per_side).astype(np.intp)
         ]
     if len(fractions_along_side) > 4 * len(cells_along_border):
-        at = 1.0 + fractions_along_side[-4:] * (
-            cells_along_inner_edges.cells_per_side - 2
-        )  # in cells from the border's corner
-        # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
+        # Position of each profile, in cells from the border's corner.
+        at = 1.0 + fractions_along_side[-4:] * (cells_along_inner_edges.cells_per_side - 2)
+        # Blur bends the edge if the nearest inner cell, or the cell behind it, is black.
         free = cells_along_inner_edges.are_first_two_inner_cells_white[
             _SIDE_INDICES, (at - 0.3).astype(np.intp)
         ]
@@ -726,37 +738,37 @@ def find_neighbour_edges(
     )
 
 
-# --- Edges between black and white to 0.01 px, on grey profiles across them ---
-# An edge is the windowed centroid of the gradient, first with a wide window, then with one centred
-# on the side's own line. Values per side are (rows,), values per profile (rows, n).
+# --- Location of black-white edges, accurate to 0.01 px, on grey profiles across them ---
+# An edge is located at the windowed centroid of the gradient, first with a wide window and then
+# with a narrow window centred on the side's line. Values per side have the shape (rows,), values
+# per profile (rows, n).
 
 
 _PROFILE_POSITIONS_ALONG_SIDE_F32 = PROFILE_POSITIONS_ALONG_SIDE.astype(np.float32)
-# squares of the window's standard deviation: in units of the blur's, and px^2
+# Variance of the window relative to the blur's variance, and its lower limit.
 _WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
-_MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9  # share of the gradient that neighbouring edges may cause
-# second moment of an edge: px^2, and in units of the window's variance
+# Neighbouring edges are assumed to cause at most this fraction of the gradient.
+_MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9
+# Limits of an edge's second moment; the upper one is relative to the window's variance.
 _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
-# inverse standard deviation of the wide window, times its half length
+# Half length of the wide window, in units of its standard deviation.
 _WIDE_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
 _PROFILE_POSITION_POWERS: Floats = (PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(3)).astype(
     np.float32
 )
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
-_MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = (
-    0.3  # a profile is usable if its gradient is at least this share of the row's mean
-)
-_MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # minimum cutoff, so that ordinary noise is not rejected
-_MAX_WIDE_WINDOW_ERROR_PX = (
-    0.2  # if the wide window is off by less than this, one narrow iteration is enough
-)
+# A profile is usable if its gradient is at least this fraction of the mean gradient in its row.
+_MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = 0.3
+_MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # A smaller cutoff would reject ordinary noise.
+# If the wide window is off by less than this, one iteration with the narrow window is enough.
+_MAX_WIDE_WINDOW_ERROR_PX = 0.2
 _MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
 _OUT_OF_RANGE_PX = 1e6
 _PROFILES_PER_QUARTER_SIDE = PROFILES_PER_SIDE // 4
 _QUARTER_SIDE_ONES: Floats = np.ones(_PROFILES_PER_QUARTER_SIDE, dtype=np.float32)
-# The line through the values in the middles of both halves of the profiles, (2, n).
+# Matrix (2, n) that maps the midmeans in both halves of a side to the line through them.
 _HALF_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
     0.5 / float(PROFILE_POSITIONS_ALONG_SIDE[PROFILES_PER_SIDE // 2 :].mean())
 )
@@ -793,11 +805,12 @@ def locate_edges(
     neighbours: NeighbourEdges,
 ) -> tuple[Array, Array, Array]:
     """Locate the dark-to-bright edge on each profile. Return each edge's offset from the middle of
-    the profile, px (rows, n); its weight, 0 for outliers (rows, n); and the blur of each row, px
-    (standard deviation, (rows,)).
+    the profile, px (rows, n); its weight (rows, n), 0 for outliers; and the standard deviation of
+    the blur in each row, px (rows,).
 
     Args:
-        profile_greys: (rows, n, steps + 1), the profile from -half_px to +half_px.
+        profile_greys: grey values (rows, n, steps + 1) along each profile, from
+            -profile_half_length_px to +profile_half_length_px.
         profile_half_length_px, window_half_length_px: half length of the profiles and of the
             windows, (rows,).
     """
@@ -838,21 +851,22 @@ class _EdgeProfiles:
         around: NeighbourEdges,
     ) -> None:
         self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
+        # positions of the gradient samples, px (rows, steps)
         self.u = (
             profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS
-        )  # position, (rows, steps)
+        )
         self.near, self.depth = (
             window_half_length_px.astype(np.float32),
             around.neighbour_distance_px.astype(np.float32),
         )
-        self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
-        # Neighbouring edges on the flanks: number on both, and outside minus inside.
+        self.most2 = 0.25 * self.near * self.near  # Maximum variance of a window.
+        # Number of neighbouring edges on both sides, and the difference outside minus inside.
         self.both, self.side = (
             around.inner_neighbour_count + around.outer_neighbour_count,
             around.outer_neighbour_count - around.inner_neighbour_count,
         )
         self.can = around.is_edge_locatable.astype(np.float32)
-        # Factor for the sum over a row's profiles: a share of the mean over the possible ones.
+        # The sum over a row's profiles times this factor is the minimum gradient of a usable one.
         self.part = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
             self.can.dot(_PROFILE_ONES_F32), 1.0
         )
@@ -888,7 +902,8 @@ class _EdgeProfiles:
         mass *= self.gradient
         total = (mass @ _SAMPLE_ONES) * self.can
         is_usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
-        # Share, position and spread of a neighbour seen through the window.
+        # Share of the gradient, position and spread of a neighbouring edge, as seen through the
+        # window.
         wide2 = w2 + blur_variance_px2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
@@ -907,7 +922,7 @@ class _EdgeProfiles:
             np.maximum(moment, _MIN_SECOND_MOMENT_PX2), _MAX_SECOND_MOMENT_RATIO * w2
         )
         found2 = moment * w2 / (w2 - moment)
-        # Undo the pull of the window on the centroid.
+        # Correct for the window, which pulls the centroid towards its middle.
         centroid = first / total * (1.0 + found2 / w2)[:, None]
         limit = self.near[:, None]
         return line_offsets_px + np.minimum(np.maximum(centroid, -limit), limit), is_usable, found2
@@ -923,7 +938,8 @@ def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bo
     halves.sort(axis=2)
     first = _PROFILES_PER_QUARTER_SIDE // 2
     middle = halves[:, :, first : first + _PROFILES_PER_QUARTER_SIDE]
-    # Excluded before the sum: next to huge values, an edge's position would be rounded away.
+    # Exclude fill values before the sum: added to such large values, the edge positions would be
+    # lost to rounding.
     shown = np.abs(middle) < _OUT_OF_RANGE_PX
     count = shown @ _QUARTER_SIDE_ONES
     mean = (middle * shown) @ _QUARTER_SIDE_ONES / np.maximum(count, 1.0)
@@ -956,7 +972,7 @@ def _fit_robust_line(
 
 
 def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
-    """Return each row's median over its usable values, (rows,); 0 if it has none."""
+    """Return the median (rows,) of the usable values in each row; 0 for a row without any."""
     values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
