@@ -1,14 +1,14 @@
 """Detect the corners of the target's two markers in an image.
 
-`CORNER_METHODS` lists the methods that find corners in the order in which they are tried, with the
-requirements, cost and use of each; ``docs/corners.md`` shows examples of all.
+`CORNER_METHODS` lists the methods that find corners, in the order in which they are tried, with the
+requirements and cost of each method and when it runs. ``docs/corners.md`` shows an example of each.
 
     frame -> DetectionPrior -> CORNER_METHODS, one by one -> CornerResults -> Detections
              (expected corners, kinds of search)
 
 Corners are (4, 2) px, top left, top right, bottom right, bottom left as printed; (0, 0) is the
-centre of the top-left pixel. Each marker's corners have one standard deviation (px) or a covariance
-(8, 8) px^2. A marker that no method confirms is None.
+centre of the top-left pixel. The corners of a marker have either one standard deviation, px, or a
+covariance (8, 8), px^2. The result is None for a marker that no method confirms.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-_MIN_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
-# number of frames for which a measured edge shift stays valid, since the light changes slowly
+_MIN_SEARCHED_SIDE_PX = 13.0  # The search does not find smaller markers.
+# A measured edge shift stays valid for this number of frames because the light changes slowly.
 _MAX_EDGE_SHIFT_AGE_FRAMES = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
 
@@ -84,26 +84,26 @@ _FoundCorners = dict[MarkerName, RefinedCorners]
 
 @dataclass(frozen=True, eq=False)
 class DetectionPrior:
-    """What is known about the target before a frame is searched.
+    """What is known about the target before its markers are detected in a frame.
 
     Attributes:
         expected_corners_px: the markers' predicted corners, each (4, 2) px; empty if no target is
             expected.
-        expected_corners_both_markers_px: the same, with a missing marker derived from the other
-            one.
+        expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
+            missing marker is derived from the other one. Empty if no target is expected.
         search_mode: the kinds of search for this frame.
         initial_blur_frame_counter: frame counter; its parity selects a small or a large initial
             blur for the fits to blurred markers (see `find_expected_blurred`).
-        was_target_seen_recently: a marker was found at most
+        was_target_seen_recently: True if a marker was found at most
             `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
             are disabled.
-        was_target_truncated: `was_target_seen_recently` is True, and every marker was truncated or
-            hidden in the last image with a detection.
+        was_target_truncated: True if `was_target_seen_recently` is True and the image border
+            truncated every marker that was detected last.
         previous_edge_shift: how far white has grown over black (blooming), measured in a recent
-            frame; None: measure it in this frame.
+            frame; None if it must be measured in this frame.
         measure_own_target_distance_m: function that returns a marker's horizontal distance, m, from
             the expected position of this vehicle's own target. It selects one of several targets if
-            no position is expected. None: select by the image alone.
+            none is expected at a known position. None if only the image is used to select a target.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
@@ -118,8 +118,8 @@ class DetectionPrior:
 
 @dataclass(frozen=True, eq=False)
 class CornerResults:
-    """Results of the corner methods tried so far: the markers' refined `corners`, and the raw
-    corners from the last search, `search_result`."""
+    """Results of the corner methods tried so far: the refined `corners` of each marker, and
+    `search_result`, the raw corners from the last search."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
     search_result: FoundMarkers = field(default_factory=FoundMarkers)
@@ -134,9 +134,10 @@ class CornerMethod:
         requirements_text: what the method needs, in words.
         cost_text: typical time for an image of 640x480 on one core.
         run_condition_text: when the method runs, in words (`should_run`).
-        should_run: function that returns True if the method should be tried on the image, given
-            the prior and the findings so far.
-        find: function that returns the findings that replace the previous ones.
+        should_run: function that returns True if the method should be tried on the image, given the
+            prior and the results so far.
+        find: function that runs the method and returns the new results, which replace the previous
+            ones.
     """
 
     name: str
@@ -179,7 +180,8 @@ def _has_edge_fit_found_nothing(
 def _search_half_size(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    # If no side was found, a close target has usually moved further than a profile reaches.
+    # If the edge fit found no sides, a close target has usually moved further than a profile
+    # reaches.
     searched = search_half_size(detector_input, prior.expected_corners_both_markers_px)
     if searched is None:
         return earlier_results
@@ -358,14 +360,13 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         find=_search_blurred,
     ),
 )
-"""The methods, tried in this order in each image. With ``detector.refinement: subpix``, only the
-search is used."""
+"""The corner methods in the order in which they are tried on each image. With
+``detector.refinement: subpix``, only the search is used."""
 
 
 def find_corners(detector_input: DetectorInput, prior: DetectionPrior) -> CornerResults:
-    """Find the markers' corners with each applicable method of `CORNER_METHODS` in turn.
-
-    Each method starts from the findings of the methods before it.
+    """Find the markers' corners with each applicable method of `CORNER_METHODS` in turn. Each
+    method starts from the results of the methods before it.
     """
     found = CornerResults()
     for method in CORNER_METHODS:
@@ -386,10 +387,11 @@ def detect_markers(
     """Find and refine the target's markers in one frame.
 
     The search starts at `expected_corners_px`, each (4, 2), predicted from the vehicle's motion, or
-    otherwise near the `previous` detections. `frames_without_markers`, the number of frames without
-    markers since the last marker, alternates the kinds of search; None, for the first frame,
-    applies all kinds. If no target is expected, `measure_own_target_distance_m` chooses one of
-    several. For a frame of two fields, the result is the mean of the fields.
+    otherwise near the `previous` detections. The kinds of search alternate depending on
+    `frames_without_markers`, the number of successive frames without a marker. If it is None, as
+    for the first frame, all kinds of search are used. If no target is expected,
+    `measure_own_target_distance_m` chooses one of several targets. For a frame of two fields, the
+    result is the mean of the fields.
     """
     prior = make_detection_prior(
         frame,
@@ -415,7 +417,8 @@ def make_detection_prior(
     frames_without_markers: int | None = None,
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> DetectionPrior:
-    """Return what is known before the frame; arguments as in `detect_markers`."""
+    """Return what is known about the target before the frame. The arguments are those of
+    `detect_markers`."""
     expected_corners_px = (
         dict(expected_corners_px)
         if expected_corners_px
@@ -427,7 +430,7 @@ def make_detection_prior(
     initial_blur_frame_counter = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
         initial_blur_frame_counter = (frames_without_markers + 2) // 4
-    # A part of the target is recognized only at a position measured a short time ago.
+    # A part of the target is only recognized at a position that was measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
         previous is not None
@@ -479,9 +482,9 @@ def _detect(
 def _choose_search_mode(
     frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
-    """Return the kind of search for this frame: with a marker in the previous frame, near the
-    expected corners; otherwise, to save time, the kinds alternate from frame to frame. None as
-    `frames_without_markers` selects all kinds."""
+    """Return the kind of search for this frame. If the previous frame showed a marker, the search
+    is near the expected corners. Otherwise, to save time, the kinds of search alternate from frame
+    to frame. If `frames_without_markers` is None, all kinds are selected."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -490,7 +493,7 @@ def _choose_search_mode(
         if frames_without_markers == 0:
             return "near_expected"
         return "expected_fits" if frames_without_markers % 4 else "expected_window"
-    # At 0, something was seen, but not at the expected position.
+    # If `frames_without_markers` is 0, something was seen, but not at the expected position.
     every = DetectorConfig.blurred_every
     return (
         "whole_blurred"
@@ -514,10 +517,10 @@ def _is_marker_missing(
 
 
 def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
-    """Refine the raw corners from a search by the edge fit, or else by subpixel refinement. The
-    partial-view fit measures markers that are truncated or hidden, because a search mistakes the
-    image border for a side of the marker. The photometric fit follows if the edges are not accurate
-    enough."""
+    """Refine the raw corners from a search with the edge fit or, if it fails, with subpixel
+    refinement. Markers that are truncated or hidden are measured with the partial-view fit, because
+    a search mistakes the image border for a side of the marker. The photometric fit follows if the
+    edges are not accurate enough."""
     image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
@@ -586,12 +589,13 @@ def _make_detection(
 
 
 _MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
-_MAX_FLOW_AGE_S = 0.25  # older image motion does not predict positions
+_MAX_FLOW_AGE_S = 0.25  # older image motion is useless for predicting positions
 
 
 def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return each marker's corners (4, 2) px, extrapolated from `previous` to `t_s` by their image
-    velocity; empty if no velocity is known."""
+    """Return the corners (4, 2) px of each marker in `previous`, extrapolated to `t_s` with their
+    image velocity. Without a recent velocity, the corners stay where they were. Empty if `previous`
+    has no markers."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -604,7 +608,8 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
 
 
 def add_marker_flow(current: Detections, previous: Detections | None) -> Detections:
-    """Return `current` with the image velocity, px/s, of its markers' corners since `previous`."""
+    """Return `current` with the image velocity, px/s, of its markers' corners since the `previous`
+    detections."""
     if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_FLOW_AGE_S:
         return current
     flow: dict[MarkerName, Array] = {}
@@ -621,24 +626,23 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
 # --- Photometric fits for markers that the edge fit measured poorly or missed ---
 
 
-_MIN_ACCURATE_LINE_FIT_CELL_PX = (
-    6.0  # with larger cells, a line fit is as accurate as a photometric fit, and faster
-)
-# the same limit as a ratio of a cell's width to the blur's standard deviation
+# With larger cells, a line fit is as accurate as a photometric fit, and faster.
+_MIN_ACCURATE_LINE_FIT_CELL_PX = 6.0
+# For this accuracy, a cell must also be wider than this multiple of the blur's standard deviation.
 _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
-_MAX_ALIGNMENT_MOTION_SIDES = 0.3  # share of the side
-# A marker whose position follows from the other one may have a larger standard deviation.
-_MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12  # share of the side
-_DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5  # initial guess if the blur is unknown
+_MAX_ALIGNMENT_MOTION_SIDES = 0.3
+# A marker that is located from the other marker may have a larger standard deviation.
+_MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12
+_DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5
 _SAMPLING_BLUR_SIGMA_PX = 0.37
-"""Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
-drawing, px."""
+"""Standard deviation, px, that pixels and interpolation add to the measured blur of a marker's
+sides, but not to the blur of its drawing."""
 _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
-    """True if the corners come from an edge fit that is as accurate as a photometric fit: with
-    cells of at least 6 px and 6 times the blur."""
+    """True if the corners come from an edge fit that is as accurate as a photometric fit. For this,
+    a cell must be at least 6 px wide, and at least 6 times as wide as the blur."""
     cell_size_px = mean_side_px(corners.corners_px) / pattern.cells_along_border.cells_per_side
     return corners.are_corners_fitted and cell_size_px >= max(
         _MIN_ACCURATE_LINE_FIT_CELL_PX,
@@ -649,11 +653,11 @@ def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> b
 def refine_photometrically(
     detector_input: DetectorInput, found_corners: _FoundCorners, is_from_search: bool = False
 ) -> _FoundCorners:
-    """Fit the drawing to each marker in `found_corners` whose edge fit is not accurate enough, and
-    add the other marker, located from the one that was found, if it is visible.
+    """Fit the drawing to each marker in `found_corners` whose edge fit is not accurate enough. If
+    only one marker was found, locate the other one from it, and add it if it is visible.
 
-    If `is_from_search`, a single marker is dropped unless its edge fit is accurate enough or the
-    drawing confirms it.
+    If `is_from_search` is True, a single marker is dropped unless its edge fit is accurate enough
+    or the drawing confirms it.
     """
     image, patterns, better = (
         detector_input.image,
@@ -696,9 +700,9 @@ def refine_photometrically(
 
 
 def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
-    """Return the initial blur, px (standard deviation), for a photometric fit: the blur of the
-    sides if lines were fitted to them, otherwise `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also
-    the upper limit."""
+    """Return the standard deviation of the initial blur, px, for a photometric fit. It is the blur
+    of the sides if lines were fitted to them; otherwise it is `_DEFAULT_INITIAL_BLUR_SIGMA_PX`,
+    which is also the upper limit."""
     if (
         corners is None
         or not corners.are_corners_fitted
@@ -717,8 +721,9 @@ def _initial_corners_px(
     this, other = found_corners.get(name), found_corners.get(_OTHER_MARKER[name])
     if this is not None:
         if this.cov_px2 is not None:
-            return None  # an obstacle in front of the marker would also disturb the photometric fit
-        # Small cells matter only if no larger ones were measured.
+            # Whatever hides a part of the marker would also disturb the photometric fit.
+            return None
+        # Small cells only matter if no larger ones were measured.
         enough = is_line_fit_sufficient(this, detector_input.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
         return None if this.are_corners_fitted and enough else this.corners_px
@@ -727,11 +732,11 @@ def _initial_corners_px(
     return None
 
 
-# --- Markers at their expected positions: no search, only verification ---
+# --- Markers at their expected positions, which are only verified, not searched for ---
 
 
-_MIN_LINE_FIT_CELL_PX = 2.5  # least cell size for line fits
-_MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES = 0.12  # share of the small marker's side
+_MIN_LINE_FIT_CELL_PX = 2.5
+_MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES = 0.12
 
 
 def fit_lines(
@@ -740,11 +745,11 @@ def fit_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Fit the four sides of each marker, starting at `start_corners_px` (4, 2), and return the
-    markers with four straight sides. This function does not check the cells.
+    markers whose four sides are straight. This function does not check the cells.
 
     All markers are fitted together, because blooming and gamma move all edges of an image by the
-    same number of pixels. `known_edge_shift` is how far white has grown over black, if measured
-    before; None measures it.
+    same number of pixels. `known_edge_shift` is how far white has grown over black, if this was
+    measured before; None measures it.
     """
     if not start_corners_px:
         return {}
@@ -765,8 +770,8 @@ def refine_expected_markers(
     expected_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Measure the expected markers, with corners (4, 2) px, by edge fits. Return those whose sides
-    and cells the image confirms.
+    """Measure the expected markers, with corners (4, 2) px, by edge fits. Return the markers whose
+    sides and cells the image confirms.
 
     A marker is omitted if it is more than 0.85 cells (at most 7 px) from its expected position, if
     it is truncated or hidden, or if its cells are smaller than 2.5 px. `known_edge_shift` is how
@@ -831,8 +836,8 @@ def add_partly_visible_markers(
 def find_large_marker_around_small(
     detector_input: DetectorInput, small: RefinedCorners
 ) -> RefinedCorners | None:
-    """Return the large marker around a detected small one; the large one may be partly covered or
-    cut. None if the image does not confirm it."""
+    """Return the large marker around a detected small one, or None if the image does not confirm
+    the large marker. The large marker may be partly hidden or truncated."""
     image, pattern = detector_input.image, detector_input.setup.patterns["large"]
     start = detector_input.derive_corners_from_other_marker_px(small.corners_px, "large")
     if not np.isfinite(start).all():
@@ -846,8 +851,8 @@ def find_large_marker_around_small(
         )
 
     if is_inside_image(start, image.shape, IMAGE_MARGIN_PX):
-        # The small marker only gives an approximate position, so the fit is repeated from its first
-        # result.
+        # The small marker only yields an approximate position, so the fit is repeated from its
+        # first result.
         found = fit_lines(detector_input, {"large": start}).get("large")
         if found is not None:
             found = fit_lines(detector_input, {"large": found.corners_px}).get("large")
@@ -860,15 +865,16 @@ def find_large_marker_around_small(
     return partly if partly and is_centred(partly) else None
 
 
-# --- Mean of the markers in two fields, at the time half way between them ---
+# --- Mean of the markers in two fields, at the time halfway between the fields ---
 
 
-_MAX_FIELD_MOTION_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
+_MAX_FIELD_MOTION_SIDES = 1.5  # corresponds to 1.9 m/s for the small marker
 
 
 def average_fields(first: Detections, second: Detections) -> Detections:
-    """Return the mean corners of the two fields, which do not depend on the field order. If any
-    marker was detected in both fields, markers detected in only one field are omitted."""
+    """Return the mean of the corners in two fields, which does not depend on the order of the
+    fields. If any marker was detected in both fields, markers detected in only one field are
+    omitted."""
     averaged: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)

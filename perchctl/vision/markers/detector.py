@@ -1,8 +1,9 @@
-"""Constants for the detection of the target's markers, made once: dictionaries, patterns, and the
-mask of the vehicle's own gear.
+"""Data for detecting the target's markers, computed once: dictionaries, patterns, and the mask of
+the vehicle's own gear.
 
-Each marker has a dictionary with its single id, so that no other marker can be mistaken for it (0/1
-correction bits: no false accept in 28 images without a target; 0/3: 7 of 28).
+Each marker has its own dictionary with a single id, so that no other marker can be mistaken for it.
+In 28 images without a target, 0 and 1 correction bits (large and small marker) led to no false
+detection; 0 and 3 correction bits led to false detections in 7 images.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRRORED_MARKER_ID = 1
-"""Index of the mirror image in a marker's dictionary."""
-# error of an edge: the errors of its hundreds of printed dots average out
+"""Index of the marker's mirror image in its dictionary."""
+# The error of an edge is small because the errors of its hundreds of printed dots average out.
 _PRINT_EDGE_SIGMA_M = 1e-6
-_MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, at 640 px
+_MIN_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
 _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_POLYGON_ACCURACY_RATE = 0.1
 
@@ -39,7 +40,7 @@ ThresholdWindowRange = tuple[int, int]
 10."""
 OPENCV_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (3, 23)
 """OpenCV's default windows."""
-# sufficient if both markers were seen in the previous frame
+# A single window is sufficient if both markers were seen in the previous frame.
 QUICK_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (13, 13)
 _LOOSE_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
 
@@ -50,8 +51,8 @@ class DetectorSetup:
 
     Attributes:
         large_and_small_aruco_dictionaries: OpenCV's dictionaries, with one marker each.
-        patterns: appearance of both markers.
-        small_to_large_side_ratio: side of the small marker over that of the large one.
+        patterns: appearance of each marker.
+        small_to_large_side_ratio: side of the small marker divided by the side of the large one.
         is_line_fit_enabled: if False, markers are only detected by OpenCV and refined by
             `refine_subpix`, without edge fits and photometric fits.
         static_hidden_mask: True for pixels that the vehicle covers, (h, w).
@@ -67,7 +68,7 @@ class DetectorSetup:
 def make_detector_setup(
     config: DetectorConfig, target: TargetConfig, static_hidden_mask: HiddenMask | None = None
 ) -> DetectorSetup:
-    """Return the setup for a target, with dictionaries that contain only its markers' ids.
+    """Return the setup for a target, with dictionaries that only contain the target's markers.
     `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every image."""
     large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
     small_to_large_side_ratio = target.small.side_m / target.large.side_m
@@ -99,11 +100,10 @@ def make_detector_setup(
 def make_aruco_detector(
     setup: DetectorSetup, size_px: tuple[int, int], threshold_windows_px: ThresholdWindowRange
 ) -> Any:
-    """Return OpenCV's marker detector for images of `size_px` (width, height);
-    `threshold_windows_px` is the smallest and the largest window over which the adaptive threshold
-    averages."""
+    """Return OpenCV's marker detector for images of `size_px` (width, height). The adaptive
+    threshold averages over windows from the smallest to the largest of `threshold_windows_px`."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.errorCorrectionRate = 1.0  # makes maxCorrectionBits the limit itself
+    parameters.errorCorrectionRate = 1.0  # the limit is then maxCorrectionBits itself
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = threshold_windows_px
@@ -112,7 +112,7 @@ def make_aruco_detector(
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral: its
+    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral. Its
     candidates are then compared with blurred markers, whose bits OpenCV cannot read."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
@@ -125,7 +125,7 @@ def make_quad_detector(setup: DetectorSetup) -> Any:
 
 
 def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
-    """Return the inner bits (n, n) of the profile's marker, 1 = white."""
+    """Return the inner bits (n, n) of a marker in the profile, 1 = white."""
     source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
@@ -143,23 +143,24 @@ def _make_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:
 
 
 # --- The vehicle's own gear in the image ---
-# The gear hides parts of the target. Its pixels are filled from their surroundings so that
-# thresholding does not connect the gear to a marker's border. No side or cell is measured there.
+# The gear hides parts of the target. The pixels of the gear are filled from their surroundings so
+# that thresholding does not connect the gear to a marker's border. No side or cell is measured at
+# these pixels.
 
 
 HiddenMask = NDArray[np.bool_]
 WHITE_BORDER_REACH_HALF_SIDES = 1.25
-"""Half sides from a marker's centre within which any object disturbs the measurement of its
-sides."""
-_HIDDEN_MASK_DILATION_ROWS = 7  # rows of a field's image to which a covered row contributes
-# reduction factor, and standard deviation of the fill in the reduced image
+"""Distance from a marker's centre, in half sides, within which any object disturbs the measurement
+of the marker's sides."""
+_HIDDEN_MASK_DILATION_ROWS = 7  # A covered row contributes to this number of a field's image rows.
+# Factor by which the image is reduced, and standard deviation of the fill in the reduced image.
 _FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
 _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
     """Return the mask (h, w) of the pixels that the vehicle hides in this frame. For a single
-    field, `static_hidden_mask` is widened by the rows that are interpolated from hidden ones."""
+    field, `static_hidden_mask` is extended by the rows that are interpolated from hidden ones."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
@@ -171,7 +172,7 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
 
 
 def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDArray[np.uint8]:
-    """Return the image with its hidden pixels filled by a smooth interpolation of their
+    """Return the image after filling its hidden pixels with a smooth interpolation of their
     surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
@@ -215,8 +216,8 @@ def is_any_part_hidden(
 
 @dataclass(frozen=True, eq=False)
 class DetectorInput:
-    """An image in which markers are to be measured, with the detector setup and the camera.
-    `hidden_mask` (h, w) is True for pixels that the vehicle hides."""
+    """An image in which markers are to be detected, together with the detector setup and the
+    camera. `hidden_mask` (h, w) is True for pixels that the vehicle hides."""
 
     image: NDArray[np.uint8]
     hidden_mask: HiddenMask | None
