@@ -1,20 +1,22 @@
-"""Partial-view fit: measure a marker that is partly invisible because the image ends in it, light
-glares on it, or the vehicle's own gear covers it.
+"""Partial-view fit: measure a marker that is partly invisible because the image border truncates
+it, light glares on it, or the vehicle's own gear covers it.
 
-Four lines need all four sides. Here, the whole square is fitted at once to the visible edges: its
-sides, and the inner edges of its border, which replace a missing side. Gauss-Newton finds the
-increment P of the homography H and the shift d of all edges (white over black) from the distances
-r_k, px, between the square's edges and the image's:
+Fitting four separate lines requires that all four sides are visible. This fit instead moves the
+whole square at once to match the visible edges: its sides, and the inner edges of its border, which
+replace a missing side. Gauss-Newton finds the increment P of the homography H and the shift d of
+all edges (white over black) from the distances r_k, px, between the edges of the square and the
+edges in the image:
 
     min sum w_k (r_k - a_k.P - s_k d)^2 + (d - d_0)^2 / sigma_d^2,    H <- H (I + P)
 
-where a_k is the derivative of an edge by P, s_k is -1 for sides and +1 for inner edges, and d_0 is
-the shift measured before. The invisible part follows from the visible one; the corners' covariance
-(8, 8) px^2, J N^-1 J' times the variance of an edge, says how accurately.
+where a_k is the derivative of edge k with respect to P, s_k is -1 for sides and +1 for inner edges,
+and d_0 is the shift measured before. The position of the invisible part follows from the visible
+part. Its accuracy is given by the covariance of the corners (8, 8) px^2, which is J N^-1 J' times
+the variance of an edge.
 
-The result is wrong if the boundary of a glare or a shadow runs along a side and is mistaken for it.
-It is None if the edges leave a corner with a standard deviation above 2 % of the side, or if the
-cells in view are not the marker's.
+The result is wrong if the boundary of glare or of a shadow runs along a side and is mistaken for
+it. The result is None if the standard deviation of a corner is above 2 % of the side, or if the
+cells in view do not match the marker.
 """
 
 from __future__ import annotations
@@ -66,19 +68,18 @@ from perchctl.vision.markers.pattern import (
 )
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-MIN_PARTIAL_FIT_CELL_PX = 4.0  # with smaller cells, a part of a side carries no information
+# With smaller cells, a part of a side carries no information.
+MIN_PARTIAL_FIT_CELL_PX = 4.0
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
-_MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9  # share of the window
-_MAX_CORNER_SIGMA_SIDES = (
-    0.02  # share of the side; corners with a larger standard deviation are rejected
-)
+_MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9
+_MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
-_ROBUST_VARIANCE_FACTOR = 1.3  # compensates for the smaller squared residuals under robust weights
+# Robust weights make the squared residuals smaller; this factor compensates for it.
+_ROBUST_VARIANCE_FACTOR = 1.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5
-_MAX_MOTION_FROM_START_PX = (
-    20.0  # three search windows; edges cannot move a fit further from its start
-)
+# Three search windows: the edges cannot move a fit further from its start.
+_MAX_MOTION_FROM_START_PX = 20.0
 
 
 def fit_partly_visible_marker(
@@ -92,10 +93,10 @@ def fit_partly_visible_marker(
     outside the image.
 
     `identified_by` is the evidence for the marker's identity: its own cells alone ("bits"), the
-    predicted position ("track") or the other marker ("other_marker"). It determines how many
-    visible cells must match. `known_edge_shift` is how far white has grown over black, if measured
-    before. None if the visible part does not determine the corners, or if its cells are not the
-    marker's.
+    predicted position ("track") or the other marker ("other_marker"). This evidence determines how
+    many visible cells must match. `known_edge_shift` is how far white has grown over black, if this
+    was measured before. Returns None if the visible part does not determine the corners, or if its
+    cells do not match the marker.
     """
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
@@ -103,7 +104,7 @@ def fit_partly_visible_marker(
         >= MIN_PARTIAL_FIT_CELL_PX
     ):
         return None
-    # Wherever the fit converges, enough cells must be in the image.
+    # Enough cells must be in the image wherever the fit may converge.
     in_picture = _is_point_in_image(
         _project_sample_points_px(start_corners_px, pattern, camera),
         detector_input.image.shape,
@@ -157,11 +158,11 @@ def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> 
 def _linearize_edges(
     visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
 ) -> tuple[Array, Array, Array]:
-    """Linearise the edges' offsets, px, in nine unknowns: the increment of the homography (8) and
-    the shift of all edges.
+    """Linearise the offsets of the edges, px, with respect to nine unknowns: the increment of the
+    homography (8) and the shift of all edges.
 
-    Returns the derivatives (9, rows * n), the normal matrix (9, 9) and its right-hand side (9,),
-    for an edge with a variance of 1 px^2.
+    Returns the derivatives (9, rows * n), and the normal matrix (9, 9) and the right-hand side (9,)
+    of the normal equations for edges with a variance of 1 px^2.
     """
     u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
     nx, ny = (
@@ -173,10 +174,10 @@ def _linearize_edges(
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
-    # The model's edge moves with the square, the observed edge with the shift.
+    # The increment moves the edge of the model, whereas the shift moves the observed edge.
     A[8] = np.where(visible_edges.edge_to_centre_half_sides < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
-    # Profiles closer to each other than a pixel measure the same edge.
+    # Profiles that are less than a pixel apart measure the same part of the edge.
     worth = np.minimum(
         1.0,
         2.0
@@ -186,7 +187,7 @@ def _linearize_edges(
     )
     weighted = A * (visible_edges.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(visible_edges.outward_edge_offset_px.ravel())
-    # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
+    # The standard deviation of an edge is not known yet, so it is assumed to be a tenth of a pixel.
     certain = (0.1 / edge_shift_prior.sigma_px) ** 2
     N[8, 8] += certain
     g[8] += certain * edge_shift_prior.white_growth_px
@@ -203,8 +204,8 @@ def _make_refined_corners(
     camera: CameraModel,
 ) -> RefinedCorners | None:
     """Return the marker's corners, projected by `H_pinhole_marker` (3, 3), with their covariance;
-    None if they are too uncertain. `residual_px` (rows, n) are the edges' residuals after the fit,
-    and `normal_matrix` (9, 9) is that of the last step."""
+    None if they are too uncertain. `residual_px` (rows, n) are the residuals of the edges after the
+    fit, and `normal_matrix` (9, 9) is the normal matrix of the last step."""
     w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -228,8 +229,8 @@ def _make_refined_corners(
     )
     side_px = mean_side_px(pinhole)
     cell_size_px = side_px / pattern.cells_along_border.cells_per_side
-    # The square alone; `remaining_edge_shift_sigma_px` covers the uncertainty of the shift of all
-    # edges.
+    # This is the covariance of the square alone; `remaining_edge_shift_sigma_px` covers the
+    # uncertainty of the shift of all edges.
     J = corners_jacobian_wrt_homography_increment(H_pinhole_marker)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = (
@@ -258,12 +259,13 @@ def _make_refined_corners(
 
 IdentificationEvidence = Literal["bits", "track", "other_marker"]
 """What identifies a marker: its cells alone, its previous position, or the other marker."""
-_MIN_KNOWN_CELL_FRACTION = 0.6  # share of all cells
-# above white, as a share of the contrast; as bright as possible
+_MIN_KNOWN_CELL_FRACTION = 0.6
+# A sample glares if it is brighter than white by more than this fraction of the contrast, or if it
+# is at least as bright as this grey level although white is not.
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0
-# other codewords differ in two bits
+# Other codewords differ from the marker's in two bits.
 _MAX_INVISIBLE_BITS: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}
-_MAX_LENS_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse exists
+_MAX_LENS_INVERSION_ERROR_PX = 0.5  # The lens model is valid where its inverse exists.
 
 
 def _has_matching_visible_cells(
@@ -272,10 +274,10 @@ def _has_matching_visible_cells(
     pattern: MarkerPattern,
     identified_by: IdentificationEvidence,
 ) -> bool:
-    """True if the visible cells without glare have the right colours. The number of inner cells
-    that may be invisible depends on `identified_by`: one for "bits", four for "track", any number
-    for "other_marker". For "other_marker", a fifth of the visible inner cells may also have the
-    wrong colour."""
+    """True if the visible cells, apart from those with glare, have the right colours. The number of
+    inner cells that may be invisible depends on `identified_by`: one for "bits", four for "track",
+    any number for "other_marker". For "other_marker", a fifth of the visible inner cells may also
+    have the wrong colour."""
     image, hidden_mask = detector_input.image, detector_input.hidden_mask
     h, w = image.shape
     at = _project_sample_points_px(corners_px, pattern, detector_input.camera)
@@ -316,9 +318,9 @@ def _has_matching_visible_cells(
 def _project_sample_points_px(
     corners_px: Array, pattern: MarkerPattern, camera: CameraModel
 ) -> Array:
-    """Return the sample points (n, 2) of a marker with corners (4, 2) in the distorted image; NaN
-    outside the valid range of the lens model. The distortion matters here: a marker that fills the
-    image does not appear as a quadrilateral."""
+    """Return the sample points (n, 2), px in the distorted image, of a marker with corners (4, 2);
+    NaN outside the valid range of the lens model. The distortion matters here because a marker that
+    fills the image does not appear as a quadrilateral."""
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points_half_sides), 2), np.nan)
@@ -336,8 +338,8 @@ def _project_sample_points_px(
 def _is_point_in_image(
     points_px: Array, shape: tuple[int, ...], max_distance_outside_px: float
 ) -> NDArray[np.bool_]:
-    """Return for each point (n, 2) whether it is in the image, or at most `max_distance_outside_px`
-    outside."""
+    """Return for each point (n, 2) whether it is in the image, or outside it by at most
+    `max_distance_outside_px`."""
     h, w = shape[:2]
     inside = (points_px >= -max_distance_outside_px) & (
         points_px <= (w - 1 + max_distance_outside_px, h - 1 + max_distance_outside_px)
@@ -373,32 +375,35 @@ def _has_enough_known_cells(
 
 
 IMAGE_MARGIN_PX = 2.0
-"""Distance to the image's edge, px, within which blur would need pixels outside the image."""
-_MIN_INNER_EDGE_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
-_BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5  # shares of the contrast: black inside, white outside
+"""Closer than this to the image border, px, the blur of an edge would extend beyond the image."""
+# With smaller cells, the inner and the outer edge of the border are not separate.
+_MIN_INNER_EDGE_CELL_PX = 6.0
+# A clean profile deviates from black on its dark side, and from white on its bright side, by less
+# than these fractions of the contrast.
+_BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
-_MIN_SIDE_WEIGHT_SUM = 3.0  # of a side's profiles
-_MIN_VISIBLE_EDGES = 4  # a square has eight unknowns, and an edge determines two
+_MIN_SIDE_WEIGHT_SUM = 3.0
+_MIN_VISIBLE_EDGES = 4  # A square has eight unknowns, and an edge determines two of them.
 _OUT_OF_RANGE_PX = 1e6
 _WINDOW_SAMPLE_OFFSETS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class VisibleEdges:
-    """Edges measured in one round of the fit: n profiles in each row, with one row per visible
-    edge.
+    """Edges measured in one iteration of the fit: one row per visible edge, with n profiles in each
+    row.
 
     Attributes:
         points_half_sides: measured points (rows, n, 2), in half sides from the marker's centre.
-        outward_edge_offset_px: distance (rows, n) of each measured point from the model's edge,
-            positive out of the marker.
+        outward_edge_offset_px: distance (rows, n) of each measured point from the edge of the
+            model, positive outwards.
         weight: weight (rows, n) of each profile.
         side_index: index of the edge's side, 0 to 3, (rows,).
         edge_to_centre_half_sides: distance of the edge from the marker's centre: 1 for a side,
             less for an inner edge of the border, (rows,).
-        px_per_half_side: scale across the edge, (rows,).
-        blur_sigma_per_window_half_length: standard deviation of the blur over the half length of
-            the window, (rows,).
+        px_per_half_side: image scale across the edge, (rows,).
+        blur_sigma_per_window_half_length: standard deviation of the blur divided by the half length
+            of the window, (rows,).
         white_grey: grey level of white paper.
     """
 
@@ -415,8 +420,8 @@ class VisibleEdges:
 def find_visible_edges(
     detector_input: DetectorInput, H_pinhole_marker: Array, pattern: MarkerPattern
 ) -> VisibleEdges | None:
-    """Measure the edges of the marker that `H_pinhole_marker` (3, 3) projects to pixels; None if
-    too few are visible."""
+    """Measure the visible edges of a marker; None if too few are visible. `H_pinhole_marker` (3, 3)
+    projects the marker's coordinates to pixels of a pinhole camera."""
     camera, cells, corners = (
         detector_input.camera,
         pattern.cells_along_border.cells_per_side,
@@ -435,9 +440,10 @@ def find_visible_edges(
     s = profile_fractions_along_side(sides_px[side] * at)
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    # Far outside the image, a lens model may return any position, even NaN.
     if not (np.abs(origin) < _OUT_OF_RANGE_PX).all():
-        return None  # far outside the image, a lens model may return any position, even NaN
-    # White is outside the marker, and inside its border.
+        return None
+    # The paper is white outside the marker and, for the inner edges, inside the border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
     window_half_length_px, profile_half_length_px = window_and_profile_half_lengths_px(
@@ -500,7 +506,7 @@ def _is_profile_in_view(
     window_half_length_px: Array,
 ) -> NDArray[np.bool_]:
     hidden_mask, (h, w) = detector_input.hidden_mask, detector_input.image.shape
-    # A profile is in the image if both of its ends are.
+    # A profile is in the image if both of its ends are in the image.
     reach, last = (
         window_half_length_px[:, None, None] * np.abs(profile_direction),
         (w - 1 - IMAGE_MARGIN_PX, h - 1 - IMAGE_MARGIN_PX),
@@ -525,9 +531,10 @@ def _find_clean_profiles(
     window_half_length_px: Array,
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return for each profile (rows, n) whether it shows a clean step from black to white, and the
-    grey level of white paper. None if there is no such profile."""
-    # At half a window from the edge, its blur has faded and no neighbouring edge has begun.
+    """Return for each profile (rows, n) whether it shows a clean step from black to white, and
+    return the grey level of white paper. None if the contrast is too low."""
+    # At 0.6 times the half length of the window, the blur of the edge has faded and that of a
+    # neighbouring edge has not begun.
     off = max(
         1,
         round(

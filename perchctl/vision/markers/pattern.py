@@ -1,5 +1,5 @@
-"""A marker's appearance (border, cells, drawing), and checks whether an image shows these cells at
-given corners."""
+"""A marker's appearance (border, cells, drawing), and functions that check whether an image shows
+these cells at given corners."""
 
 from __future__ import annotations
 
@@ -18,17 +18,15 @@ from perchctl.vision.markers.corners import (
     is_inside_image,
 )
 
-MIN_MARKER_SIDE_PX = 7.0  # a smaller marker looks like a blob
-MIN_CONTRAST_GREY = 10.0  # grey levels
-MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = (
-    0.1  # difference between a cell and the threshold, as a share of the contrast
-)
+MIN_MARKER_SIDE_PX = 7.0  # A smaller marker looks like a blob.
+MIN_CONTRAST_GREY = 10.0
+# A cell must differ from the threshold by at least this fraction of the contrast.
+MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = 0.1
 MIN_MATCHING_CELL_FRACTION = 0.8
-"""Share of the cells that must have the right colour."""
+"""More than this fraction of the cells must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
-_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = (
-    1.25  # half sides of a central marker that may hide cells
-)
+# Distance from the centre, in half sides of the small marker, within which it may hide cells.
+_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = 1.25
 _SAMPLE_OFFSETS_CELLS: Array = np.array(
     [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
 )
@@ -40,10 +38,10 @@ class CellsAlongBorder:
     runs from corner k to corner k + 1.
 
     Attributes:
-        is_first_inner_cell_white: 1 for a white cell, 0 for a black one, as factors in sums, (4,
-            n). The first and last cells of a side belong to the border.
-        are_first_two_inner_cells_white: 1 if this cell and the next one further in are white, (4,
-            n).
+        is_first_inner_cell_white: 1 for a white cell and 0 for a black one (4, n), for use as
+            factors in sums. The first and last cells of a side belong to the border.
+        are_first_two_inner_cells_white: 1 if both this cell and the next one further in are white,
+            otherwise 0 (4, n).
         print_tolerance_cells: standard deviation of a printed edge's position, in cells.
     """
 
@@ -61,17 +59,17 @@ class MarkerPattern:
     """The appearance of a marker.
 
     Attributes:
-        cells_along_border: cells inside the border.
-        drawing: all cells.
-        sample_points_half_sides: points (n, 2) at which cells are read, in the marker's coordinates
-            (see `perchctl.vision.markers.corners`).
+        cells_along_border: the cells just inside the border.
+        drawing: all cells of the marker.
+        sample_points_half_sides: points (n, 2) at which the greys of cells are read, in the
+            marker's coordinates (see `perchctl.vision.markers.corners`).
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
         rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
-            rotation of the marker (corners rolled by 0 to 3), with a blur of half a cell, zero-mean
-            and of unit norm.
+            rotation of the marker (corners rolled by 0 to 3). Each row is blurred by half a cell
+            and normalised to zero mean and unit norm.
         is_cell_white: True for a white cell, (cells,).
-        is_cell_inside_border: True for a cell within the border, (cells,).
+        is_cell_inside_border: True for a cell that is not part of the border, (cells,).
     """
 
     cells_along_border: CellsAlongBorder
@@ -140,12 +138,12 @@ def make_marker_pattern(
 
 
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
-    """True if every cell in the image clearly has the colour of the pattern."""
+    """True if every cell in the image clearly has the colour of its cell in the pattern."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
     white, black = means[pattern.is_cell_white], means[~pattern.is_cell_white]
-    # The light may vary across the marker, so white and black are medians.
+    # The illumination may vary across the marker, so medians are used for white and black.
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
@@ -161,7 +159,7 @@ def has_mostly_matching_cells(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
     """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells in the image have the colour of
-    the pattern."""
+    their cell in the pattern."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -214,7 +212,7 @@ def _read_sample_greys(
     at = apply_homography(
         homography_from_centred_square(corners_px), pattern.sample_points_half_sides
     )
-    # The sample points are inside the corners.
+    # If the corners are in the image, so are the sample points, which are all inside the marker.
     if not (is_inside_image(corners_px, image.shape) or is_inside_image(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
@@ -235,19 +233,19 @@ def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Ar
 # --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_FITTED_WHITE_MARGIN_CELLS = 0.6  # white around the border
+_FITTED_WHITE_MARGIN_CELLS = 0.6  # width of the white margin around the border that is fitted
 BLUR_MARGIN_NODES = 12
-"""Number of additional nodes on all sides, for the blur."""
+"""Number of nodes that are added on all sides to make room for the blur."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerDrawing:
     """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
 
-    The drawing of the large marker also contains the small marker: its cells,
-    `small_marker_cell_whiteness`; its side over that of the large marker,
-    `small_to_large_side_ratio`; and half the side of the paper in the marker's coordinates,
-    `paper_reach_half_sides` (None: infinite)."""
+    The drawing of the large marker also contains the small marker: `small_marker_cell_whiteness`
+    are the cells of the small marker, and `small_to_large_side_ratio` is its side divided by the
+    side of the large marker. `paper_reach_half_sides` is half the side of the paper in the marker's
+    coordinates; None if the paper is assumed to be infinite."""
 
     cell_whiteness: Array
     small_marker_cell_whiteness: Array | None = None
@@ -256,8 +254,8 @@ class MarkerDrawing:
 
     @property
     def photometric_fit_reach_half_sides(self) -> float:
-        """Half the side of the square that the photometric fit compares with the image, in half
-        sides of the marker."""
+        """Half the side, in half sides of the marker, of the square that the photometric fit
+        compares with the image."""
         return 1.0 + _FITTED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
@@ -298,7 +296,7 @@ def _cell_coverage(
 
 
 def _add_margin_nodes(node_positions_half_sides: Array, node_reach_half_sides: float) -> Array:
-    """Return the node positions along one axis with `BLUR_MARGIN_NODES` additional nodes at both
+    """Return the node positions along one axis after adding `BLUR_MARGIN_NODES` nodes at both
     ends."""
     more = 2.0 * node_reach_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
@@ -316,8 +314,9 @@ def render_whiteness_and_off_paper_fraction(
 ) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing at n by n nodes and at a margin of nodes around them.
 
-    Returns the whiteness of each node, 0 to 1, as the first array. If the paper ends inside the
-    compared square, a second array contains the fraction of each node beyond the paper.
+    The first array returned is the whiteness of each node, 0 to 1. If the paper ends inside the
+    square that is compared with the image, a second array contains the fraction of each node that
+    is beyond the paper.
     """
     node_reach_half_sides = drawing.photometric_fit_reach_half_sides / nodes_per_side
     node_positions_half_sides: Array = node_reach_half_sides * (
@@ -337,8 +336,8 @@ def render_whiteness_and_off_paper_fraction(
 
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square with the size of a marker that has `cells_per_side`
-    cells, at n by n nodes."""
+    """Return the whiteness of a black square, with the size of a marker that has `cells_per_side`
+    cells, at n by n nodes and at a margin of nodes around them."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -370,8 +369,8 @@ def blurred_cell_coverage(
     node_reach_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
-    """Return the fraction of each node's width that each row of cells covers, (n, cells), after a
-    Gaussian blur of `blur_sigma_nodes`."""
+    """Return the fraction (n, cells) of each node's width that each row of cells covers, after a
+    Gaussian blur with the standard deviation `blur_sigma_nodes`."""
     wide = _cell_coverage(
         _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
         node_reach_half_sides,
@@ -392,7 +391,7 @@ def blurred_cell_coverage(
 
 
 def blur_nodes(sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
-    """Return the nodes after a Gaussian blur of `blur_sigma_nodes`. The input has a margin of
-    `BLUR_MARGIN_NODES` on all sides, and so has the result."""
+    """Return the node values after a Gaussian blur with the standard deviation `blur_sigma_nodes`.
+    Both the input and the result have a margin of `BLUR_MARGIN_NODES` nodes on all sides."""
     soft = cv2.GaussianBlur(sharp_nodes, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)
