@@ -1,21 +1,22 @@
-"""Photometric fit: fit a marker's drawing to the image if edges and bits are no longer visible.
+"""Photometric fit: fit a marker's drawing to the image if its edges and bits are no longer visible.
 
-If blur has merged the cells, or cells are only a few pixels wide, the image of the whole marker
-is still its drawing D, blurred and lit. Gauss-Newton finds the homography H together with the
-standard deviation of the blur and the light, at the nodes u of a grid over the marker:
+If blur has merged the cells, or if cells are only a few pixels wide, the image still shows the
+marker's whole drawing D, blurred and illuminated. Gauss-Newton finds the homography H together with
+the standard deviation of the blur and the illumination, at the nodes u of a grid over the marker:
 
     min sum (I(lens(H u)) - [a + b.u + (c + e.u) D + f D (1 - D)])^2,    D blurred by sigma
 
 a, b: black level and its slope; c, e: gain and its slope; f: bend of the tone curve. If the sheet
-ends, the grey beyond it is one more unknown. An image that still deviates from the drawing, cell
-by cell, does not show the marker.
+ends within the grid, the grey beyond the sheet is one more unknown. If any cell still deviates from
+the drawing after the fit, the image does not show the marker.
 
-The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
-the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
-same with that blur; `DrawingAlignment.worst_cell_flip_fraction` says how close one is.
+The result is wrong if the blur is anisotropic (fast motion), if something covers a part of the
+marker but leaves the cells readable, or if white is clipped. The fit itself does not notice if
+another codeword looks the same after this blur; `DrawingAlignment.worst_cell_flip_fraction` is a
+measure of how close another codeword is.
 
-Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
-grids are (n, n) nodes, stored as rows of n * n.
+The coordinates u are the marker's own (see `perchctl.vision.markers.corners`). Grey values are 0 to
+255. Grids have (n, n) nodes, which are stored as rows of n * n values.
 """
 
 from __future__ import annotations
@@ -50,28 +51,30 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID_NODES, _MIN_GRID_NODES = 44, 18
-_NODE_SPACING_PX = 0.8  # image pixels between nodes
+_NODE_SPACING_PX = 0.8
 _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
-"""Number of rounds after which the fit fails unless its correlation reaches
-`_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two rounds."""
-_CONVERGED_STEP_PX = 0.05  # after a step this small, the next one is usually a tenth of it
-_MAX_DISTORTION_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
-_MAX_HOMOGRAPHY_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
-# Standard deviations of the shape from its start, in half sides: rotations and scales; the
-# perspective.
+"""Number of iterations after which the fit fails unless its correlation has reached
+`_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two iterations."""
+_CONVERGED_STEP_PX = 0.05  # After a step this small, the next one is usually a tenth of it.
+# After a larger motion, the lens distortion is computed again.
+_MAX_DISTORTION_REUSE_MOTION_PX = 0.3
+_MAX_HOMOGRAPHY_INCREMENT = 0.5  # If an iteration exceeds it, the fit has diverged.
+# Standard deviations of the change of shape since the start, in half sides: of rotations and
+# scales, and of the perspective.
 _SHAPE_SIGMA, _PERSPECTIVE_SIGMA = 0.2, 0.03
-_TONE_CURVE_PRIOR_SIGMA = 0.5  # of the tone curve, in units of the gain
+# Standard deviation of the bend of the tone curve, relative to the gain.
+_TONE_CURVE_PRIOR_SIGMA = 0.5
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_MAX_BLUR_VARIANCE_STEP_FRACTION = (
-    0.5  # per round, as a share of the blur's square; a node's square at least
-)
+# In one iteration, the variance of the blur changes at most by this fraction of itself, or by one
+# squared node spacing if that is larger.
+_MAX_BLUR_VARIANCE_STEP_FRACTION = 0.5
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
-"""Changes of the blur below both limits do not render the drawing again: as a share, and in
-cells."""
-_MIN_GAIN_GREY = 10.0  # grey levels from black to white
+"""The drawing is not rendered again for a change of the blur that is below both limits: a fraction
+of the blur, and a fraction of a cell."""
+_MIN_GAIN_GREY = 10.0
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
-# indices of the unknowns: increment, blur, light
+# Indices of the unknowns: homography increment, blur, illumination.
 _SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
 _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
     np.array(
@@ -87,7 +90,7 @@ _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
         ]
     )
     ** -2.0
-)  # terms of the increment; the position is free
+)  # One value per element of the increment. The position is practically free.
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +102,16 @@ class DrawingAlignment:
         fit_correlation: correlation of the image with the fitted drawing.
         pattern_correlation: correlation of the inner bits with the residual that a plain black
             square of the same size leaves in the image.
-        pattern_to_border_contrast_ratio: contrast of the inner bits relative to the border's.
-        largest_cell_deviation_per_contrast: largest deviation of a cell's mean grey from that of
-            the fitted drawing, relative to the contrast of black and white.
+        pattern_to_border_contrast_ratio: contrast of the inner bits relative to the contrast of the
+            border.
+        largest_cell_deviation_per_contrast: largest deviation of a cell's mean grey from its mean
+            grey in the fitted drawing, relative to the contrast of black and white.
         worst_cell_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as
             drawn) to 1 (flipped bit).
         largest_cell_flip_fraction_sigma: standard deviation of `worst_cell_flip_fraction` for the
             least certain cell.
-        blur_sigma_px: standard deviation of the blur.
-        largest_motion_from_start_px: largest distance of a corner from its start.
+        blur_sigma_px: standard deviation of the fitted blur.
+        largest_motion_from_start_px: largest distance of a fitted corner from its start.
     """
 
     corners_px: Array
@@ -127,7 +131,7 @@ class _NormalEquations:
     """The normal equations of one Gauss-Newton iteration.
 
     Attributes:
-        contrast_grey: grey levels from black to white.
+        contrast_grey: difference between white and black, in grey levels.
         grey_residual: grey values of the image minus those of the drawing under the best-fitting
             illumination, (n * n,).
         grey_jacobian: derivatives (k, n * n) of the drawing's grey values with respect to the
@@ -155,7 +159,8 @@ def align_drawing(
     """Fit the drawing to the image, starting at `start_corners_px` (4, 2) and
     `initial_blur_sigma_px`.
 
-    Returns None if the marker leaves the image, looks different, or the fit diverges.
+    Returns None if a part of the marker is outside the image, if the image does not resemble the
+    drawing, or if the fit diverges.
     """
     start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all():
@@ -224,7 +229,7 @@ def align_drawing(
         elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX:
             break
     assert equations is not None
-    # Residuals of the last round, whose step was negligible.
+    # These are the residuals of the last iteration, whose step was negligible.
     contrast_grey, grey_residual = equations.contrast_grey, equations.grey_residual
     corners_px = distort_px(apply_homography(H_pinhole_marker, CENTRED_SQUARE).T, camera).T
     pattern_correlation, pattern_to_border_contrast_ratio = _measure_inner_pattern_match(
@@ -271,7 +276,7 @@ def _linearize_greys(
     `homography_increment_from_start` (8,) is the sum of the increments so far."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
-    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
+    A[BEND, BEND] += 1e-3 * len(grey)  # keeps the bend at zero unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     contrast_grey = float(illumination[GAIN])
     if contrast_grey < _MIN_GAIN_GREY:
@@ -284,7 +289,7 @@ def _linearize_greys(
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT_INDEX + BEND
-    N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # about a node's width per round
+    N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # limits the step to about a node's width
     N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
     N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
@@ -297,8 +302,8 @@ def _linearize_greys(
 
 
 def fit_correlation(grey: Array, grey_residual: Array) -> float:
-    """Return the correlation of grey values (k,) with their fitted values, given the residuals
-    (k,)."""
+    """Return the correlation of grey values (k,) with their fitted values. `grey_residual` (k,) is
+    the difference between the two."""
     spread = grey - grey.mean()
     explained = 1.0 - float((grey_residual**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -310,12 +315,12 @@ def _measure_worst_cell_flip_fraction(
     inverse_normal_matrix: Array,
     nodes_per_independent_sample: float,
 ) -> tuple[float, float]:
-    """Return `worst_cell_flip_fraction` and `largest_cell_flip_fraction_sigma` of an
+    """Return `worst_cell_flip_fraction` and `largest_cell_flip_fraction_sigma` of a
     `DrawingAlignment`.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
-    cell, minus the part that the fit's unknowns can absorb. The result is 0 for a cell as drawn and
-    1 for a flipped cell. `nodes_per_independent_sample` is the result of
+    cell, minus the part that the unknowns of the fit can absorb. The projection is 0 for a cell as
+    drawn and 1 for a flipped cell. `nodes_per_independent_sample` is the result of
     `_estimate_nodes_per_independent_sample`."""
     soft, noise, contrast_grey = (
         rendered_drawing.blurred_cell_coverage,
@@ -355,8 +360,8 @@ def _measure_inner_pattern_match(
 
 def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     """Return the number of neighbouring nodes per independent residual, estimated from the
-    correlation between neighbours in `grey_residual` (n, n). The variance of a fit is larger by
-    this factor."""
+    correlation between neighbours in `grey_residual` (n, n). The correlation makes the variance of
+    a fit larger by this factor."""
     energy = max(float((grey_residual * grey_residual).mean()), 1e-9)
     factor = 1.0
     for a, b in (
@@ -390,14 +395,14 @@ def _assign_nodes_to_cells(
     return index, np.maximum(count, 1.0)
 
 
-# --- The light on a marker, which converts its drawing to grey values ---
+# --- The illumination of a marker, which converts its drawing to grey values ---
 # Offset, gain, their slopes, the bend of the tone curve and the grey beyond the sheet all shift
 # edges.
 
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
-    """Return the derivatives (9, n * n) of the drawing's grey values with respect to the
-    homography's increment (8) and the variance of the blur, under the illumination with the
+    """Return the derivatives (9, n * n) of the drawing's grey values with respect to the increment
+    of the homography (8) and the variance of the blur. The illumination is given by the
     coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
@@ -413,14 +418,14 @@ def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Arra
 # --- A grid over a marker in its own coordinates, and the image at its nodes ---
 
 
-_CHEBYSHEV_NODES_PER_AXIS = 9  # per side
+_CHEBYSHEV_NODES_PER_AXIS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingGrid:
     """Sampling grid on the marker: n by n nodes at `node_positions_half_sides` (n,) in both
-    directions, in half sides from the marker's centre; `node_uv1` (3, n * n) is (u, v, 1) of each
-    node."""
+    directions, in half sides from the marker's centre. `node_uv1` (3, n * n) contains the
+    homogeneous coordinates (u, v, 1) of each node."""
 
     nodes_per_side: int
     node_positions_half_sides: Array
@@ -446,14 +451,14 @@ def _grid_coordinates(node_positions_half_sides: Array) -> Array:
 
 
 def project_nodes(H_pinhole_marker: Array, node_uv1: Array) -> Array:
-    """Map the marker's coordinates (3, n) by `H_pinhole_marker` to pinhole pixels, x and y,
-    (2, n)."""
+    """Map homogeneous marker coordinates (3, n) with `H_pinhole_marker` to pixels, x and y (2, n),
+    of a pinhole camera."""
     q = H_pinhole_marker.dot(node_uv1)
     return np.asarray(q[:2] / q[2])
 
 
 def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
-    """Convert pinhole pixels (2, n) to pixels (2, n) of the distorted image."""
+    """Convert pixels (2, n) of a pinhole camera to pixels (2, n) of the distorted image."""
     K = camera.K
     rays = np.empty((pinhole_px.shape[1], 2))
     rays[:, 1] = (pinhole_px[1] - K[1, 2]) / K[1, 1]
@@ -477,7 +482,8 @@ def lens_distortion_shift_px(
 @lru_cache(maxsize=64)
 def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
     """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES_PER_AXIS^2), and the weights (n,
-    _CHEBYSHEV_NODES_PER_AXIS) for the grid's own nodes."""
+    _CHEBYSHEV_NODES_PER_AXIS) with which values at these nodes are interpolated at the grid's own
+    nodes."""
     reach = float(grid.node_positions_half_sides[-1])
     x = chebyshev.chebpts2(_CHEBYSHEV_NODES_PER_AXIS)
     degree = _CHEBYSHEV_NODES_PER_AXIS - 1
@@ -493,8 +499,8 @@ def _extract_patch(
     H_pinhole_marker: Array,
     node_distortion_shift_px: Array,
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the image that contains all nodes, and the position (2, 1) of its top-left
-    pixel; None if a node is outside the image."""
+    """Return the part of the image that contains all nodes, and the position (2, 1) of the top-left
+    pixel of this part. None if a node is outside the image."""
     h, w = image.shape
     x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_distortion_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -525,10 +531,11 @@ def _sample_patch(
 
 
 # --- Products of long rows with a value for each node of a square grid ---
-# They are computed block by block: large products wake threads, which cost more than they save.
+# They are computed block by block, because large products start threads, which cost more time than
+# they save.
 
 
-_GRAM_BLOCK_SIZE = 256  # values per row
+_GRAM_BLOCK_SIZE = 256  # number of values per row in a block
 
 
 def gram_matrix(rows: Array) -> Array:
@@ -544,15 +551,16 @@ def gram_matrix(rows: Array) -> Array:
 # --- A marker's drawing at the nodes of a grid, blurred ---
 
 
-_LOG_BLUR_TABLE_STEP = 0.02  # relative step of the blur
-# Rows of the light: offset and its slopes, gain and its slopes, bend, grey beyond the sheet.
+_LOG_BLUR_TABLE_STEP = 0.02  # Relative step between the blurs in the table.
+# Rows of the illumination basis: offset and its slopes, gain and its slopes, bend of the tone
+# curve, grey beyond the sheet.
 OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A marker's drawing at the nodes of a grid, after a Gaussian blur with a standard deviation of
-    `blur_sigma_nodes`."""
+    """A marker's drawing at the nodes of a grid, after a Gaussian blur with the standard deviation
+    `blur_sigma_nodes`, in node spacings."""
 
     drawing: MarkerDrawing
     grid: SamplingGrid
@@ -560,9 +568,9 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_whiteness_and_off_paper_fraction(self) -> tuple[tuple[Array, Array], ...]:
-        """The arrays of `render_whiteness_and_off_paper_fraction` after the blur. Each is a pair:
-        its values at the nodes (n * n,), and their derivatives (9, n * n) with respect to the
-        homography's increment (8) and the variance of the blur."""
+        """The arrays of `render_whiteness_and_off_paper_fraction` after the blur. Each array is
+        returned as a pair: its values (n * n,) at the nodes, and their derivatives (9, n * n) with
+        respect to the increment of the homography (8) and the variance of the blur."""
         sharp_nodes = render_whiteness_and_off_paper_fraction(
             self.drawing, self.grid.nodes_per_side
         )
@@ -575,8 +583,8 @@ class RenderedDrawing:
     def illumination_basis(self) -> tuple[Array, Array]:
         """Basis of the drawing's grey values under any illumination, and the Gram matrix of its
         rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
-        (gain) and its slopes, and the bend of the tone curve; the eighth, the grey beyond the
-        paper, exists only if the paper ends inside the compared square."""
+        (gain) and its slopes, and the bend of the tone curve. The eighth row, the grey beyond the
+        paper, only exists if the paper ends inside the square that is compared with the image."""
         u, v, one = self.grid.node_uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -585,8 +593,9 @@ class RenderedDrawing:
 
     @cached_property
     def black_square_illumination_basis(self) -> tuple[Array, Array]:
-        """The same for a plain black square in place of the marker, but without the slopes of the
-        gain and without the bend of the tone curve: rows (4 or 5, n * n), and their Gram matrix."""
+        """Illumination basis for a plain black square in place of the marker, without the slopes of
+        the gain and without the bend of the tone curve: the rows (4 or 5, n * n), and their Gram
+        matrix."""
         soft = blur_nodes(
             render_black_square(len(self.drawing.cell_whiteness), self.grid.nodes_per_side),
             self.blur_sigma_nodes,
@@ -611,9 +620,9 @@ class RenderedDrawing:
 def render_blurred(
     drawing: MarkerDrawing, nodes_per_side: int, blur_table_index: int
 ) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over the compared square, blurred by
-    ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes. Only blurs from this table are rendered,
-    so that results can be cached."""
+    """Return the drawing at n by n nodes over the square that is compared with the image. The
+    standard deviation of its blur is ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes. Only
+    blurs from this table are rendered, so that the results can be cached."""
     return RenderedDrawing(
         drawing,
         make_sampling_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),

@@ -1,12 +1,13 @@
 """Search for both markers, in a window and then in the whole image, and choose among the results.
 
-OpenCV's ArUco detector thresholds the image adaptively and decodes the quadrilaterals. Its
-corners are raw: they are about 0.5 px off, mostly inwards, and the image's edge may be mistaken
-for a side. A pixel p' of a window at half size that starts at pixel o is at
+OpenCV's ArUco detector thresholds the image adaptively and decodes the quadrilaterals that it
+finds. Its corners are raw: they are about 0.5 px off, mostly inwards, and the image border may be
+mistaken for a side. In a window that starts at pixel o of the image and is reduced to half size,
+the pixel p' corresponds to the image pixel
 
     p = 2 p' + 1/2 + o
 
-The search fails where blur or the image's edge hides the bits. Corners are (4, 2) px.
+The search fails if blur or the image border hides the bits. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ from perchctl.vision.types import MARKERS, MarkerName
 SearchMode = Literal[
     "near_expected", "expected_window", "expected_fits", "whole_sharp", "whole_blurred", "all"
 ]
-"""Kinds of search in one frame. At the expected position: by OpenCV in the window around it
-("expected_window"), by fits to a blurred target ("expected_fits"), or by both ("near_expected"). In
-the whole image: by OpenCV, which needs a sharp target ("whole_sharp"), or by fits to a blurred
-target ("whole_blurred"). "all" is everything."""
-_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25  # share of the target's size in the image, on each side
+"""Kinds of search in one frame. "expected_window" searches the window around the expected position
+with OpenCV, "expected_fits" fits a blurred target at that position, and "near_expected" does both.
+"whole_sharp" searches the whole image with OpenCV, which needs a sharp target, and "whole_blurred"
+searches it for a blurred target. "all" combines all of these."""
+_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
-_MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8  # share of the image
+_MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8
 _MIN_SIDE_BEFORE_HALVING_PX = 60.0
-"""Side above which markers are found in an image of half the size, in a quarter of the time,
-px."""
-_NESTING_TOLERANCE_SMALL_MARKER_SIDES = 0.35  # share of the small marker's side
+"""Markers whose sides, px, are longer than this are searched for in an image of half the size,
+which takes a quarter of the time."""
+_NESTING_TOLERANCE_SMALL_MARKER_SIDES = 0.35
 
 
 ImageWindow = tuple[slice, slice]
@@ -70,13 +71,14 @@ def search(
     search_mode: SearchMode = "all",
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers with OpenCV's detector, then the whole image if
-    markers are missing in the window.
+    """Search the window around the expected markers with OpenCV's detector. If markers are missing
+    in the window, search the whole image.
 
-    With `search_mode` "near_expected" or "expected_window", only the window is searched (they
-    differ in the fits to blurred markers that follow); with "whole_sharp", only the whole image;
-    otherwise both. If several targets are found and none is expected, the search returns the one
-    closest to this vehicle's own target (`measure_own_target_distance_m`).
+    With the `search_mode` "near_expected" or "expected_window", only the window is searched; these
+    two modes differ in the fits to blurred markers that follow. With "whole_sharp", only the whole
+    image is searched. Other modes search both. If several targets are found and none is expected,
+    the search returns the one closest to this vehicle's own target
+    (`measure_own_target_distance_m`).
     """
     setup, shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
@@ -116,8 +118,9 @@ def search_half_size(
     expected_corners_px: Mapping[MarkerName, Array],
     measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
-    """Search the window in an image of half the size, which takes 1 ms; None if this misses a
-    marker that is expected to be completely in view."""
+    """Search the window in an image of half the size, which takes 1 ms. Return None if this search
+    misses a marker that is expected to be completely in view, or if the expected markers are not
+    suitable for it."""
     shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
     if (
@@ -146,10 +149,10 @@ def make_search_window(
     small_to_large_side_ratio: float,
     shape: tuple[int, ...],
 ) -> ImageWindow | None:
-    """Return the part of the image to search for the expected markers; None if it is nearly the
-    whole image, which the caller then searches instead. `small_to_large_side_ratio` is the small
-    marker's side over the large one's. The window contains the complete large marker if that may be
-    in the image."""
+    """Return the part of the image to search for the expected markers. If it is nearly the whole
+    image, return None; the caller then searches the whole image. `small_to_large_side_ratio` is the
+    side of the small marker divided by the side of the large one. The window contains the complete
+    large marker if it may be completely in the image."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
@@ -197,7 +200,7 @@ def _search_once(
             continue
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
-        # The centre of a pixel at half size is between two pixels.
+        # The centre of a pixel at half size is between two pixels of the full-size image.
         candidates[name].append((2.0 * at + 0.5 if must_halve_image else at) + first)
     targets = len(_pair_markers(candidates, setup.small_to_large_side_ratio))
     chosen = choose_markers(
@@ -217,9 +220,9 @@ def choose_markers(
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
-    A small marker in the centre of a large one with the right size and rotation confirms both.
-    Markers at expected positions take precedence over a pair elsewhere; among single markers, the
-    closest by `measure_own_target_distance_m` is chosen.
+    A small marker with the right size and rotation in the centre of a large one confirms both
+    markers. Markers at expected positions take precedence over a pair elsewhere. Among single
+    markers, the one with the shortest `measure_own_target_distance_m` is chosen.
     """
     if measure_own_target_distance_m is not None and not expected_corners_px:
         candidates = _sort_by_own_target_distance(candidates, measure_own_target_distance_m)
@@ -261,11 +264,11 @@ def _sort_by_own_target_distance(
     candidates: Mapping[MarkerName, list[Array]],
     measure_own_target_distance_m: OwnTargetDistanceFunction,
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates sorted by their distance from this vehicle's own target, without those
-    that are too far away to be it.
+    """Return the candidates, sorted by their distance from the position of this vehicle's own
+    target, without those that are too far away to be this target.
 
-    A single candidate is kept at any distance: the pipeline rejects it later and reports the
-    reason.
+    A single candidate is kept at any distance, and so are all candidates if all are too far away:
+    the pipeline rejects them later and reports the reason.
     """
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -280,8 +283,9 @@ def _sort_by_own_target_distance(
 def _pair_markers(
     candidates: Mapping[MarkerName, list[Array]], small_to_large_side_ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of a large and a small marker that form a target, best first: nesting error,
-    index of the large marker, index of the small marker."""
+    """Return the pairs of a large and a small marker that form a target, best first. Each pair
+    consists of the nesting error, the index of the large marker, and the index of the small
+    marker."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
         (nesting_error_to_tolerance_ratio(a, b, small_to_large_side_ratio), i, j)
@@ -299,8 +303,9 @@ def nesting_error_to_tolerance_ratio(
     large_corners_px: Array, small_corners_px: Array, small_to_large_side_ratio: float
 ) -> float:
     """Return the largest distance of the small marker's corners from their expected positions
-    inside the large one, divided by the allowed distance. The two form a target if the result is at
-    most 1. `small_to_large_side_ratio` is the small marker's side over the large one's."""
+    inside the large one, divided by the allowed distance. The two markers form a target if the
+    result is at most 1. `small_to_large_side_ratio` is the side of the small marker divided by the
+    side of the large one."""
     mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_NESTING_TOLERANCE_SMALL_MARKER_SIDES * side_px, 2.5)
