@@ -1,8 +1,8 @@
 """Combine the two markers of a frame into one target pose, by one of two methods.
 
-`weights` is the paper's method (section II-A): a pose and a Kalman filter per marker, merged by W.
-`joint` solves the corners of both markers at once and filters that single pose; a marker alone
-updates the same filter.
+`weights` is the paper's method (section II-A): each marker has its own pose and Kalman filter,
+which are merged with the weights W. `joint` solves for one pose from the corners of both markers
+and filters this pose; if only one marker is visible, its pose updates the same filter.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from perchctl.vision.types import (
 )
 
 MAX_CONSISTENT_CHI2_PER_DOF = 4.0
-"""Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
+"""If chi-squared per degree of freedom is below this value, the two markers do not contradict each
+other."""
 _XYZ_YAW_STATE_INDICES = [X, Y, Z, YAW]
 _VISIBLE_MARKERS_BY_POSE_SOURCE = {
     "joint": VisibleMarkers.BOTH,
@@ -43,10 +44,10 @@ class MergedTarget:
 
     Attributes:
         track_frame_xyz_yaw: position and yaw of the target (4,).
-        track_frame_velocity_mps: velocity of that position (3,).
+        track_frame_velocity_mps: velocity of the target (3,).
         track_frame_position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance
-            of the yaw, without constant errors.
-        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position by one standard deviation
+            of the yaw; constant errors are not included.
+        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position for one standard deviation
             of each constant error, one column per error (see `TrackMeasurement`).
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
@@ -72,9 +73,9 @@ def measure_markers(
     """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
     they update.
 
-    `start_pose` is the last pose of the target, moved by the vehicle's motion since then.
-    `previous_target_normal_cam` (3,) is the target's unit normal, out of the paper, in the last
-    pose, in the camera's axes at that time.
+    `start_pose` is the last pose of the target, corrected for the vehicle's motion since then.
+    `previous_target_normal_cam` (3,) is the unit normal of the target (out of the paper) in its
+    last pose, in the axes of the camera at that time.
     """
     seen, t_s = correct_rolling_shutter(detections, setup), detections.t_s
     joint = None
@@ -105,7 +106,7 @@ def measure_markers(
         if do_markers_contradict:
             poses_by_track = {better.source: better}
         elif config.stages == "range":
-            # By the distance from the camera to the target's plane (equations 4, 6 and 11).
+            # Choose by the distance from the camera to the target's plane (equations 4, 6 and 11).
             offset = R_level_body_of(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
             z_m = float(better.e_m[2] + offset[2])
             if not config.z3_m < z_m <= config.z2_m:
@@ -121,9 +122,10 @@ def merge_tracks(
     poses_by_track: Mapping[str, MarkerPose],
     weights: WeightsConfig,
 ) -> MergedTarget | None:
-    """Return the target as the mean of both markers' tracks, weighted by W
-    (`make_marker_weight_matrix`; equations 5, 8, 12 of the paper), from the tracks that this
-    frame's poses update, or otherwise from the tracks measured last; None without tracks."""
+    """Return the target as the mean of the markers' tracks, weighted by W
+    (`make_marker_weight_matrix`; equations 5, 8, 12 of the paper). The mean is over the tracks that
+    this frame's poses update or, if there are none, over the tracks that were measured last.
+    Returns None if there are no tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())
@@ -144,7 +146,7 @@ def merge_tracks(
         )
     large, small = used["large"], used["small"]
     order = _XYZ_YAW_STATE_INDICES
-    W2 = make_marker_weight_matrix(weights) ** 2  # squared: the errors are independent
+    W2 = make_marker_weight_matrix(weights) ** 2  # squared because the errors are independent
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
@@ -163,7 +165,7 @@ def merge_tracks(
 def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Increase the target's covariance so that it also covers the position of a rival: a
     target-like pattern, with the state `rival_state` (8,), whose position contradicts the target's
-    track. With the difference d between the two positions, the covariance grows by d d^T."""
+    track. If d is the difference between the two positions, the covariance grows by d d^T."""
     off = rival_state[_XYZ_YAW_STATE_INDICES] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -174,24 +176,26 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 
 
 # --- Undo the rolling shutter ---
-# Rows are exposed one after the other within the readout time. Each corner is moved along its own
-# motion to the time of the middle row, which is the frame's time.
+# A rolling shutter exposes the image rows one after the other within the readout time. Each corner
+# is moved along its own image motion to where it was when the middle row was exposed, which is the
+# frame's time.
 
 
 UNKNOWN_READOUT_SIGMA_S = 0.012
-"""Standard deviation of a camera's readout time if the profile does not specify it, s."""
+"""Standard deviation of a camera's rolling-shutter readout time, s, if the profile does not specify
+it."""
 FLOW_ALONG_SIGMA_FRACTION, FLOW_ACROSS_SIGMA_FRACTION = 0.05, 0.015
-"""Errors along and across a corner's motion, as shares of it, since the motion was measured one
-frame earlier."""
+"""Errors of a corner's motion along and across its direction, as fractions of the motion. They
+arise because the motion was measured one frame earlier."""
 
 
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the detections with their corners moved to where they were at the frame's time.
 
-    If `readout_s` is None, the corners are not moved, and `corner_shift_per_readout_sigma_px` is
-    their possible shift for a typical readout time. Otherwise the corners are moved, and
-    `corner_shift_per_readout_sigma_px`, `sigma_px` and `cov_px2` include the error of that
-    correction.
+    If the readout time `setup.readout_s` is None, the corners are not moved, and
+    `corner_shift_per_readout_sigma_px` is their possible shift for a typical readout time.
+    Otherwise the corners are moved, and `corner_shift_per_readout_sigma_px`, `sigma_px` and
+    `cov_px2` include the error of this correction.
     """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
@@ -203,9 +207,9 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         if flow is None:
             out.append(d)
             continue
-        # A corner that moves down from frame to frame is also exposed later.
+        # A corner that moves down from frame to frame is exposed later in each frame.
         flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
-        # Time from the middle row's exposure to each corner's.
+        # Time from the exposure of the middle row to the exposure of each corner.
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
@@ -229,15 +233,15 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
 
 
 def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
-    """Return which markers a frame shows: its stage in the paper (section II-A.2)."""
+    """Return which markers a frame shows, which is the stage in the paper (section II-A.2)."""
     if is_large_detected:
         return VisibleMarkers.BOTH if is_small_detected else VisibleMarkers.LARGE
     return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
 
 
 def make_marker_weight_matrix(weights: WeightsConfig) -> Array:
-    """Return the weight matrix W (4, 8) of the paper's equation 9. The columns are x, y, z and yaw,
-    each for the large and the small marker."""
+    """Return the weight matrix W (4, 8) of the paper's equation 9. The columns are x of the large
+    and of the small marker, then y, z and yaw likewise."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -246,7 +250,7 @@ def make_marker_weight_matrix(weights: WeightsConfig) -> Array:
 
 def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
     """Return the weighted mean of (x, y, z, yaw) of the two markers, each (4,), by equation 8 of
-    the paper. The mean of the yaw angles is taken on the circle."""
+    the paper. The yaw angles are averaged on the circle."""
     W = make_marker_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))

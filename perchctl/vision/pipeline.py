@@ -1,8 +1,8 @@
-"""The vision pipeline: one frame through detection, pose, filter and merge.
+"""The vision pipeline, which runs each frame through detection, pose, filter and merge.
 
-`step` is the only path from an image to a pose, and `estimate` predicts its result to any later
+`step` is the only path from an image to a pose, and `estimate` predicts its result for any later
 time. All memory is in `PipelineState`, which the functions take and return. Small matrices are
-multiplied by `dot` because `@` takes twice as long.
+multiplied with `dot` because `@` takes twice as long.
 """
 
 from __future__ import annotations
@@ -82,12 +82,12 @@ class Detector(Protocol):
 StepFunction = Callable[
     [PipelineState, Frame, VehicleState | None, "Pipeline"], tuple[PipelineState, PipelineOutput]
 ]
-"""The signature of `step`."""
+"""Type of functions with the signature of `step`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's parameters, created by `make_pipeline`. If set, `custom_step` replaces
+    """The pipeline's parameters, created by `make_pipeline`. If `custom_step` is set, it replaces
     `step`."""
 
     detector_setup: DetectorSetup
@@ -104,10 +104,11 @@ def make_pipeline(
     profile: Profile, camera: CameraModel, hidden_mask: NDArray[np.bool_] | None = None
 ) -> Pipeline:
     """Return the pipeline for a profile and a calibrated camera. Several image streams may share
-    it.
+    one pipeline.
 
-    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images; None
-    reads `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
+    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images. If it is
+    None, the file `camera.mask` is read. Raises NotFound if this file is missing, and InvalidValue
+    if it is invalid.
     """
     pose_setup = PoseSetup(
         config=profile.pose,
@@ -127,7 +128,7 @@ def make_pipeline(
     if detector_setup.is_line_fit_enabled:
         warm_up_truncated_marker_fit(detector_setup.patterns, camera)
     target = profile.target
-    # the position at which the vehicle searches for the target
+    # Without `target.expected_xy_m`, use the position at which the vehicle searches for the target.
     own = OwnTargetPosition(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
         own = OwnTargetPosition(target.expected_xy_m, target.expected_within_m)
@@ -151,9 +152,9 @@ def make_pipeline(
 
 
 def make_camera_only_profile(profile: Profile) -> Profile:
-    """Return a copy of the profile for tracking with a camera that is not on a vehicle. It has no
-    mounting and no gear, so that poses are in the camera frame, and it reports a separate pose for
-    each marker."""
+    """Return a copy of the profile for tracking with a camera that is not on a vehicle. This
+    profile has no mounting and no gear, so that poses are in the camera frame, and it reports a
+    separate pose for each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
         update={
@@ -168,7 +169,8 @@ def deinterlace(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
-    two fields in time order if the camera is interlaced. Raises InvalidValue as `step` does."""
+    two fields in time order if the camera is interlaced. Raises InvalidValue for the same reasons
+    as `step`."""
     with one_thread():
         frame = _convert_to_grey(frame, pipeline.camera)
         fields, found = deinterlace_frame(state.field_state, frame)
@@ -178,8 +180,8 @@ def deinterlace(
 def step(
     state: PipelineState, frame: Frame, attitude: VehicleState | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Process a frame, in grey or colour, and return the new state and the frame's output. Raises
-    InvalidValue if the image is invalid or does not have the size given in the calibration.
+    """Process a grey or colour frame, and return the new state and the output for this frame.
+    Raises InvalidValue if the image is invalid or does not have the size given in the calibration.
 
     `attitude` is the vehicle's state at the frame's time. If it is None, the vehicle is assumed to
     be level and at rest, and the filter works in the level frame regardless of `kalman.frame`.
@@ -191,7 +193,7 @@ def step(
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
     else:
-        # All methods search the first image.
+        # In the first image, all methods search for the target.
         first = (
             state.last_detections is None
             and state.rival is None
@@ -261,7 +263,8 @@ def step_detections(
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
     """Run the part of `step` that follows detection. `start_pose` is the expected pose of the
-    target, and `picture_kind` says whether the image is a whole frame or a field."""
+    target. `picture_kind` is passed on to the output: whether the image is a whole frame,
+    interlaced, or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
@@ -325,10 +328,10 @@ def estimate(
     attitude: VehicleState | None,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """Return the target estimate at `t_s`, a time after the newest frame, for the vehicle's
+    """Return the target estimate at `t_s`, a time after the newest frame, given the vehicle's
     `attitude` at that time.
 
-    A tracked target is predicted by its filter and by the vehicle's motion. A target that is no
+    A tracked target is predicted with its filter and the vehicle's motion. A target that is no
     longer tracked stays at its last position in the world. Returns None before the first
     measurement.
     """

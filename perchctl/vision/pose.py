@@ -1,9 +1,9 @@
-"""Compute the target's pose relative to the gear from its corners.
+"""Compute the target's pose relative to the gear from the corners of its markers.
 
-A planar marker has two tilts with nearly identical images. The vehicle's roll and pitch decide
-between them (the target is horizontal), or otherwise the tilt in the previous frame. The position
-is also rotated to the level frame by the vehicle's roll and pitch, never by the marker's own axes:
-at 1.15 m, the error is 0.5 mm instead of 40 mm.
+For a planar marker, two tilts produce nearly identical images. Since the target is horizontal, the
+vehicle's roll and pitch decide between the two. If they are unknown, the tilt in the previous frame
+decides. The position is also rotated to the level frame with the vehicle's roll and pitch, never
+with the marker's own axes: at 1.15 m, the error is 0.5 mm instead of 40 mm.
 """
 
 from __future__ import annotations
@@ -22,16 +22,15 @@ from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import CameraModel, Detection, MarkerPose, VehicleState
 
-_ATTITUDE_TILT_SIGMA_RAD = math.radians(
-    6.0
-)  # combined error of the mounting, the attitude estimate and the ceiling
-_PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)  # between two frames
-_MIN_SHEET_CURL_CHI2_PER_DOF = (
-    3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
-)
-_MAX_CHI2_FRACTION_WITH_SHEET_CURL = (
-    0.5  # largest share of chi-squared that may remain if curl is the cause
-)
+# Combined error of the mounting, the attitude estimate and the ceiling.
+_ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)
+# Change of the tilt between two frames.
+_PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)
+# If the corners of both markers on a flat sheet have a larger chi-squared per degree of freedom,
+# the sheet may be curled.
+_MIN_SHEET_CURL_CHI2_PER_DOF = 3.0
+# If curl is the cause, at most this fraction of chi-squared remains after allowing for it.
+_MAX_CHI2_FRACTION_WITH_SHEET_CURL = 0.5
 _PoseSource = Literal["large", "small", "joint"]
 
 
@@ -50,7 +49,8 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_PoseSource, Array]:
-        """Corners (4, 3) of each marker in its own axes, m; ``joint`` (8, 3): large, then small."""
+        """Corners (4, 3) of each marker in its own axes, m. ``joint`` (8, 3) contains the corners
+        of the large marker, then those of the small one."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
@@ -75,8 +75,8 @@ def square_corners(side_m: float) -> Array:
 
 
 def R_level_body_of(attitude: VehicleState | None) -> Array:
-    """Return the rotation ``R_level_body`` (3, 3) of an attitude; if it is None, the vehicle is
-    assumed to be level."""
+    """Return the rotation ``R_level_body`` (3, 3) for an attitude. If the attitude is None, the
+    vehicle is assumed to be level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
 
@@ -90,16 +90,17 @@ def estimate_pose(
 ) -> MarkerPose | None:
     """Estimate the target's pose from the corners of one marker, or of both markers jointly.
 
-    A planar marker allows two tilts (pose ambiguity). If `start`, the joint pose of the same frame,
-    is given, its tilt is kept and only refined. Otherwise the vehicle's roll and pitch resolve the
-    ambiguity. Without an attitude, the tilt with the normal closer to `previous_target_normal_cam`
-    (3,) is chosen. Returns None if the corners yield no pose: no finite solution in front of the
-    camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
+    A planar marker allows two tilts (pose ambiguity). If a `start` pose is given, its tilt is kept
+    and only refined. Otherwise the vehicle's roll and pitch resolve the ambiguity. Without an
+    attitude, the tilt with the normal closer to `previous_target_normal_cam` (3,) is chosen.
+    Returns None if the corners yield no pose, because there is no finite solution in front of the
+    camera, or because the reprojection error (RMS over the corners) is above
+    `pose.max_reprojection_px`.
     """
     source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
     image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_points_px):
-        return None  # the lens model cannot image these corners
+        return None  # the lens model has no solution for these corners
     K, lift = setup.camera.K, setup.corner_lift_per_sheet_curl_sigma_m[source]
     points = compute_corner_weights(detections, setup.corners_m[source], image_points_px, K, lift)
     R_level_body = R_level_body_of(attitude)
@@ -122,9 +123,9 @@ def estimate_pose(
     ):
         return pose
     if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
-        return pose  # interpolated rows make sides look curled
-    # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
-    # wrong.
+        return pose  # Interpolated rows make the sides look curled.
+    # No flat sheet explains the positions of both markers. Either the sheet is curled, or the
+    # corners are wrong.
     points = replace(points, allows_for_sheet_curl=True)
     settled = _refine_from_start(points, solution, prior, max_rms_reprojection_px)
     if settled is None:
@@ -169,11 +170,12 @@ def _make_marker_pose(
     cov, chi2, curl = pose_covariance(points, solution)
     e_m = R_level_body.dot(R_body_cam.dot(solution.tvec_m) + t_body_cam_m - setup.gear_body_m)
     R_level_target = R_level_cam.dot(R).dot(R_MARKER_TARGET)
-    G = np.zeros((4, 6))  # derivative of (e, e_yaw) by (rvec, tvec)
+    G = np.zeros((4, 6))  # derivative of (e, e_yaw) with respect to (rvec, tvec)
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR_drvec)
     cov_e = G.dot(cov).dot(G.T)
-    # If the print is larger by some percentage, the target is further away by the same percentage.
+    # If the print is larger by some percentage, the target is actually further away by the same
+    # percentage.
     print_cam = np.array([setup.target.size_sigma * solution.tvec_m, curl[3:]])
     print_shift_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_shift_m.dot(print_shift_m.T)
@@ -196,12 +198,13 @@ def _make_marker_pose(
 
 
 def target_rotation_translation_cov_cam(pose: MarkerPose) -> Array:
-    """Return the covariance (6, 6) of the target's pose in the camera frame, as small rotations
-    (rad) about and translations (m) along the camera's x, y and z. Print errors are not
+    """Return the covariance (6, 6) of the target's pose in the camera frame, for small rotations
+    (rad) about, and translations (m) along, the camera's x, y and z axes. Print errors are not
     included."""
     assert pose.rvec_tvec_cov is not None
     R, dR_drvec = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
-    turns = dR_drvec.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
+    # one skew-symmetric matrix for each component of the rotation vector
+    turns = dR_drvec.reshape(3, 3, 3) @ R.T
     J = np.eye(6)
     J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
     return np.asarray(J @ pose.rvec_tvec_cov @ J.T)
@@ -218,16 +221,17 @@ def rotation_vector(R: Array) -> Array:
 
 
 def target_normal_cam(pose: MarkerPose) -> Array:
-    """Return the target's unit normal, the marker's z axis out of the paper, in camera axes,
-    (3,)."""
+    """Return the target's unit normal (3,) in camera axes. It is the marker's z axis, which points
+    out of the paper."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
 def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
     """Return the gradient (3,) of the target's yaw in the level frame with respect to the rotation
-    vector. The yaw is atan2(R[1, 0], R[0, 0]) of `R_level_target`; `dR_drvec` (3, 9) is
-    ``dR_drvec/drvec``."""
-    dx = dR_drvec.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
+    vector. The yaw is atan2(R[1, 0], R[0, 0]) with R = `R_level_target`. `dR_drvec` (3, 9) is the
+    derivative of the rotation matrix with respect to the rotation vector."""
+    # derivative of the target's x axis: rows for the components of rvec, columns for the level axes
+    dx = dR_drvec.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)
     hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
@@ -235,20 +239,23 @@ def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) ->
 # --- Rotation and translation from corners: a closed form, then weighted least squares ---
 
 
-_MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # solutions closer than this are the same
-_MIN_COST_CORNER_SIGMA_PX = 0.05  # lens and print errors make smaller values meaningless
+_MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # Two solutions that are closer together count as one.
+_MIN_COST_CORNER_SIGMA_PX = 0.05  # Lens and print errors make smaller values meaningless.
 _MAX_GAUSS_NEWTON_STEPS = 8
-# weight of the detections' own standard deviation against the residuals, in degrees of freedom
+# Weight of the standard deviation in the detections relative to the residuals, in degrees of
+# freedom.
 _CORNER_SIGMA_PRIOR_DOF = 8.0
 
-_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # rad and m
-# The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
+_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # The step is in rad and m.
+# The nonlinearity is about the squared motion divided by the distance between corners, which is
+# 20 px or more.
 _MAX_LINEARISED_MOTION_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """A possible pose of the marker in the camera: `rvec_rad` (3,) and `tvec_m` (3,)."""
+    """A possible pose of the marker in the camera frame: rotation vector `rvec_rad` (3,) and
+    translation `tvec_m` (3,)."""
 
     rvec_rad: Array
     tvec_m: Array
@@ -256,15 +263,15 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A candidate, its reprojection errors (n, 2), and their Jacobian (2n, 6) with respect to rvec
-    and tvec."""
+    """A pose candidate with its reprojection errors (n, 2), and their Jacobian (2n, 6) with respect
+    to rvec and tvec."""
 
     reprojection_error_px: Array
     reprojection_jacobian: Array
 
     @property
     def rms_reprojection_px(self) -> float:
-        """Root mean square distance of projected from measured corners, px."""
+        """RMS distance between projected and measured corners, px."""
         flat = self.reprojection_error_px.ravel()
         return math.sqrt(float(flat.dot(flat)) / len(self.reprojection_error_px))
 
@@ -288,7 +295,7 @@ class TiltPrior:
 
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """Return the more likely one of the two possible poses of a planar marker; None if neither is
+    """Return the more likely of the two possible poses of a planar marker; None if neither pose is
     valid."""
     candidates = [_refine_unweighted(points, c) for c in _solve_closed_form(points)]
     scored = [_score_candidate(c, points) for c in candidates if _is_valid_candidate(c)]
@@ -299,13 +306,13 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
         best = _choose_most_likely_pose(
             [best, *_find_flipped_candidates(best, points)], points, prior
         )
-    # The unweighted optimum is close enough for the errors to be linear.
+    # The unweighted optimum is close enough to the weighted one for the errors to be linear.
     return refine_pose(points, best) or best
 
 
 def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a nearby pose by Gauss-Newton steps, with each corner weighted by its standard
-    deviation; None if the steps do not converge."""
+    """Refine the pose `start`, which must be close to the solution, by Gauss-Newton steps. Each
+    corner is weighted by its standard deviation. Returns None if the steps do not converge."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening_matrix
@@ -320,17 +327,17 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
             return None
         g = B.T.dot(error)
-        # OpenCV's solver is three times as fast on matrices of this size.
+        # OpenCV's solver is three times as fast as numpy's for matrices of this size.
         regular, solved = cv2.solve(B.T.dot(A), g[:, None], flags=cv2.DECOMP_CHOLESKY)
         if not regular:
             return None
         step = solved[:, 0]
-        # reduction of the cost by the step, in squared standard deviations
+        # Reduction of the cost by this step, in squared standard deviations.
         gain = float(step.dot(g))
         moved_px = scored.reprojection_jacobian.dot(step).reshape(-1, 2)
         small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
         if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
-            # Errors are linear in a step of this size.
+            # The errors are linear for a step of this size.
             reprojection_error_px = scored.reprojection_error_px - moved_px
             rvec, tvec = scored.rvec_rad - step[:3], scored.tvec_m - step[3:]
             return ScoredPose(rvec, tvec, reprojection_error_px, scored.reprojection_jacobian)
@@ -347,8 +354,8 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 class PoseCovariance(NamedTuple):
     """Covariance (6, 6) of (rvec, tvec), chi-squared of the corners per degree of freedom, and the
-    shift (6,) of (rvec, tvec), rad and m, for one standard deviation of a bowl-shaped curl of the
-    sheet."""
+    shift (6,) of (rvec, tvec), rad and m, that one standard deviation of a bowl-shaped curl of the
+    sheet causes."""
 
     rvec_tvec_cov: Array
     chi2_per_dof: float
@@ -356,7 +363,8 @@ class PoseCovariance(NamedTuple):
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
-    """Return the covariance of a pose, the chi2 of its corners, and the effect of the sheet's curl.
+    """Return the covariance of a pose, the chi-squared of its corners, and the effect of the
+    sheet's curl.
 
     The covariance includes corner noise (at least as large as the residuals), shifts common to all
     corners, and a twist of the sheet, but not its bowl-shaped curl.
@@ -384,9 +392,10 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 
 def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
-    each curl mode."""
+    each mode of the sheet's curl."""
     target_normal_cam = rotation_matrix(scored.rvec_rad)[:, 2]
-    # In the image, a corner above the sheet's plane moves as if the target moved along its normal.
+    # If curl lifts a corner off the sheet's plane, its image moves as if the whole target moved
+    # along its normal.
     moved = (
         scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None]
         * points.corner_lift_per_sheet_curl_sigma_m
@@ -395,8 +404,8 @@ def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> A
 
 
 def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> float:
-    """Return the angle, rad, between the normal of a marker with rotation `rvec` and
-    `expected_normal_cam`."""
+    """Return the angle, rad, between `expected_normal_cam` and the normal of a marker with the
+    rotation vector `rvec`."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_normal_cam))))
 
@@ -440,7 +449,7 @@ def _score_candidate(candidate: PoseCandidate, points: WeightedCorners) -> Score
 
 
 def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
-    """Return the second solution of a planar marker: the candidate refined from a normal that is
+    """Return the second solution of a planar marker, refined from a candidate whose normal is
     mirrored about the line of sight. Empty if both normals are nearly the same."""
     R = rotation_matrix(scored.rvec_rad)
     normal, sight = R[:, 2], scored.tvec_m / np.linalg.norm(scored.tvec_m)
@@ -479,8 +488,8 @@ def _choose_most_likely_pose(
 def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: float) -> Array:
     """Return the height of corners (n, 3) above the flat sheet for one standard deviation of two
     curl modes: a bowl (all corners on one side) and a saddle (neighbouring corners on opposite
-    sides). `sheet_curl_sigma_per_m` is the height per squared distance from the centre. Shape (2n,
-    2), m; each corner has two equal rows, for its x and y."""
+    sides). `sheet_curl_sigma_per_m` is the height per squared distance from the centre. The result
+    has the shape (2n, 2), m; each corner has two equal rows, for its x and y."""
     x, y = object_points_m[:, 0], object_points_m[:, 1]
     lift: Array = sheet_curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -501,18 +510,20 @@ def sheet_curl_weight_matrix(whitened_shift_per_sheet_curl_sigma: Array) -> Arra
 
 
 # --- Weights of the corners in the pose solution ---
-# A fitted line has errors of offset and tilt, and moves the corners at both of its ends. Their
-# errors across the line have the variance s^2 and a correlation of -1/2, so half the line's offset
-# is known to s/2 and its tilt to s sqrt(3)/2: `whitening_matrix` transforms the corner errors to
-# these independent ones. A shift of all edges (clipped white, ink) is part of the covariance only:
-# in the fit, faults of small markers would corrupt it.
+# A fitted line has errors of offset and tilt, and moves the corners at both of its ends. The errors
+# of these two corners across the line have the variance s^2 and a correlation of -1/2. Half their
+# sum (the line's offset) therefore has the standard deviation s/2, and half their difference (its
+# tilt) has s sqrt(3)/2: `whitening_matrix` transforms the corner errors to these independent ones.
+# A shift of all edges (clipped white, ink) is only part of the covariance: if it were part of the
+# fit, the errors of small markers would corrupt the result.
 
 
 _IDENTITY_8 = np.eye(8)
 _TILT_TO_OFFSET_WHITENING_RATIO = np.array(1.0 / math.sqrt(3.0))
 _PREVIOUS_CORNER_INDICES = np.array([3, 0, 1, 2])
-_SIDE_START_CORNER_INDICES = np.arange(4)  # side k runs from corner k ...
-_SIDE_END_CORNER_INDICES = np.array([1, 2, 3, 0])  # ... to corner k + 1
+# Side k runs from corner k to corner k + 1.
+_SIDE_START_CORNER_INDICES = np.arange(4)
+_SIDE_END_CORNER_INDICES = np.array([1, 2, 3, 0])
 _SIDE_WHITENING_ROWS = np.concatenate(
     [2 * np.tile(_SIDE_START_CORNER_INDICES, 4), 2 * np.tile(_SIDE_START_CORNER_INDICES, 4) + 1]
 )
@@ -525,7 +536,7 @@ _SIDE_WHITENING_COLUMNS = np.concatenate(
     ]
     * 2
 )
-# indices into a flattened (8, 8) matrix
+# Indices into a flattened (8, 8) matrix.
 _SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMNS
 
 
@@ -536,12 +547,14 @@ class WeightedCorners:
     Attributes:
         object_points_m, image_points_px: corners (n, 3) on the target, and (n, 2) in the image of a
             pinhole camera `K` (3, 3).
-        sigma_px: standard deviations (n,).
-        whitening_matrix: matrix (2n, 2n) that makes the errors independent, with unit variance.
-        whitened_shift_per_common_error_sigma: whitened shift of the corners by one standard
-            deviation of each error common to several of them, one column per error (2n, k): white
-            grown over black at all edges, `corner_shift_per_readout_sigma_px` of the detections,
-            and the jitter of each detection's rows.
+        sigma_px: standard deviations (n,) of the corners.
+        whitening_matrix: matrix (2n, 2n) that transforms the errors of the corners to independent
+            errors with unit variance.
+        whitened_shift_per_common_error_sigma: whitened shift of the corners for one standard
+            deviation of each error that is common to several corners, one column per error (2n, k).
+            These errors are the growth of white over black at all edges,
+            `corner_shift_per_readout_sigma_px` of the detections, and the row jitter in each
+            detection.
         corner_lift_per_sheet_curl_sigma_m: result (2n, 2) of `corner_lift_by_sheet_curl`.
         allows_for_sheet_curl: True if the sheet may be curled, which reduces the weight of corners
             that curl would move; False if the sheet is assumed to be flat.
@@ -564,14 +577,15 @@ def compute_corner_weights(
     K: Array,
     corner_lift_per_sheet_curl_sigma_m: Array,
 ) -> WeightedCorners:
-    """Compute the weights of the detections' corners. `image_points_px` are the corners in a
-    pinhole camera with matrix K; `corner_lift_per_sheet_curl_sigma_m` is the result of
+    """Return the corners of the detections with their weights. `image_points_px` are the corners in
+    a pinhole camera with matrix K; `corner_lift_per_sheet_curl_sigma_m` is the result of
     `corner_lift_by_sheet_curl`."""
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
-    # A shift of all edges by one pixel moves a corner along the normals of both of its sides.
+    # If all edges shift by one pixel, a corner moves by one pixel along the normals of both of its
+    # sides.
     moved = (normals + normals.take(_PREVIOUS_CORNER_INDICES, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
@@ -579,9 +593,8 @@ def compute_corner_weights(
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
-            except (
-                np.linalg.LinAlgError
-            ):  # rounding errors for distant corners of a truncated target
+            except np.linalg.LinAlgError:
+                # Distant corners of a truncated target cause rounding errors.
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.are_corners_fitted:
             spread_px = (
@@ -597,7 +610,7 @@ def compute_corner_weights(
         if d.corner_shift_per_readout_sigma_px is not None:
             error_shifts[rows, 1] = d.corner_shift_per_readout_sigma_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
-            # As for a line: half to all of the rows shift alike, and they tilt.
+            # As with a fitted line, the errors are a common shift of the rows and a tilt.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)
@@ -628,8 +641,9 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
-    """Return the standard deviation of each side's position perpendicular to it, (4,) px. In a
-    field, it is larger for sides along the image rows because every second row is interpolated."""
+    """Return the standard deviation of each side's position perpendicular to it, (4,) px. In an
+    image from a single field, it is larger for sides along the image rows because every second row
+    is interpolated."""
     sides = corners.take(_SIDE_END_CORNER_INDICES, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])
@@ -642,8 +656,8 @@ def _side_sigma_px(detection: Detection, corners: Array) -> Array:
 
 
 def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the elements, at `_SIDE_WHITENING_FLAT_INDICES`, of the matrix that whitens corners
-    which are intersections of four fitted lines. Each line has independent errors of offset and
+    """Return the elements, at `_SIDE_WHITENING_FLAT_INDICES`, of the whitening matrix for corners
+    that are intersections of four fitted lines. Each line has independent errors of offset and
     tilt.
 
     `normals` (4, 2) are the lines' unit normals; `sigma_px` is a scalar for all lines, or (4,).

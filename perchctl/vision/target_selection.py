@@ -1,8 +1,9 @@
 """Select the vehicle's own target from several targets with identical markers.
 
-The own target is the one closest to its position in the profile, in the world frame of the state
-estimate, or otherwise the one closest to the upward axis through the gear. This choice is made
-once; afterwards, the lock (`perchctl.vision.tracks`) follows the chosen target.
+The vehicle's own target is the one closest to the position in the profile, which is in the world
+frame of the state estimate. Without such a position, it is the one closest to the upward axis
+through the gear. The target is chosen once; afterwards, the lock (`perchctl.vision.tracks`) follows
+it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from perchctl.vision.filter import (
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Detection, MarkerName, MarkerPose, VehicleState
 
-_RAW_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
+_RAW_CORNER_SIGMA_PX = 1.0  # for corners that a search has found, before refinement
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,13 @@ class OwnTargetPosition:
 
 
 OwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
-"""Function that returns the distance, m, of a marker with corners (4, 2) px from the own target's
-position, or inf."""
+"""Type of functions that return the horizontal distance, m, of a marker with corners (4, 2) px from
+the position of the vehicle's own target, or infinity if the marker is too far away."""
 
 
 _NO_POSE_DISTANCE_M = 1e9
-"""Distance for corners that yield no pose yet, for example next to a highlight, m: examined last,
-but not refused."""
+"""Distance, m, that is assumed for corners that yield no pose yet, for example next to a highlight.
+Such a marker is considered last, but not rejected."""
 
 
 def marker_to_own_target_distance_m(
@@ -55,8 +56,9 @@ def marker_to_own_target_distance_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return the horizontal distance, m, of a marker with corners (4, 2) px from the own target's
-    position; infinite beyond `own_target.max_distance_m`."""
+    """Return the horizontal distance, m, of a marker with corners (4, 2) px from the position of
+    the vehicle's own target. The result is infinite if the distance exceeds
+    `own_target.max_distance_m`."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
@@ -71,8 +73,8 @@ def marker_to_own_target_distance_m(
 def horizontal_distance_to_own_target_m(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
-    """Return the horizontal distance of a detected target from the position of the vehicle's own
-    target, or from the gear if that position is unknown."""
+    """Return the horizontal distance, m, of a detected target from the position of the vehicle's
+    own target, or from the gear if this position is unknown."""
     if own_target.xy_world_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -82,7 +84,7 @@ def horizontal_distance_to_own_target_m(
 def foreign_target_message(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
-    """Return the message that a detected target belongs to another vehicle; None if it may be this
+    """Return a message if a detected target belongs to another vehicle; None if it may be this
     vehicle's own target."""
     if attitude is None or own_target.xy_world_m is None:
         return None
@@ -99,7 +101,7 @@ def foreign_target_message(
 
 
 _IDENTITY_4 = np.eye(4)
-# 0.006 deg, 0.03 mm: errors of lens and print
+# Errors of the lens and the print: 0.006 deg and 0.03 mm.
 _MIN_MEASUREMENT_COVARIANCE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
 _YAW_FIRST_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
@@ -107,8 +109,8 @@ _YAW_FIRST_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def target_level_to_world(
     e_m: Array, e_yaw_rad: float, attitude: VehicleState, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert a target's position (3,) and heading, relative to the gear in the level frame, to the
-    world frame of the state estimate."""
+    """Convert a target's position (3,), m, and heading, rad, which are relative to the gear in the
+    level frame, to the world frame of the state estimate."""
     body_to_target_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(body_to_target_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -120,8 +122,9 @@ def target_world_to_level(
     attitude: VehicleState,
     setup: PoseSetup,
 ) -> tuple[Array, float]:
-    """Convert a target's position (3,) and heading in the world frame of the state estimate to
-    those relative to the gear in the level frame; the inverse of `target_level_to_world`."""
+    """Convert a target's position (3,), m, and heading, rad, from the world frame of the state
+    estimate to the level frame, relative to the gear. This is the inverse of
+    `target_level_to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     body_to_target_m = (target_position_world_m - np.asarray(attitude.position_m)).dot(
         attitude.R_world_level
@@ -136,8 +139,9 @@ def make_track_measurement(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> TrackMeasurement:
-    """Convert a pose to a filter measurement in the world frame or the level frame."""
-    z, lever_m = np.empty(4), pose.e_m  # a tilt error rotates the lever arm
+    """Convert a pose to a filter measurement in the world frame (if `is_in_world_frame`) or in the
+    level frame."""
+    z, lever_m = np.empty(4), pose.e_m  # an error of the vehicle's tilt rotates this lever arm
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if is_in_world_frame:
         assert attitude is not None
