@@ -44,9 +44,9 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """Parameters for updating tracks: the filters in the level and in the world frame, the pose
-    estimation, and the position of the vehicle's own target. `is_gate_enabled`: reject poses that
-    do not fit the tracked target."""
+    """Parameters for updating tracks: the filters for the level and the world frame, the pose
+    estimation, and the position of the vehicle's own target. If `is_gate_enabled` is True, poses
+    that do not fit the tracked target are rejected."""
 
     level_filter: FilterSetup
     world_filter: FilterSetup
@@ -55,7 +55,8 @@ class TrackSetup:
     own_target: OwnTargetPosition
 
     def select_filter(self, is_in_world_frame: bool) -> FilterSetup:
-        """Return the filter parameters for the world frame or the level frame."""
+        """Return the filter parameters for the world frame (if `is_in_world_frame`) or for the
+        level frame."""
         return self.world_filter if is_in_world_frame else self.level_filter
 
 
@@ -83,7 +84,7 @@ def update_tracks(
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Update the tracks with the poses of one frame that the gate accepts."""
+    """Update the tracks with those poses of one frame that the gate accepts."""
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
         name: make_track_measurement(
@@ -113,7 +114,7 @@ def update_tracks(
             frame_pose = replace(frame_pose, is_locked_target_in_view=looks)
         if setup.is_gate_enabled:
             verdict = judge_pose(state.lock, state.rival, frame_pose, filter_setup)
-        # A locked target stays locked, however far the estimate's world frame has drifted
+        # A locked target stays locked, no matter how far the estimate's world frame has drifted
         # meanwhile.
         goes_on = not verdict.restarts_track or verdict.restarts_at_locked_target
         goes_on = goes_on and drop_expired_lock_and_rival(state.lock, None, t_s)[0] is not None
@@ -143,58 +144,59 @@ def update_tracks(
 
 # --- Gate: does a pose belong to the locked target? ---
 # An image cannot distinguish another target, or a marker of another size, from the target, but the
-# target does not jump. A pose that contradicts the lock by more than noise, motion and drift
+# target does not jump. A pose that contradicts the lock by more than noise, motion and drift can
 # explain belongs to a rival and updates no filter.
 #
-# The lock changes to a rival seen with both markers: at once if the lock never was; otherwise, if
-# both are equally far away, after `REACQUIRE_S` in which the target was not seen although its
-# position is in the image. It changes to any rival that was seen more often than a lock of only a
-# few frames.
+# The lock changes to a rival that is seen with both markers. It changes at once if the locked
+# target was never seen with both markers. Otherwise, it changes if the rival and the target are
+# equally far away and the target was not seen for `REACQUIRE_S` although its position is in the
+# image. If the lock has only a few frames, it changes to any rival that was seen more often.
 #
-# A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
-# lacks, so a rival is most likely the target from a different viewpoint. The lock then changes
-# after `MIN_ONLY_RIVAL_SEEN_DURATION_S` in which only the rival was seen, if the rival has both
-# markers or the lock never had. A rival that was seen before the target was lost is a second target
-# and waits `REACQUIRE_S`.
+# If the camera is not on a vehicle, neither its motion nor the number of frames that a recording
+# lacks is known, so a rival is most likely the target from a different viewpoint. The lock then
+# changes when only the rival has been seen for `MIN_ONLY_RIVAL_SEEN_DURATION_S`, if the rival shows
+# both markers or if the locked target never did. A rival that was seen before the target was lost
+# is a second target, and the lock only changes to it after `REACQUIRE_S`.
 #
-# While a rival is seen and the target is not, the target's predicted position may be wrong, and its
-# covariance covers the rival's position, too.
+# While a rival is seen and the target is not, the target's predicted position may be wrong, so its
+# covariance also covers the rival's position.
 #
-# A pose that passes the gate may still be wrong. If the next pose fits the previous track and not
-# the present one, the track restarts there.
+# A pose that passes the gate may still be wrong. If the next pose fits the track before that pose,
+# but not the current track, the track restarts at the next pose.
 #
-# While something is seen at the lock's position, the search continues there and ignores a complete
-# target elsewhere. If the state estimate jumps, the target seems to jump in the world, but not in
-# the image.
+# While something is seen at the position of the locked target, the search continues there and
+# ignores a complete target elsewhere. If the state estimate jumps, the target seems to jump in the
+# world, but not in the image.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
 MIN_ONLY_RIVAL_SEEN_DURATION_S = 0.3
-"""Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
-has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
+"""Time, s, for which a camera without a vehicle must see only the rival before the lock changes to
+it. Larger: after lost frames, a recording is without a target for longer. Smaller: fewer successive
+wrong frames are enough to capture the lock."""
 LOCK_TIMEOUT_S = 10.0
-"""Time after which a lock in the world frame expires, s."""
+"""Time after which a lock in the world frame expires if the target is not seen, s."""
 MIN_ESTABLISHED_TRACK_FRAMES = 5
-"""Number of frames below which a lock yields to a rival that was seen more often."""
+"""If a lock has fewer frames than this, it yields to a rival that was seen more often."""
 
 _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the last pose: that pose may have been wrong"
 )
-_MAX_GATE_CHI2 = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
-_MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
-# Errors outside any covariance: calibration, print, latency; plus shares of the range.
+_MAX_GATE_CHI2 = 25.0  # With four dimensions, 5 of 100 000 squared distances exceed it by chance.
+_MAX_SAME_RANGE_SIGMAS = 4.0
+# Errors that no covariance includes (calibration, print, latency): constants and fractions of the
+# range.
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
 _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
 _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-_MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(
-    15.0
-)  # a larger rotation is mentioned in the message
+# The message mentions a larger rotation.
+_MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-# largest share of the squared innovation that the better of two explanations may leave
+# An explanation is accepted if it leaves less than this fraction of the other's squared innovation.
 _MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 
@@ -216,7 +218,7 @@ class FramePose:
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as a pose of the target, whether the
-    tracks restart at this pose, and whether they restart for the same target
+    tracks restart at this pose, and whether they restart for the locked target
     (`restarts_at_locked_target`) or for the rival.
 
     `rival` is the rival track after this frame; `reason` explains a rejection or a restart.
@@ -227,7 +229,7 @@ class GateVerdict:
     restarts_at_locked_target: bool = False
     rival: RivalTrack | None = None
     reason: str = ""
-    is_foreign_target: bool = False  # its position is that of another vehicle's target
+    is_foreign_target: bool = False  # True if another vehicle's target is at this position
 
 
 def judge_pose(
@@ -244,7 +246,7 @@ def judge_pose(
         rival = None
     if lock is None or lock.is_in_world_frame != frame_pose.is_in_world_frame:
         return GateVerdict(is_accepted=True)
-    if frame_pose.t_s <= lock.track.t_s:  # the tracks are newer
+    if frame_pose.t_s <= lock.track.t_s:  # the tracks are already newer than this frame
         return GateVerdict(is_accepted=False, rival=rival)
     if rival is None and _is_clearly_consistent(lock.track, frame_pose, filter_setup):
         return GateVerdict(is_accepted=True)
@@ -287,17 +289,17 @@ def judge_pose(
 def drop_expired_lock_and_rival(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
-    """Return lock and rival, each replaced by None if it has expired at `t_s`. A rival, or a lock
-    in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S`; any other
-    lock after `LOCK_TIMEOUT_S`."""
+    """Return the lock and the rival, each replaced by None if it has expired at `t_s`. A rival, or
+    a lock in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S`. Any
+    other lock expires after `LOCK_TIMEOUT_S`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
         return None, None
     age_s = t_s - lock.track.t_s
-    # A position in the level frame expires soon, but a rival stays a rival.
+    # A position in the level frame expires soon, unless there is a rival.
     lasting = lock.is_in_world_frame or rival is not None
-    # If the clock was set back, older tracks cannot be confirmed any more.
+    # If the clock was set back, earlier tracks can no longer be confirmed.
     if age_s < -MAX_TRACK_GAP_S or age_s > (LOCK_TIMEOUT_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, rival
@@ -354,8 +356,8 @@ def update_lock(
 
 @dataclass(frozen=True, eq=False)
 class _Innovation:
-    """Innovation of a pose: measurement minus prediction of (yaw, x, y, z) in the track's frame,
-    rad and m, (4,), and its covariance `S` (4, 4)."""
+    """Innovation of a pose, which is measurement minus prediction of (yaw, x, y, z) (4,), rad and
+    m, in the track's frame, and the covariance `S` (4, 4) of the innovation."""
 
     yaw_xyz: Array
     S: Array
@@ -366,8 +368,8 @@ class _Innovation:
 
     @property
     def log_likelihood_cost(self) -> float:
-        """The squared Mahalanobis distance plus a penalty for a larger covariance (twice the
-        negative log likelihood, without its constant)."""
+        """The squared Mahalanobis distance plus a penalty for a larger covariance, which is twice
+        the negative log likelihood without its constant."""
         return self.squared_mahalanobis + float(np.linalg.slogdet(self.S)[1])
 
     @property
@@ -379,13 +381,14 @@ def _compute_innovation(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> _Innovation:
     wanted, measurement = predict_track(track, frame_pose.t_s, filter_setup), frame_pose.measurement
-    # The largest drift is taken as three standard deviations.
+    # The maximum drift is assumed to be three standard deviations.
     drift_m = (
         min(filter_setup.max_target_speed_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
     )
     residual = measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
-    # A bias shifts measurement and prediction alike.
+    # A bias shifts the measurement and the prediction alike, so only the difference of the shifts
+    # counts.
     error_shifts = (
         wanted.state_shift_per_bias_sigma[MEASURED]
         if measurement.yaw_xyz_shift_per_bias_sigma is None
@@ -404,8 +407,8 @@ def _compute_innovation(
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
-    """True if the innovation is smaller than the unmodelled errors of lens, print and latency
-    alone, as in most frames. This fast check saves the full one."""
+    """True if the unmodelled errors of lens, print and latency alone explain the innovation, as in
+    most frames. This fast check then makes the full one unnecessary."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
@@ -532,7 +535,7 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
     if not lock.has_shown_both_markers:
         return True
     unseen_s = frame_pose.t_s - max(rival.first_seen_at_s, lock.track.t_s)
-    # A target outside the image may still be at its position.
+    # A target whose position is outside the image may still be there.
     return (
         (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.has_different_range
@@ -561,10 +564,12 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
 
 # --- Expected position of the target in the next image ---
 # The state estimate provides the vehicle's motion in two ways: as the difference of two positions,
-# and as velocity times time. Each is weighted by its recent errors in the target's own images.
+# and as velocity times time. Each of the two is weighted by its recent errors, which are measured
+# with the images of the target.
 
 
-_MOTION_ERROR_SMOOTHING_FACTOR = 0.1  # weight of a new frame in the running mean of squared errors
+# Weight of a new frame in the running mean of the squared errors.
+_MOTION_ERROR_SMOOTHING_FACTOR = 0.1
 
 
 def predict_corners(
@@ -573,8 +578,8 @@ def predict_corners(
     """Predict the corners of both markers, (4, 2) px, and the pose of the target at `t_s` from the
     last pose and the vehicle's motion since then.
 
-    Returns (None, last pose) if one of the two attitudes is unknown, and (None, None) if there is
-    no recent pose.
+    Returns (None, last pose) if the vehicle's attitude at either time is unknown, and (None, None)
+    if there is no recent pose.
     """
     if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -601,8 +606,8 @@ def predict_corners(
 def update_last_pose(
     previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
-    """Return a new pose as the last pose, with updated errors of the vehicle's estimated motion
-    since `previous`."""
+    """Return `pose` as the new last pose. The errors of the vehicle's estimated motion are updated
+    with the motion since `previous`."""
     if previous is None:
         return LastPose(pose, attitude)
     then, passed_s = previous.attitude, pose.t_s - previous.pose.t_s
@@ -610,7 +615,8 @@ def update_last_pose(
         return LastPose(pose, attitude, previous.motion_errors)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(previous.pose.tvec_m) - R.dot(pose.tvec_m)
-    # Across the line of sight, because the distance of a far target is uncertain along it.
+    # Compare the motions only across the line of sight, because the distance of a far target along
+    # it is uncertain.
     residual = [
         R.T.dot(displacement_m - seen_m)[:2] / pose.tvec_m[2]
         for displacement_m in _camera_displacements_m(then, attitude, setup)
@@ -623,13 +629,13 @@ def update_last_pose(
 
 
 def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup) -> bool:
-    """True if a position (3,) in the world frame is in the camera's field of view at the vehicle's
-    attitude."""
+    """True if a position (3,), m, in the world frame is in the camera's field of view, given the
+    vehicle's attitude and position."""
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (
         position_world_m - attitude.position_m - _vehicle_to_camera_world_m(attitude, setup)
     )
-    # Further off the axis, a lens model may fold back into the image.
+    # Further off the optical axis, a lens model may map points back into the image.
     if (
         tvec_m[2] <= 0.0
         or np.hypot(*tvec_m[:2])
@@ -641,8 +647,8 @@ def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup
 
 
 class _CameraDisplacements(NamedTuple):
-    """The camera's displacement (3,) in the world between two times: from the difference of the
-    estimated positions, and from velocity times time."""
+    """The camera's displacement (3,), m, in the world between two times, computed from the
+    difference of the estimated positions, and from velocity times time."""
 
     position_based_m: Array
     velocity_based_m: Array
@@ -652,7 +658,7 @@ def _camera_displacements_m(
     previous: VehicleState, current: VehicleState, setup: PoseSetup
 ) -> _CameraDisplacements:
     """Return the camera's displacement from the `previous` to the `current` vehicle state, computed
-    in both ways."""
+    both from positions and from velocities."""
     turned_m = _vehicle_to_camera_world_m(current, setup) - _vehicle_to_camera_world_m(
         previous, setup
     )
@@ -670,6 +676,6 @@ def _R_world_cam(attitude: VehicleState, setup: PoseSetup) -> Array:
 
 
 def _vehicle_to_camera_world_m(attitude: VehicleState, setup: PoseSetup) -> Array:
-    """Return the vector from the vehicle to the camera in the world, (3,)."""
+    """Return the vector (3,), m, from the vehicle's origin to the camera, in world axes."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

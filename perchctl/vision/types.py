@@ -24,12 +24,13 @@ GearToTargetInLevel = Array
 
 
 class VisibleMarkers(Enum):
-    """The target's markers that are in view: the stages of the paper (section II-A.2)."""
+    """The markers of the target that are in view, which are the stages of the paper (section
+    II-A.2)."""
 
     NONE = "none"
-    LARGE = "large"  # stage 1, equation 5
-    BOTH = "both"  # stage 2, equation 8
-    SMALL = "small"  # stage 3, equation 12
+    LARGE = "large"  # Stage 1 of the paper, equation 5.
+    BOTH = "both"  # Stage 2 of the paper, equation 8.
+    SMALL = "small"  # Stage 3 of the paper, equation 12.
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,8 @@ class CameraModel:
         size_px: width, height.
         K: camera matrix (3, 3), px: (fx, 0, cx), (0, fy, cy), (0, 0, 1).
         dist: distortion coefficients in OpenCV's order, shape (n,).
-        model: ``plumb_bob`` (5), ``rational_polynomial`` (8) or ``fisheye`` (4).
+        model: distortion model, ``plumb_bob`` (5 coefficients), ``rational_polynomial`` (8) or
+            ``fisheye`` (4).
 
     Raises InvalidValue for any other form of `K`, because OpenCV only uses fx, fy, cx and cy and
     silently ignores the other entries.
@@ -56,15 +58,15 @@ class CameraModel:
 
     @property
     def calibration_key(self) -> tuple[tuple[int, int], str, bytes, bytes]:
-        """A hashable value that is equal for cameras with the same calibration."""
+        """A hashable value that is the same for all cameras with the same calibration."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
 
 
 MAX_CAMERA_MATRIX_SKEW_PX = 0.3
-"""Largest skew, px. A skew of s px moves a pixel laterally by s y/z: with this value, 0.2 px at the
-lower edge of the example camera, or 0.5 mm at 1 m. Larger: an error that no other check detects is
-accepted."""
+"""Largest skew of a camera matrix, px. A skew of s px moves an image point laterally by s y/z. With
+this skew, a point at the lower edge of the example camera's image moves by 0.2 px, or 0.5 mm at 1
+m. Larger: an error that no other check detects is accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
@@ -140,41 +142,35 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """One marker's corners in the image: (4, 2) px, TL TR BR BL in the order of cv2.aruco; pixel
-    (0, 0) is the centre of the top-left pixel.
+    """One marker's corners in the image, (4, 2) px, in the order of cv2.aruco: top left, top right,
+    bottom right, bottom left. (0, 0) is the centre of the top-left pixel.
 
     Attributes:
         sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
             default value if no lines were fitted.
         are_corners_fitted: True if the corners come from a line fit or a photometric fit, False if
             they come from OpenCV or from the other marker.
-        remaining_edge_shift_sigma_px: standard deviation of the remaining common outward shift of
-            all edges after its correction.
+        remaining_edge_shift_sigma_px: standard deviation of the common outward shift of all edges
+            that remains after the correction of this shift.
         corner_shift_per_readout_sigma_px: change (4, 2) of the corners for one standard deviation
             of the readout-time error, which is common to both markers; None if there is no such
             error.
         cov_px2: covariance (8, 8) of corners that were inferred from a visible part of the marker
-            and may lie outside the image, in pixels of a pinhole camera, ordered x0, y0, x1, y1,
-            ...
-        row_jitter_sigma_px: standard deviation due to row jitter in analogue video.
-        horizontal_side_extra_sigma_px: additional standard deviation of sides along the image rows
-            if every second row is interpolated.
+            and may be outside the image. It is in pixels of a pinhole camera, in the order x0, y0,
+            x1, y1, ...
+        row_jitter_sigma_px: standard deviation of the corners due to row jitter in analogue video.
+        horizontal_side_extra_sigma_px: additional standard deviation of the sides along the image
+            rows if every second row is interpolated.
     """
 
     marker: MarkerName
     corners_px: Array
     sigma_px: float
     are_corners_fitted: bool
-    remaining_edge_shift_sigma_px: float = (
-        0.0  # standard deviation of the common outward shift of all edges
-    )
-    # (4, 2): change of the corners for one standard deviation of an error common to all of them
+    remaining_edge_shift_sigma_px: float = 0.0
     corner_shift_per_readout_sigma_px: Array | None = None
     cov_px2: Array | None = None
-    row_jitter_sigma_px: float = (
-        0.0  # standard deviation due to the jitter of rows in analogue video
-    )
-    # additional standard deviation of sides along the rows, if every second row is interpolated
+    row_jitter_sigma_px: float = 0.0
     horizontal_side_extra_sigma_px: float = 0.0
 
 
@@ -182,7 +178,8 @@ class Detection:
 class EdgeShift:
     """Common shift of all black-white edges of an image (blooming, gamma). `white_growth_px` is how
     far white has grown over black; if positive, a marker's black square looks smaller. `sigma_px`
-    is its standard deviation, and `age_frames` the number of frames since it was measured."""
+    is the standard deviation of this growth, and `age_frames` the number of frames since it was
+    measured."""
 
     white_growth_px: float
     sigma_px: float
@@ -197,11 +194,10 @@ class Detections:
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    is_mirrored_marker_seen: bool = False  # whether a marker was decoded as its mirror image
-    target_count: int = 0  # complete targets, with both markers, found by a search
-    flow_pxps: dict[MarkerName, Array] = field(
-        default_factory=dict
-    )  # (4, 2), or (2,) for all corners
+    is_mirrored_marker_seen: bool = False  # True if a marker was decoded as its mirror image.
+    target_count: int = 0  # Number of complete targets, with both markers, that a search found.
+    # Image velocity of each marker's corners (4, 2), or one velocity (2,) for all of its corners.
+    flow_pxps: dict[MarkerName, Array] = field(default_factory=dict)
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
@@ -210,7 +206,7 @@ class Detections:
 
     @property
     def markers(self) -> list[Detection]:
-        """The detected markers, the large one first."""
+        """The markers that were detected, the large one first."""
         return [each for each in (self.large, self.small) if each is not None]
 
 
@@ -255,8 +251,9 @@ class MarkerPose:
         e_m: position of the target relative to the gear in the level frame, (3,).
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
-        rms_reprojection_px: RMS distance of the projected from the measured corners.
-        chi2_per_dof: squared errors of the corners over their variances, per degree of freedom.
+        rms_reprojection_px: RMS distance between the projected and the measured corners.
+        chi2_per_dof: sum of the squared errors of the corners divided by their variances, per
+            degree of freedom.
         xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
         shift_per_print_error_sigma_m: shift of `e_m` for one standard deviation of the print's size
             error and of the sheet's curl, (3, 2). These errors are included in `sigma_m` and
@@ -283,11 +280,11 @@ class MarkerPose:
 class MarkerTrack:
     """State of a marker's Kalman filter (paper, section II-A.1).
 
-    State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
-    in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
-    motion. Column k of `state_shift_per_bias_sigma` (8, 4) is the change of the state for one
-    standard deviation of bias k: the vehicle's roll and pitch, the print's size and curl.
-    `unseen_frames` counts the frames since the last measurement.
+    The state `x` (8,) contains yaw, yaw rate, then position and velocity of x, y, z, in SI units;
+    `perchctl.vision.filter` defines names for its indices. `P` (8, 8) is its covariance due to the
+    noise of measurements and motion. Column k of `state_shift_per_bias_sigma` (8, 4) is the change
+    of the state for one standard deviation of bias k: the vehicle's roll and pitch, the print's
+    size and curl. `unseen_frames` counts the frames since the last measurement.
     """
 
     t_s: float
@@ -308,10 +305,10 @@ class TargetEstimate:
     deviations.
 
     Attributes:
-        t_s: time of the estimate: the frame's, or later by prediction.
-        last_measured_at_s, small_marker_last_measured_at_s: time (on the clock of `t_s`) of the
-            exposure of the last frame that measured the target, and of the last one that measured
-            its small marker.
+        t_s: time of the estimate, which is the time of the frame, or a later time for a prediction.
+        last_measured_at_s, small_marker_last_measured_at_s: exposure times (on the clock of `t_s`)
+            of the last frame in which the target was measured, and of the last frame in which its
+            small marker was measured.
         stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
         is_measured_in_newest_frame: True if the newest frame contains a detection of the target.
         tracked: True if the target was measured at most `kalman.n_max` frames ago. If False, the
@@ -321,16 +318,18 @@ class TargetEstimate:
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`. While only a
             rival is seen, which may be the target, sigma_m also covers the rival's position.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
-        velocity_mps: the filter's velocity, in level axes, (3,): of `e_m` (`kalman.frame: level`)
-            or of the target in the world (`kalman.frame: world`).
-        measured_gear_to_target_world_m, measured_gear_to_target_sigma_m: vector from the gear to
-            the target at `last_measured_at_s`, in axes of the state estimate's world, (3,), and the
-            larger standard deviation of its x and y; None and infinite without an attitude. Unlike
-            `e_m`, it does not depend on how far the vehicle has moved since.
+        velocity_mps: velocity (3,) from the filter, in level axes: the rate of change of `e_m`
+            (`kalman.frame: level`), or the velocity of the target in the world (`kalman.frame:
+            world`).
+        measured_gear_to_target_world_m, measured_gear_to_target_sigma_m: vector (3,) from the gear
+            to the target at `last_measured_at_s`, in the axes of the state estimate's world frame,
+            and the larger of the standard deviations of its x and y; None and infinite without an
+            attitude. Unlike `e_m`, the vector does not depend on how far the vehicle has moved
+            since then.
         world_m, world_yaw_rad: position (3,) and heading of the target in the world frame of the
             vehicle's state estimate; None without an attitude.
-        world_velocity_mps: velocity (3,) of the target in that frame, which is the frame's drift;
-            None if the filter works in the level frame.
+        world_velocity_mps: velocity (3,) of the target in the world frame of the state estimate,
+            which is the drift of this frame; None if the filter works in the level frame.
     """
 
     t_s: float
@@ -354,8 +353,8 @@ class TargetEstimate:
 
 class MotionErrors(NamedTuple):
     """Running mean squared errors of the vehicle's estimated motion between poses, as angles seen
-    from the camera, rad^2: for the motion from the difference of two estimated positions, and for
-    the motion from velocity times time."""
+    from the camera, rad^2: one for the motion computed from the difference of two estimated
+    positions, and one for the motion computed from velocity times time."""
 
     position_based_mean_squared_error_rad2: float = 0.0
     velocity_based_mean_squared_error_rad2: float = 0.0
@@ -376,7 +375,7 @@ class LastPose:
 class TargetLock:
     """The target that the pipeline is locked on: its last track and pose, the number of frames with
     an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers.
-    `track_before_last_pose` is the track without its last pose; None after the first one."""
+    `track_before_last_pose` is the track without its last pose; None after the first pose."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -394,9 +393,9 @@ class RivalTrack:
     Attributes:
         track: state of the rival's filter.
         is_in_world_frame: True if the track is in the world frame, False if in the level frame.
-        first_seen_at_s: time of the rival's first frame.
-        seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and of
-            those that showed both of its markers.
+        first_seen_at_s: time of the first frame that showed the rival.
+        seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and
+            number of frames that showed both of its markers.
         has_different_range: True if the rival's range differs significantly from the target's.
         relative_position_text: the rival's position relative to the target, in words.
     """
@@ -415,7 +414,7 @@ class MarkerPoses:
     """The poses estimated from one frame.
 
     Attributes:
-        poses_by_source: all poses, by ``joint``, ``large``, ``small``, in this order.
+        poses_by_source: all poses, with the keys ``joint``, ``large`` and ``small`` in this order.
         poses_by_track: the poses that update a track, by the track's name.
         do_markers_contradict: True if the two markers contradict each other.
     """
@@ -437,14 +436,15 @@ class FieldState:
     """What is known about the interlacing of an image stream.
 
     Attributes:
-        picture_kind: kind of the last frame that was checked for combing.
+        picture_kind: kind of the last frame that was checked for combing; ``woven`` from the first
+            interlaced frame on.
         frames_since_combing_check: number of frames since that check.
         top_field_first_vote_sum: sum of the votes on the order of the fields: positive if the top
             field seems to be first, negative if the bottom field does.
         is_top_field_first: order of the fields; None until the votes decide.
-        frame_periods_s: the last periods between frames.
+        frame_periods_s: the most recent times between successive frames.
         last_frame_t_s: time of the last frame.
-        previous_image: previous image, unless it was a whole one.
+        previous_image: the previous image; None if it was not interlaced.
     """
 
     picture_kind: PictureKind | None = None
@@ -461,13 +461,12 @@ class PipelineState:
     """The complete state of the pipeline between frames; `PipelineState()` is the initial state."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
-    are_tracks_in_world_frame: bool = (
-        False  # frame of the tracks: world of the state estimate, or level
-    )
-    marker_poses: MarkerPoses = MarkerPoses()  # poses of the newest frame
-    target: TargetEstimate | None = None  # at the last frame with a track
+    # True if the tracks are in the world frame of the state estimate, False if in the level frame.
+    are_tracks_in_world_frame: bool = False
+    marker_poses: MarkerPoses = MarkerPoses()  # Poses estimated from the newest frame.
+    target: TargetEstimate | None = None  # Estimate for the last frame in which there was a track.
     last_detections: Detections | None = None
-    last_pose: LastPose | None = None  # the last pose
+    last_pose: LastPose | None = None
     frames_with_contradicting_markers: int = 0
     frames_without_markers: int = 0  # number of successive frames without a marker
     lock: TargetLock | None = None
@@ -481,16 +480,15 @@ class PipelineOutput:
 
     detections: Detections
     poses: dict[str, MarkerPose]
-    target: TargetEstimate | None  # at the frame's time
-    stage: VisibleMarkers  # from this frame's detections
-    frames_with_contradicting_markers: int = (
-        0  # number of successive frames with contradicting markers
-    )
-    picture_kind: PictureKind = "whole"  # kind of the image
-    lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
-    is_foreign_target: bool = (
-        False  # whether this frame showed another vehicle's target, judged by its position
-    )
+    target: TargetEstimate | None  # Estimate for the time of the frame.
+    stage: VisibleMarkers  # Markers that were detected in this frame.
+    # Number of successive frames in which the two markers contradict each other.
+    frames_with_contradicting_markers: int = 0
+    picture_kind: PictureKind = "whole"
+    # Why the pose from this frame was rejected, or was accepted at an unexpected position.
+    lock_note: str = ""
+    # True if this frame showed another vehicle's target, judged by its position.
+    is_foreign_target: bool = False
 
 
 @dataclass(frozen=True)
@@ -498,11 +496,11 @@ class CameraCalibrationErrors:
     """Errors of the camera latency and mounting in the profile, estimated in flight, each with its
     standard deviation.
 
-    `latency_above_profile_s` is the latency beyond the profile's.
-    `mount_rotation_from_profile_xyz_rad` are the small rotations of the mounting about body x, y
-    and z relative to the profile's. `mount_rotation_sigma_xyz_rad` includes the bias of the
-    attitude estimate, which shifts the target in the same way as a roll or pitch error of the
-    mounting.
+    `latency_above_profile_s` is the camera's latency minus the latency in the profile.
+    `mount_rotation_from_profile_xyz_rad` are the small rotations of the mounting, about body x, y
+    and z, relative to the mounting in the profile. `mount_rotation_sigma_xyz_rad` includes the bias
+    of the attitude estimate, which shifts the target in the same way as a roll or pitch error of
+    the mounting.
     """
 
     latency_above_profile_s: float
