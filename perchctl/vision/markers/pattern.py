@@ -23,10 +23,11 @@ MIN_CONTRAST_GREY = 10.0
 # A cell must differ from the threshold by at least this fraction of the contrast.
 MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = 0.1
 MIN_MATCHING_CELL_FRACTION = 0.8
-"""More than this fraction of the cells must have the right colour."""
+"""Fraction of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
-# Distance from the centre, in half sides of the small marker, within which it may hide cells.
-_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = 1.25
+# Within this distance from the centre, in half sides of the small marker, no cells are sampled,
+# because the small marker may hide them.
+_SMALL_MARKER_EXCLUSION_REACH_HALF_SIDES = 1.25
 _SAMPLE_OFFSETS_CELLS: Array = np.array(
     [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
 )
@@ -115,7 +116,7 @@ def make_marker_pattern(
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_CELLS))
     free = (
         np.abs(sample_points_half_sides).max(axis=1)
-        > _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
+        > _SMALL_MARKER_EXCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     )
     kept = np.unique(owner[free])
     turns, at = [], sample_points_half_sides[free]
