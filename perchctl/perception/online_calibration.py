@@ -29,8 +29,8 @@ USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
 oscillate."""
 SLEW = 0.02
-"""Rate at which the applied latency changes, s/s: at 0.4 m/s, the target appears to move by 8 mm/s,
-as with a drift."""
+"""Rate at which the applied latency changes, s/s. At 0.4 m/s, the target then appears to move at 8
+mm/s, like a drift."""
 FAST_SLEW = 0.5
 """Rate at which the applied latency changes, s/s, while images and accelerometer agree on a very
 different latency. This rate is below 1 because the images' times would otherwise run backwards.
@@ -114,8 +114,9 @@ def apply_latency(
     If the accelerometer shows that the latency is far from the one in use,
     `VisualInertialWindow.correction_s` is set, and is applied within half a second. The sums would
     take several seconds to converge, and a vehicle whose only position source is the target would
-    oscillate meanwhile. A certain solution of the sums is more accurate and is approached slowly.
-    Sums that contradict the correction belong to an earlier latency, and are restarted.
+    oscillate meanwhile. Once the solution of the sums is certain, it is more accurate, and the
+    latency approaches it slowly. Sums that contradict the correction belong to an earlier latency,
+    and are restarted.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
     sure_s = (

@@ -77,8 +77,8 @@ class Perception:
     def exposure_s(self, frame: Frame) -> float:
         """Return the best estimate of a frame's exposure time, s, on the loop's clock.
 
-        The source gives a frame its arrival time minus the profile's latency. The additional
-        latency measured in flight is subtracted here and nowhere else.
+        The source sets the time of a frame to its arrival time minus the profile's latency. The
+        additional latency measured in flight is subtracted here and nowhere else.
         """
         return frame.t_s - self.calibration.applied_delay_s
 

@@ -87,7 +87,8 @@ class FeltSamples:
     itself.
 
     Attributes:
-        rows: (n, 7) for each sample: time, roll, pitch, yaw, and the acceleration in world axes.
+        rows: array (n, 7) with one row for each sample: time, roll, pitch, yaw, and the
+            acceleration in world axes.
     """
 
     samples: tuple[Telemetry, ...] = ()

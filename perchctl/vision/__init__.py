@@ -1,6 +1,6 @@
 """Estimate the target from a frame with pure functions: detection, pose, merge and filter.
 
-pipeline: processes one frame, from the image to the target estimate; its state is a value.
+pipeline: processes one frame, from the image to the target estimate; takes and returns its state.
 fields: deinterlaces the frames of analogue cameras.
 markers: detects the corners of both markers.
 lens: removes the lens distortion from corners.

@@ -24,7 +24,8 @@ GreyImage = NDArray[np.uint8]
 # Minimum ratio of the energy of strong differences between the two fields to the energy within the
 # fields. Fields that are one pixel apart exceed it.
 _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
-# Rows per group; all but the outer four rows of a group are compared with their neighbours.
+# Number of rows per group. All rows of a group, except the outer two at each end, are compared with
+# their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
 _MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO = 5.0

@@ -1,4 +1,4 @@
-"""Convert pixels to rays and back: the only module with a lens model.
+"""Convert pixels to rays and back; no other module contains a lens model.
 
 perchctl undistorts corners, never whole images: undistorting a frame before the detection would
 lose markers at its edge and blur the others.

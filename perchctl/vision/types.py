@@ -1,4 +1,4 @@
-"""The values that the steps of the vision pipeline exchange, as frozen dataclasses."""
+"""Frozen dataclasses for the values that the steps of the vision pipeline exchange."""
 
 from __future__ import annotations
 
@@ -214,8 +214,8 @@ class Detections:
 class VehicleState:
     """The vehicle's attitude, position and velocity at a frame's time, in world axes.
 
-    Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
-    if unknown.
+    Signs are as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is
+    None if unknown.
     """
 
     t_s: float
@@ -227,12 +227,12 @@ class VehicleState:
 
     @cached_property
     def R_level_body(self) -> Array:
-        """Rotation (3, 3) from body to level axes, by roll and pitch."""
+        """Rotation (3, 3) from body to level axes, given by roll and pitch."""
         return rotation_from_rpy(self.roll_rad, self.pitch_rad, 0.0)
 
     @cached_property
     def R_world_level(self) -> Array:
-        """Rotation (3, 3) from level to world axes, by the heading."""
+        """Rotation (3, 3) from level to world axes, given by the heading."""
         return rot_z(self.yaw_rad)
 
     @cached_property

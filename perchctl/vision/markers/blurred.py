@@ -12,7 +12,7 @@ drawing. Any start is safe because the photometric fit measures the corners and 
 The result is wrong whenever the photometric fit is wrong
 (`perchctl.vision.markers.photometric_fit`). The result is empty if another codeword would look the
 same, or if the marker is further from its expected position than 0.5 sides or 10 px, whichever is
-larger. Corners are (4, 2) px.
+larger. Corners are arrays (4, 2), px.
 """
 
 from __future__ import annotations

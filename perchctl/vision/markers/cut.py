@@ -227,7 +227,7 @@ def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
     """Search poses that are shifted from `start` across the image and along the line of sight.
-    Return the one at which the rendered drawing correlates best with the coarse image; None if the
+    Return the pose at which the rendered drawing correlates best with the coarse image; None if the
     correlation is low everywhere."""
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
     for growth in _RANGE_SCALE_CANDIDATES:

@@ -7,7 +7,7 @@ the pixel p' corresponds to the image pixel
 
     p = 2 p' + 1/2 + o
 
-The search fails if blur or the image border hides the bits. Corners are (4, 2) px.
+The search fails if blur or the image border hides the bits. Corners are arrays (4, 2), px.
 """
 
 from __future__ import annotations
