@@ -264,7 +264,7 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
 
 
 def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> str | None:
-    """Return why this vehicle must not take off any more: another vehicle's flight has ended in its
+    """Return why this vehicle may no longer take off: another vehicle's flight has ended in its
     corridor. A vehicle whose flight has ended does not move again, so this reason is permanent."""
     corridor = plan.corridors[name]
     for other, result in ended.items():

@@ -217,8 +217,7 @@ class FlightReport:
             + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP)
             + int(state.outcome is Outcome.HOVERED),
             duration_s=obs.t_s - state.flight_started_at_s,
-            # The available telemetry is older than an emergency stop, which always locks the
-            # vehicle.
+            # An emergency stop always locks the vehicle, but the newest telemetry predates it.
             is_locked_by_supervisor=obs.telemetry.has_bit(LOCKED)
             or state.outcome is Outcome.EMERGENCY,
             history=history,
