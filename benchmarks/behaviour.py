@@ -92,7 +92,7 @@ def print_decisions(log: Path) -> None:
         decided = {
             "kind": "decision",
             "phase": new.phase.value,
-            "row": new.row_name,
+            "row": new.transition_name,
             "hold": new.hold_reason,
             "attempts": new.failed_attempts,
             "command": [type(command).__name__, to_exact_json(command)],

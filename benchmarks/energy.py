@@ -69,11 +69,11 @@ class Watch:
         if event.kind is not EventKind.PHASE or event.phase is None:
             return
         self.begun += event.phase is Phase.ASCEND
-        self.lost += event.row_name == "battery-low" and self.phase in UP
-        if event.row_name == "too-little-left":
+        self.lost += event.transition_name == "battery-low" and self.phase in UP
+        if event.transition_name == "too-little-left":
             self.refused = self.begun + 1
         if event.phase is Phase.LANDING:
-            self.row = event.row_name
+            self.row = event.transition_name
         self.phase = event.phase
 
     def tick(self, tick: Tick) -> None:

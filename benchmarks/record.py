@@ -147,7 +147,7 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
         unfiltered_pose_by_marker={
             name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()
         },
-        observation=obs, command=command, phase=state.phase, row_name="seek",
+        observation=obs, command=command, phase=state.phase, transition_name="seek",
         reason="the target is looked for",
     )  # fmt: skip
     return Tick(record=turn, state=state, output=output)

@@ -110,7 +110,7 @@ def _difference(
         return None
     replayed = {
         "phase": state.phase,
-        "row_name": state.row_name,
+        "transition_name": state.transition_name,
         "is_holding_position": bool(state.hold_reason),
         "failed_attempts": state.failed_attempts,
         "command": command,

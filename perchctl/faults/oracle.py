@@ -411,7 +411,7 @@ REFUSAL_CLAIMS: Claims = {"stands"}
 
 def last_transition(report: FlightReport) -> str:
     """The name of the transition that ended the flight; empty without a transition."""
-    return report.history[-1].row_name if report.history else ""
+    return report.history[-1].transition_name if report.history else ""
 
 
 def report_claims(report: FlightReport) -> Claims:

@@ -488,7 +488,7 @@ class TurnReporter:
             observation=obs,
             command=command,
             phase=state.phase,
-            row_name=state.row_name,
+            transition_name=state.transition_name,
             is_holding_position=bool(state.hold_reason),
             failed_attempts=state.failed_attempts,
             external_positions=external_positions(feed),

@@ -370,5 +370,5 @@ def _observe(
         flight_log_problem=flight_log_problem,
         external_position_age_s=0.0 if feed is None else feed.age_s,
         external_position_problem=None if feed is None else feed.problem,
-        rejected_sighting_to_estimate_m=0.0 if feed is None else feed.beside_m,
+        rejected_sighting_to_estimate_distance_m=0.0 if feed is None else feed.beside_m,
     )

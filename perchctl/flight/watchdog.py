@@ -236,7 +236,10 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
     monitored release continues."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
-        and (state.release_began_at_s is not None or state.motor_stop_commanded_at_s is not None)
+        and (
+            state.weight_transfer_began_at_s is not None
+            or state.motor_stop_commanded_at_s is not None
+        )
     )
 
 

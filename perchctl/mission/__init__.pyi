@@ -26,7 +26,7 @@ from .report import FlightReport as FlightReport
 from .report import HoverReport as HoverReport
 from .report import RestReport as RestReport
 from .report import Touchdown as Touchdown
-from .report import find_row_diagnosis as find_row_diagnosis
+from .report import find_transition_diagnosis as find_transition_diagnosis
 from .report import report_rest as report_rest
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState

@@ -14,7 +14,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition
 
 
-def keep_state(state: PlannerState, previous_context: Context) -> PlannerState:
+def keep_state_on_entry(state: PlannerState, previous_context: Context) -> PlannerState:
     """Return the state unchanged: the `enter` function of a phase that needs no preparation.
     `previous_context` is not used."""
     del previous_context
@@ -40,6 +40,6 @@ class PhaseDefinition:
     phase: Phase
     maneuver: Maneuver
     act: Callable[[Context], Action]
-    enter: Callable[[PlannerState, Context], PlannerState] = keep_state
+    enter: Callable[[PlannerState, Context], PlannerState] = keep_state_on_entry
     exits: tuple[Transition, ...] = ()
     conditions: tuple[Condition[Context], ...] = ()

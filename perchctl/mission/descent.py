@@ -43,8 +43,8 @@ from perchctl.mission.belief.update import (
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
     MIN_COMMANDED_TO_HOVER_THRUST_RATIO,
-    MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M,
-    descend_level,
+    MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M,
+    descend_level_by_raw_thrust,
     should_wait_for_climb_rate,
 )
 from perchctl.mission.observation import Observation
@@ -52,11 +52,11 @@ from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_falling_vehicle,
-    choose_catch_setpoint_above_vehicle_m,
+    choose_catch_setpoint_height_above_vehicle_m,
     end_press,
     forget_contact_when_below,
-    release_by_thrust,
     stop_motors,
+    transfer_weight_by_raw_thrust,
 )
 from perchctl.mission.setpoints import (
     Action,
@@ -102,7 +102,7 @@ ONBOARD_LANDING_PEAK_SPEED_MPS = 0.35
 """Peak speed of the quintic landing trajectory, m/s."""
 ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the quintic's duration, s."""
-QUINTIC_PEAK_TO_MEAN_SPEED = 1.875
+QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
 MAX_ASSUMED_HEIGHT_DRIFT_M = 1.0
 """Largest assumed drift of the height, m."""
@@ -123,7 +123,7 @@ def step_landing(
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
-    return record_command(*act(Context(state)))
+    return record_command(*act_in_landing(Context(state)))
 
 
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
@@ -148,7 +148,7 @@ def begin_landing(state: PlannerState) -> PlannerState:
         severity=max(state.severity, Severity.LAND),
         condition_start_times_s={},
         belief=reset_phase_dependent_conditions(b),
-        must_end_press=state.catch_setpoint_above_vehicle_m is None and is_pressing(b),
+        must_end_press=state.catch_setpoint_height_above_vehicle_m is None and is_pressing(b),
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
     )
@@ -200,20 +200,23 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     return replace(state, belief=start_dead_reckoning(b) if lost else b)
 
 
-def act(c: Context) -> Action:
+def act_in_landing(c: Context) -> Action:
     """Return the landing's new state and command: catch a fall, stop on the floor, or descend."""
     state = c.state
     if _is_falling_free(c):
-        return _restart_landing_with_catch(c)
-    if state.motor_stop_commanded_at_s is None and state.catch_setpoint_above_vehicle_m is not None:
+        return _restart_landing_by_catching_fall(c)
+    if (
+        state.motor_stop_commanded_at_s is None
+        and state.catch_setpoint_height_above_vehicle_m is not None
+    ):
         if (caught := _catch_fall(c)) is not None:
             return caught
-        c = Context(replace(state, catch_setpoint_above_vehicle_m=None))
+        c = Context(replace(state, catch_setpoint_height_above_vehicle_m=None))
     is_off = c.true_for_s(MOTORS_OFF_DESPITE_THRUST_COMMAND) >= MOTORS_OFF_DWELL_S
     if c.state.motor_stop_commanded_at_s is not None or is_off or _is_standing_on_floor(c):
         return stop_motors(c)
-    if c.state.release_began_at_s is not None:
-        return _complete_transfer_to_magnet(c)
+    if c.state.weight_transfer_began_at_s is not None:
+        return _complete_weight_transfer_to_magnet(c)
     # changing to another policy during the firmware's own landing would cost height
     if c.state.stop_or_land_command_count:
         return _command_onboard_landing(c)
@@ -237,8 +240,8 @@ def descend(c: Context) -> Action:
       unreliable.
     """
     b = c.belief
-    if not b.can_descend_by_position:
-        return _descend_by_thrust(c)
+    if not b.can_descend_under_position_control:
+        return _descend_by_raw_thrust(c)
     landing, in_reach, doubtful = (
         c.planner.landing,
         b.is_possibly_in_magnet_reach,
@@ -257,7 +260,7 @@ def descend(c: Context) -> Action:
         return _transfer_weight_to_magnet(c) if gives_up else _descend_by_setpoints(c)
     if b.is_target_position_source:
         return (
-            _descend_by_thrust(c)
+            _descend_by_raw_thrust(c)
             if c.state.descent.last_commanded_raw_thrust or low
             else _descend_by_setpoints(c)
         )
@@ -288,11 +291,11 @@ def _is_falling_free(c: Context) -> bool:
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
-    if not state.is_before_release_and_motor_stop:
+    if not state.is_before_weight_transfer_and_motor_stop:
         return b.is_possibly_in_magnet_reach and has_slipped(b)
     if state.stop_or_land_command_count:
         return False
-    caught = state.catch_setpoint_above_vehicle_m is None
+    caught = state.catch_setpoint_height_above_vehicle_m is None
     return (
         b.vehicle_world_z_at_last_contact_m is not None
         and caught
@@ -317,7 +320,7 @@ def _is_standing_on_floor(c: Context) -> bool:
     )
 
 
-def _restart_landing_with_catch(c: Context) -> Action:
+def _restart_landing_by_catching_fall(c: Context) -> Action:
     """Restart the landing at the present height, and first stop the fall by a setpoint above the
     vehicle (a catch)."""
     tel, b = c.telemetry, c.belief
@@ -330,10 +333,10 @@ def _restart_landing_with_catch(c: Context) -> Action:
     state = replace(
         c.state,
         belief=belief,
-        release_began_at_s=None,
+        weight_transfer_began_at_s=None,
         motor_stop_commanded_at_s=None,
         must_end_press=False,
-        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(
+        catch_setpoint_height_above_vehicle_m=choose_catch_setpoint_height_above_vehicle_m(
             b.hover_thrust, tel.thrust
         ),
         setpoint=None,
@@ -364,7 +367,7 @@ def _descend_by_setpoints(c: Context) -> Action:
     landing, state, b = c.planner.landing, c.state, c.belief
     here = make_setpoint_at_vehicle(c)
     start = here
-    if state.catch_setpoint_above_vehicle_m is None and state.setpoint is not None:
+    if state.catch_setpoint_height_above_vehicle_m is None and state.setpoint is not None:
         start = state.setpoint
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry.position_m
@@ -374,17 +377,21 @@ def _descend_by_setpoints(c: Context) -> Action:
         setpoint = replace(
             setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M)
         )
-    state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M)
-    state = replace(state, setpoint=setpoint, catch_setpoint_above_vehicle_m=None)
+    state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
+    state = replace(state, setpoint=setpoint, catch_setpoint_height_above_vehicle_m=None)
     dx, dy = state.lateral_integral_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
     return state, limit_setpoint(c, sent)
 
 
-def _descend_by_thrust(c: Context) -> Action:
+def _descend_by_raw_thrust(c: Context) -> Action:
     """Descend level by raw thrust. While neither climb rate nor hover thrust is known well enough,
     descend by setpoints."""
-    return _descend_by_setpoints(c) if should_wait_for_climb_rate(c) else descend_level(c)
+    return (
+        _descend_by_setpoints(c)
+        if should_wait_for_climb_rate(c)
+        else descend_level_by_raw_thrust(c)
+    )
 
 
 def make_onboard_landing_command(
@@ -405,7 +412,7 @@ def make_onboard_landing_command(
     return Land(
         goal_z_m,
         ONBOARD_LANDING_DURATION_MARGIN_S
-        + QUINTIC_PEAK_TO_MEAN_SPEED
+        + QUINTIC_PEAK_TO_MEAN_SPEED_RATIO
         * (vehicle_world_z_m - goal_z_m)
         / ONBOARD_LANDING_PEAK_SPEED_MPS,
     )
@@ -466,10 +473,10 @@ def _command_onboard_landing(c: Context) -> Action:
 def _transfer_weight_to_magnet(c: Context) -> Action:
     """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than a perch
     does."""
-    return release_by_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
+    return transfer_weight_by_raw_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
-def _complete_transfer_to_magnet(c: Context) -> Action:
+def _complete_weight_transfer_to_magnet(c: Context) -> Action:
     """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, command
     a thrust that carries most of the weight: a hanging vehicle then stays in place, and a fallen
     one does not climb."""
@@ -477,4 +484,4 @@ def _complete_transfer_to_magnet(c: Context) -> Action:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust
     thrust = int(max(KEEPALIVE_RAW_THRUST, min(MIN_FIRMWARE_POSITION_MODE_THRUST, part)))
-    return replace(c.state, release_began_at_s=c.t_s), RawThrust(thrust)
+    return replace(c.state, weight_transfer_began_at_s=c.t_s), RawThrust(thrust)

@@ -44,7 +44,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     `battery-unknown` lands the vehicle.
     """
     energy = c.belief.battery_fit
-    consumed_charge_mah = energy.counted_discharge_fraction * c.profile.vehicle.battery_mah
+    consumed_charge_mah = energy.coulomb_counted_discharge_fraction * c.profile.vehicle.battery_mah
     thrust_fraction = (
         c.belief.hover_thrust or FULL_THRUST * energy.mean_airborne_thrust_fraction
     ) / FULL_THRUST

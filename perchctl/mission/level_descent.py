@@ -37,12 +37,12 @@ NEAR_FLOOR_SINK_RATE_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
 MAX_NEAR_FLOOR_HEIGHT_M = 0.6
 """Height below which the vehicle sinks at `NEAR_FLOOR_SINK_RATE_SETPOINT_MPS`, m."""
-MAX_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M = 0.5
+MAX_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS = 0.5
 """Largest gain k from the error of the sink rate to the thrust, in shares of the hover thrust per
 m/s. Larger: the vehicle oscillates."""
-MIN_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M = 0.2
+MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS = 0.2
 """Smallest gain k, with old telemetry, in shares of the hover thrust per m/s."""
-SINK_RATE_GAIN_TIMES_AGE_S2_PER_M = 0.06
+SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M = 0.06
 """Product of the gain k and the age of the vertical speed, between the smallest and the largest
 gain."""
 THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
@@ -58,11 +58,11 @@ CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
 like a motion. Smaller: it drifts further."""
 SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which no speed remains, s."""
-THRUST_RAMP_DOWN_PER_S = 0.25
+THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-THRUST_RAMP_DOWN_BY_CAMERA_PER_S = 0.1
+THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S = 0.1
 """Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
 the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
@@ -113,11 +113,11 @@ MAX_DESCENT_BY_SETPOINTS_DURATION_S = 1.5
 its own estimate, s."""
 MIN_MEAN_DESCENT_SINK_RATE_MPS = 0.35
 """Least mean speed of the descent, m/s."""
-MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M = 0.1
+MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M = 0.1
 """Distance of the vehicle below its contact from which the magnet has let go, m. Larger: a vehicle
 that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to
 have come off."""
-MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M = 0.2
+MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, at which the magnet
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
@@ -145,7 +145,7 @@ def _is_target_redetected_without_velocity(c: Context) -> bool:
     return old and not seen.is_velocity_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
 
 
-def _climb_measured_at_s(c: Context) -> float:
+def _climb_rate_measured_at_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
     seen = _visual_motion_if_telemetry_old(c)
     return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
@@ -153,7 +153,7 @@ def _climb_measured_at_s(c: Context) -> float:
 
 def _is_climb_rate_unknown(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
-    return _climb_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    return _climb_rate_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
 
 
 def _limited_tick_duration_s(c: Context) -> float:
@@ -161,9 +161,9 @@ def _limited_tick_duration_s(c: Context) -> float:
     return max(0.0, min(MAX_THRUST_RAMP_INTEGRATION_STEP_S, c.t_s - c.state.t_s))
 
 
-def _climb_measurement_age_s(c: Context) -> float:
+def _climb_rate_measurement_age_s(c: Context) -> float:
     """Return the age of the vertical speed, s: at least one tick."""
-    return max(1e-3, _limited_tick_duration_s(c), c.t_s - _climb_measured_at_s(c))
+    return max(1e-3, _limited_tick_duration_s(c), c.t_s - _climb_rate_measured_at_s(c))
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
@@ -180,25 +180,25 @@ def should_wait_for_climb_rate(c: Context) -> bool:
     )
 
 
-def descend_level(c: Context) -> Action:
+def descend_level_by_raw_thrust(c: Context) -> Action:
     """Descend by raw thrust: a rate controller of the vertical speed sets the thrust, and a small
     tilt brakes the lateral speed and balances the wind."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
         _limited_tick_duration_s(c),
-        _climb_measurement_age_s(c),
-        _climb_measured_at_s(c),
+        _climb_rate_measurement_age_s(c),
+        _climb_rate_measured_at_s(c),
     )
     measured_mps = _last_measured_climb_mps(c)
-    climb_mps = measured_mps + descent.climb_change_not_yet_measured_mps
+    climb_mps = measured_mps + descent.climb_rate_change_not_yet_measured_mps
     is_sinking, ramp_per_s = (
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
-        THRUST_RAMP_DOWN_PER_S,
+        THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S,
     )
     if _visual_motion_if_telemetry_old(c) is not None:  # a vehicle on the floor ignores commands
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
-            THRUST_RAMP_DOWN_BY_CAMERA_PER_S,
+            THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoning_since_s is None else b.dead_reckoned_height_m
@@ -232,11 +232,12 @@ def descend_level(c: Context) -> Action:
     thrust = max(MIN_COMMANDED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the commands since the newest sample have caused.
     shown_s = (
-        0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_at_s)
+        0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_rate_measured_at_s)
     )
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
-    climb_change_not_yet_measured_mps = (
-        descent.climb_change_not_yet_measured_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
+    climb_rate_change_not_yet_measured_mps = (
+        descent.climb_rate_change_not_yet_measured_mps * max(0.0, 1.0 - shown_s / age_s)
+        + gained_mps
     )
     state = _forget_contact_after_fall(c)
     state = replace(
@@ -245,12 +246,12 @@ def descend_level(c: Context) -> Action:
             descent,
             last_commanded_raw_thrust=thrust,
             floor_detected_at_s=floor_detected_at_s,
-            climb_change_not_yet_measured_mps=climb_change_not_yet_measured_mps,
-            climb_measured_at_s=measured_s,
+            climb_rate_change_not_yet_measured_mps=climb_rate_change_not_yet_measured_mps,
+            climb_rate_measured_at_s=measured_s,
         ),
         setpoint=None,
         stop_or_land_command_count=0,
-        catch_setpoint_above_vehicle_m=None,
+        catch_setpoint_height_above_vehicle_m=None,
     )
     roll_rad, pitch_rad = (
         (0.0, 0.0) if floor_detected_at_s is not None else _compute_braking_roll_pitch_rad(c)
@@ -291,7 +292,7 @@ def _find_floor_detection_time_s(
     )
     stands = (
         seen is not None
-        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M
+        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M
         and weak
         and not is_sinking
     )
@@ -309,10 +310,12 @@ def _compute_sink_rate_thrust(
     sink_mps = NEAR_FLOOR_SINK_RATE_SETPOINT_MPS if low else SINK_RATE_SETPOINT_MPS
     if _visual_motion_if_telemetry_old(c) is not None:
         sink_mps = SINK_RATE_SETPOINT_BY_CAMERA_MPS
-    gain = SINK_RATE_GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
+    gain = SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M / max(
+        1e-3, c.t_s - _climb_rate_measured_at_s(c)
+    )
     gain = max(
-        MIN_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M,
-        min(MAX_HOVER_THRUST_FRACTION_PER_SINK_RATE_ERROR_S_PER_M, gain),
+        MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS,
+        min(MAX_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS, gain),
     )
     tilt = max(MIN_TILT_COSINE_TO_COMPENSATE_THRUST, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
@@ -323,14 +326,14 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
     clearly below it, or the accelerometer a fall; otherwise unchanged."""
     state, b, seen = c.state, c.belief, _visual_motion_if_telemetry_old(c)
     if b.is_position_valid and b.dead_reckoning_since_s is None:
-        return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_RELEASED_M)
+        return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
         in_magnet_reach_since_s, state.entry.t_s
     )
     seen_below = (
         seen is not None
-        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_RELEASED_M
+        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M
     )
     if fell or (b.is_possibly_in_magnet_reach and seen_below):
         belief = replace(
@@ -352,7 +355,9 @@ def _is_touchdown_overdue(c: Context) -> bool:
         return False
     descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoning_since_s or 0.0, state.entry.t_s)
-    measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    measured = (
+        c.t_s - _climb_rate_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    )
     spare_s = (
         TOUCHDOWN_OVERDUE_MARGIN_S if measured else TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
     )

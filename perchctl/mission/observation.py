@@ -61,7 +61,7 @@ class Observation:
     #: why no external position is sent; None while they are
     external_position_problem: str | None = None
     #: distance from the estimate to the newest sighting; 0 if it was accepted
-    rejected_sighting_to_estimate_m: float = 0.0
+    rejected_sighting_to_estimate_distance_m: float = 0.0
     imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`
     #: newest motion on which pictures and accelerometer agreed
     visual_inertial_motion: VisualInertialMotion | None = None

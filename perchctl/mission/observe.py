@@ -6,7 +6,7 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.update import has_tick_gap, update_belief
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M
+from perchctl.mission.release import CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -20,11 +20,11 @@ def observe(
     with it."""
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above; keeping it would make the vehicle press.
-        setpoint = state.setpoint if state.catch_setpoint_above_vehicle_m is None else None
+        setpoint = state.setpoint if state.catch_setpoint_height_above_vehicle_m is None else None
         state = replace(
             state,
             condition_start_times_s={},
-            catch_setpoint_above_vehicle_m=None,
+            catch_setpoint_height_above_vehicle_m=None,
             setpoint=setpoint,
         )
     known = state.belief.last_telemetry is not None
@@ -47,7 +47,7 @@ def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
             entry=replace(state.entry, t_s=b.obs.t_s),
             stop_or_land_command_count=0,
             last_stop_or_land_command_at_s=None,
-            catch_setpoint_above_vehicle_m=CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M,
+            catch_setpoint_height_above_vehicle_m=CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
         )
     return replace(
         state,

@@ -22,7 +22,7 @@ from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_HEIGHT_TO_CORRECT_HEIGHT_M
+from perchctl.mission.phases.approach import MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
@@ -56,7 +56,7 @@ def step_mission(
         state = _enter_phase(c, row)
         hold = hold_reason(state.belief, PHASES[state.phase].maneuver)
         state = replace(state, hold_reason=hold)
-    return record_command(*act(Context(state)))
+    return record_command(*act_in_phase(Context(state)))
 
 
 def _update_before_decision(
@@ -113,7 +113,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             t_s=c.t_s,
             position_m=c.telemetry.position_m,
             yaw_rad=c.telemetry.yaw_rad,
-            row_name=row.name,
+            transition_name=row.name,
             reason=row.reason_text(c),
             diagnosis=row.diagnosis,
             stop_command=row.stop_command,
@@ -127,7 +127,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         search_step_began_at_s=c.t_s,
         consecutive_target_frames=0,
         must_end_press=ends
-        and state.catch_setpoint_above_vehicle_m is None
+        and state.catch_setpoint_height_above_vehicle_m is None
         and presses_against_target,
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
@@ -135,17 +135,18 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
     return PHASES[row.to].enter(new, c)
 
 
-def act(c: Context) -> Action:
+def act_in_phase(c: Context) -> Action:
     """Return the phase's new state and command for this tick."""
     state = c.state
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.
     leaves = state.phase is Phase.RECOVER and (
-        state.must_end_press or state.catch_setpoint_above_vehicle_m is not None
+        state.must_end_press or state.catch_setpoint_height_above_vehicle_m is not None
     )
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (
-            state.phase is not Phase.APPROACH or c.belief.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_M
+            state.phase is not Phase.APPROACH
+            or c.belief.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
         )
         return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

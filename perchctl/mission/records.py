@@ -38,7 +38,7 @@ class Event:
     kind: EventKind
     reason: str  # a sentence without its full stop
     phase: Phase | None = None  # phase that was entered, or the current one
-    row_name: str = ""  # transition of the table; empty at the start and if there was none
+    transition_name: str = ""  # transition of the table; empty at the start and if there was none
     severity: Severity = Severity.CONTINUE
     simulated_fault: str = ""  # fault of the simulated scenario that caused it
     rest_state: RestState | None = None  # rest state found by a rescue; None in all other events
@@ -75,7 +75,13 @@ class Event:
                 text = f"no battery reading: landing within {grace_s:.0f} s"
                 events.append(cls(obs.t_s, EventKind.NOTE, text, previous_state.phase))
         if state.phase is not previous_state.phase:
-            entered = EventKind.PHASE, state.reason, state.phase, state.row_name, state.severity
+            entered = (
+                EventKind.PHASE,
+                state.reason,
+                state.phase,
+                state.transition_name,
+                state.severity,
+            )
             events.append(cls(obs.t_s, *entered, diagnosis=state.entry.diagnosis))
         elif state.pause_reason and not previous_state.pause_reason:
             held = EventKind.HOLD, state.pause_reason, state.phase
@@ -182,7 +188,7 @@ class TickRecord:
     observation: Observation | None = None  # None while waiting
     command: Command | None = None  # None while waiting, and for a failed tick
     phase: Phase | None = None
-    row_name: str = ""
+    transition_name: str = ""
     is_holding_position: bool = False
     failed_attempts: int = 0
     external_positions: ExternalPositionStatus | None = None

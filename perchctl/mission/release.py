@@ -51,18 +51,18 @@ STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 """Time after which one more stop command is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
-CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M = 1.0
+CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors stand still, m."""
-CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M = 0.2
+CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
 MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO = 0.5
 """Share of hover thrust above which the motors count as running."""
-MIN_CATCH_DURATION_S = 0.1
+MIN_FALL_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
-MAX_CATCH_DURATION_S = 2.0
+MAX_FALL_CATCH_DURATION_S = 2.0
 """Longest duration of a catch, s."""
-MIN_CLIMB_RATE_TO_END_CATCH_MPS = -0.1
+MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
 MAX_BRAKED_LATERAL_SPEED_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves more."""
@@ -99,7 +99,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     return state, limit_setpoint(c, setpoint)
 
 
-def reduce_press_before_release(c: Context) -> Action:
+def reduce_press_before_weight_transfer(c: Context) -> Action:
     """Perform the first stage of the release, which transfers the weight from the rotors to the
     magnet.
 
@@ -129,7 +129,7 @@ def reduce_press_before_release(c: Context) -> Action:
     return replace(state, setpoint=setpoint), sent
 
 
-def release_by_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
+def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
     """Perform the second stage of the release: reduce raw thrust until the motors stand still, and
     stop them once the whole weight has hung for long enough.
 
@@ -139,22 +139,22 @@ def release_by_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > max_telemetry_age_s:
         return hold_contact_by_position(c)
-    release_began_at_s = state.release_began_at_s
-    if release_began_at_s is None:
-        release_began_at_s, z_m = c.t_s, c.telemetry.position_m[2]
+    weight_transfer_began_at_s = state.weight_transfer_began_at_s
+    if weight_transfer_began_at_s is None:
+        weight_transfer_began_at_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(
             b,
             vehicle_world_z_at_last_contact_m=z_m
             if b.vehicle_world_z_at_last_contact_m is None
             else b.vehicle_world_z_at_last_contact_m,
         )
-        state = replace(state, release_began_at_s=release_began_at_s, belief=b)
+        state = replace(state, weight_transfer_began_at_s=weight_transfer_began_at_s, belief=b)
     hung_s = c.true_for_s(HANGING_WITH_MOTORS_STOPPED)
     unconfirmed = b.thrust_last_differed_from_command_at_s >= c.t_s - hung_s
     extra_s = EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
-    part = min(1.0, (c.t_s - release_began_at_s) / complete.ramp_s)
+    part = min(1.0, (c.t_s - weight_transfer_began_at_s) / complete.ramp_s)
     start = c.planner.perch.thrust if state.setpoint is None else MIN_FIRMWARE_POSITION_MODE_THRUST
     start = min(start, MIN_FIRMWARE_POSITION_MODE_THRUST)
     return state, RawThrust(int(start + part * (KEEPALIVE_RAW_THRUST - start)))
@@ -167,14 +167,21 @@ def hold_contact_by_position(c: Context) -> Action:
     x, y, z_m = tel.position_m
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
         z_m = b.vehicle_world_z_at_last_contact_m
-    setpoint = PositionSetpoint(x, y, z_m + CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M, tel.yaw_rad)
-    return replace(state, setpoint=setpoint, release_began_at_s=None), limit_setpoint(c, setpoint)
+    setpoint = PositionSetpoint(
+        x, y, z_m + CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M, tel.yaw_rad
+    )
+    return replace(state, setpoint=setpoint, weight_transfer_began_at_s=None), limit_setpoint(
+        c, setpoint
+    )
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
     """True if the downward ramp of raw thrust has brought the motors to rest."""
-    release_began_at_s = c.state.release_began_at_s
-    return release_began_at_s is not None and c.t_s - release_began_at_s > c.planner.complete.ramp_s
+    weight_transfer_began_at_s = c.state.weight_transfer_began_at_s
+    return (
+        weight_transfer_began_at_s is not None
+        and c.t_s - weight_transfer_began_at_s > c.planner.complete.ramp_s
+    )
 
 
 def stop_motors(c: Context) -> Action:
@@ -208,14 +215,16 @@ def stop_motors(c: Context) -> Action:
     return state, Idle()
 
 
-def choose_catch_setpoint_above_vehicle_m(hover_thrust: float, reported_thrust: float) -> float:
+def choose_catch_setpoint_height_above_vehicle_m(
+    hover_thrust: float, reported_thrust: float
+) -> float:
     """Return the distance, m, at which a setpoint above a falling vehicle catches it, given its
     present `reported_thrust`."""
     turning = reported_thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
     return (
-        CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_ON_M
+        CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
         if turning
-        else CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M
+        else CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
     )
 
 
@@ -223,11 +232,12 @@ def catch_falling_vehicle(c: Context) -> Action | None:
     """Catch a vehicle that falls off the magnet: return a setpoint high above it. None if there is
     nothing to catch, once the fall has ended, or with old telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
-    if state.catch_setpoint_above_vehicle_m is None or not b.is_imu_fresh:
+    if state.catch_setpoint_height_above_vehicle_m is None or not b.is_imu_fresh:
         return None
-    begun = c.time_in_phase_s < MIN_CATCH_DURATION_S
+    begun = c.time_in_phase_s < MIN_FALL_CATCH_DURATION_S
     if begun or (
-        b.climb_mps < MIN_CLIMB_RATE_TO_END_CATCH_MPS and c.time_in_phase_s < MAX_CATCH_DURATION_S
+        b.climb_mps < MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS
+        and c.time_in_phase_s < MAX_FALL_CATCH_DURATION_S
     ):
         x, y = (
             _braking_setpoint_world_xy_m(c)
@@ -235,7 +245,10 @@ def catch_falling_vehicle(c: Context) -> Action | None:
             else state.entry.position_m[:2]
         )
         setpoint = PositionSetpoint(
-            x, y, tel.position_m[2] + state.catch_setpoint_above_vehicle_m, state.entry.yaw_rad
+            x,
+            y,
+            tel.position_m[2] + state.catch_setpoint_height_above_vehicle_m,
+            state.entry.yaw_rad,
         )
         return replace(state, setpoint=setpoint), limit_setpoint(c, setpoint)
     return None

@@ -37,10 +37,12 @@ MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
 ascent allows."""
 
 
-def find_row_diagnosis(row_name: str) -> VehicleDiagnosis:
-    """Return the diagnosis of the built-in row called `row_name`; logs store that name. `NONE` for
-    any other name, such as that of your own row."""
-    return next((row.diagnosis for row in TABLE if row.name == row_name), VehicleDiagnosis.NONE)
+def find_transition_diagnosis(transition_name: str) -> VehicleDiagnosis:
+    """Return the diagnosis of the built-in row called `transition_name`; logs store that name.
+    `NONE` for any other name, such as that of your own row."""
+    return next(
+        (row.diagnosis for row in TABLE if row.name == transition_name), VehicleDiagnosis.NONE
+    )
 
 
 @dataclass(frozen=True)

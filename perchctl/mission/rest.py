@@ -7,7 +7,7 @@ import math
 from enum import Enum
 
 from perchctl.mission.belief.contact import contact_height_tolerance_m
-from perchctl.mission.belief.target import MIN_TARGET_FAR_ABOVE_GEAR_M
+from perchctl.mission.belief.target import MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Phase, VehicleDiagnosis
 
@@ -66,7 +66,9 @@ def _is_held_by_other_object(c: Context) -> bool:
     if VehicleDiagnosis.HELD_BY_OTHER_OBJECT in state.entry.diagnosis:
         return b.imu.last_fall_at_s <= state.entry.t_s
     below = (
-        contact_height_tolerance_m(b) < b.target.gear_to_target_z_m <= MIN_TARGET_FAR_ABOVE_GEAR_M
+        contact_height_tolerance_m(b)
+        < b.target.gear_to_target_z_m
+        <= MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M
         and b.gear_to_target_at_last_contact is None
     )
     by_position = (

@@ -200,7 +200,7 @@ def is_position_lost(c: Context) -> bool:
         return True
     if (
         b.position_correction_age_s > MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S
-        and c.obs.rejected_sighting_to_estimate_m
+        and c.obs.rejected_sighting_to_estimate_distance_m
         > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M
     ):
         return True

@@ -6,7 +6,7 @@ reference r, the vehicle's position x (height z), its velocity v, and the accele
 leans into:
 
     p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
-                                     - LEAN_ACCELERATION_DAMPING_S2 a))                    lateral
+                                     - TILT_ACCELERATION_DAMPING_S2 a))                    lateral
     p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                        vertical
 
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
@@ -43,7 +43,7 @@ Smaller: the thrust's fluctuation moves the vehicle further."""
 LATERAL_DAMPING_S = 1.1
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
 velocity moves the vehicle. Smaller: it oscillates."""
-LEAN_ACCELERATION_DAMPING_S2 = 0.13
+TILT_ACCELERATION_DAMPING_S2 = 0.13
 """Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
 the vehicle answers an error late. Smaller: it oscillates with these gains."""
 MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
@@ -67,7 +67,7 @@ further. Smaller: a wind keeps the vehicle off its target permanently."""
 MAX_SPEED_HOVERING_IN_PLACE_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
-MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS = 0.25
+MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS = 0.25
 """Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
 vehicle further off."""
 HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
@@ -107,20 +107,23 @@ def step_towards(
     *,
     max_up_mps: float = 0.0,
     max_down_mps: float = 0.4,
-    limits_speed_until_mounting_confirmed: bool = False,
+    limits_speed_until_camera_mounting_confirmed: bool = False,
     changes_heading: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint of the next tick: `old`, moved towards `goal` with a speed of at most
-    `max_up_mps` upwards and `max_down_mps` downwards. `limits_speed_until_mounting_confirmed`
-    limits the lateral speed while the camera's mounting is unconfirmed. If `changes_heading` is
-    False, the heading stays."""
+    `max_up_mps` upwards and `max_down_mps` downwards.
+    `limits_speed_until_camera_mounting_confirmed` limits the lateral speed while the camera's
+    mounting is unconfirmed. If `changes_heading` is False, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
         yaw_radps = 0.0
-    if limits_speed_until_mounting_confirmed and c.belief.mounting.is_target_motion_undetermined:
+    if (
+        limits_speed_until_camera_mounting_confirmed
+        and c.belief.mounting.is_target_motion_undetermined
+    ):
         xy_mps = (
-            min(xy_mps, MAX_LATERAL_SPEED_WITH_UNCONFIRMED_MOUNTING_MPS)
+            min(xy_mps, MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS)
             if c.belief.target.is_fresh
             else 0.0
         )
@@ -154,7 +157,7 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
     return fly_to(
         c,
         step_towards(
-            c, old, goal, max_up_mps=max_up_mps, limits_speed_until_mounting_confirmed=True
+            c, old, goal, max_up_mps=max_up_mps, limits_speed_until_camera_mounting_confirmed=True
         ),
     )
 
@@ -245,16 +248,16 @@ def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[fl
     if gain == 0.0:
         return 0.0, 0.0
     (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error_and_velocity(c, reference)
-    ax_mps2, ay_mps2 = c.belief.lean_acceleration_world_xy_mps2
+    ax_mps2, ay_mps2 = c.belief.acceleration_from_tilt_world_xy_mps2
     dx = (
         LATERAL_ERROR_GAIN * error_x_m
         - LATERAL_DAMPING_S * vx_mps
-        - LEAN_ACCELERATION_DAMPING_S2 * ax_mps2
+        - TILT_ACCELERATION_DAMPING_S2 * ax_mps2
     )
     dy = (
         LATERAL_ERROR_GAIN * error_y_m
         - LATERAL_DAMPING_S * vy_mps
-        - LEAN_ACCELERATION_DAMPING_S2 * ay_mps2
+        - TILT_ACCELERATION_DAMPING_S2 * ay_mps2
     )
     dx, dy = gain * dx, gain * dy
     size = math.hypot(dx, dy)

@@ -31,9 +31,9 @@ class LevelDescentState:
     """State of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
     last_commanded_raw_thrust: float = 0.0
-    climb_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
+    climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
     # climb rate that recent commands cause and no sample shows yet
-    climb_change_not_yet_measured_mps: float = 0.0
+    climb_rate_change_not_yet_measured_mps: float = 0.0
     floor_detected_at_s: float | None = None  # time at which the floor was detected
 
 
@@ -89,7 +89,7 @@ class PhaseEntry:
     t_s: float = 0.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
     yaw_rad: float = 0.0
-    row_name: str = ""  # name of the transition, for logs and displays
+    transition_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE  # diagnosis of the transition
     stop_command: EmergencyStop | StopMotors | None = None  # sent at once by the transition
@@ -117,10 +117,10 @@ class PlannerState:
     lateral_integral_m: tuple[float, float] = (0.0, 0.0)
     #: the phase began with the vehicle pressed at high thrust, and the press has not been ended
     must_end_press: bool = False
-    catch_setpoint_above_vehicle_m: float | None = None
+    catch_setpoint_height_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
     obstacle_blocked_at_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
-    release_began_at_s: float | None = None  #: start of the release by raw thrust
+    weight_transfer_began_at_s: float | None = None  #: start of the release by raw thrust
     motor_stop_commanded_at_s: float | None = None  #: first command to stop the motors
     last_stop_or_land_command_at_s: float | None = None  #: last command to land or to stop motors
     stop_or_land_command_count: int = 0
@@ -133,9 +133,9 @@ class PlannerState:
     hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
 
     @property
-    def row_name(self) -> str:
+    def transition_name(self) -> str:
         """Name of the transition into the phase, for logs and displays."""
-        return self.entry.row_name
+        return self.entry.transition_name
 
     @property
     def reason(self) -> str:
@@ -149,9 +149,9 @@ class PlannerState:
         return self.hold_reason or self.waiting_reason
 
     @property
-    def is_before_release_and_motor_stop(self) -> bool:
+    def is_before_weight_transfer_and_motor_stop(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
-        return self.release_began_at_s is None and self.motor_stop_commanded_at_s is None
+        return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:
         """Return the commands sent so far, in the form that the belief uses."""
@@ -160,7 +160,7 @@ class PlannerState:
             maneuver_start_position_m=self.entry.position_m,
             setpoint=self.setpoint,
             raw_thrust=self.commanded_raw_thrust,
-            release_began_at_s=self.release_began_at_s,
+            weight_transfer_began_at_s=self.weight_transfer_began_at_s,
             motor_stop_commanded_at_s=self.motor_stop_commanded_at_s,
             floor_detected_at_s=self.descent.floor_detected_at_s,
         )

@@ -132,7 +132,7 @@ def event_record(event: Event) -> dict[str, Any]:
         "t_s": event.t_s,
         "event": event.kind.value,
         "phase": event.phase.value if event.phase else None,
-        "row": event.row_name or None,
+        "row": event.transition_name or None,
         "severity": event.severity.name.lower().replace("_", " "),
         "reason": event.reason,
         "simulated": event.simulated_fault or None,

@@ -18,7 +18,7 @@ from perchctl.mission import (
     Outcome,
     Touchdown,
     VehicleDiagnosis,
-    find_row_diagnosis,
+    find_transition_diagnosis,
 )
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -128,7 +128,8 @@ class FlightSummary:
             log_problem=end.get("problem"),
             simulated=simulated,
             is_profile_suspect=any(
-                VehicleDiagnosis.PROFILE_MAY_BE_WRONG in find_row_diagnosis(str(event.get("row")))
+                VehicleDiagnosis.PROFILE_MAY_BE_WRONG
+                in find_transition_diagnosis(str(event.get("row")))
                 for event in log.events
             ),
         )

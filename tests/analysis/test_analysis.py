@@ -92,10 +92,14 @@ def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: P
             EventKind.PHASE,
             "hovering in the perching area",
             Phase.SEARCH,
-            row_name="approached",
+            transition_name="approached",
         ),
         Event(
-            5.2, EventKind.PHASE, "the operator cut the motors", Phase.ABORTED, row_name="operator"
+            5.2,
+            EventKind.PHASE,
+            "the operator cut the motors",
+            Phase.ABORTED,
+            transition_name="operator",
         ),
     ]
     log = read_log(synthetic.write(tmp_path / "f.jsonl", most=200, events=events))

@@ -78,7 +78,7 @@ def says_landed(patch: Patch) -> None:
     def landed(*given: Any) -> tuple[PlannerState, Command]:
         state, command = step(*given)
         if state.phase.is_final:
-            entry = replace(state.entry, row_name="landed")
+            entry = replace(state.entry, transition_name="landed")
             state = replace(state, phase=Phase.LANDED, entry=entry)
         return state, command
 

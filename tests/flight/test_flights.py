@@ -239,14 +239,14 @@ def test_it_perches_and_is_never_held(scenario: dict[str, Any]) -> None:
 def test_the_log_holds_the_planner_s_error_and_an_unlogged_flight_is_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    contexts, act, bare, logged = list[Context](), planner.act, Watcher(), Watcher()
+    contexts, act, bare, logged = list[Context](), planner.act_in_phase, Watcher(), Watcher()
     fly_lockstep(short_profile(), SEED, watchers=(bare,))
 
     def acted(context: Context) -> Any:
         contexts.append(context)
         return act(context)
 
-    monkeypatch.setattr(planner, "act", acted)
+    monkeypatch.setattr(planner, "act_in_phase", acted)
     fly_lockstep(short_profile(), SEED, tmp_path / "flight.jsonl", watchers=(logged,))
     assert [tick.command for tick in bare.ticks] == [tick.command for tick in logged.ticks]
     seen = [(t, c) for t, c in zip(logged.ticks, contexts, strict=True) if c.obs.target]

@@ -17,7 +17,10 @@ from perchctl.mission.descent import (
     MAX_LANDING_COMMANDS,
     MIN_LANDING_COMMANDS,
 )
-from perchctl.mission.release import CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, STOP_COMMAND_COUNT
+from perchctl.mission.release import (
+    CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
+    STOP_COMMAND_COUNT,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -49,7 +52,7 @@ AT_CEILING = state_with(
     t_s=T_S,
     takeoff_position_m=(0.0, 0.0, 0.0),
     vehicle_world_z_at_last_contact_m=CEILING_M,
-    release_began_at_s=T_S - 1.0,
+    weight_transfer_began_at_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
 IN_AIR = state_with(
@@ -131,7 +134,10 @@ HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
 PRESSING = remembering(
-    AT_CEILING, phase=Phase.PERCH, vehicle_world_z_at_last_contact_m=None, release_began_at_s=None
+    AT_CEILING,
+    phase=Phase.PERCH,
+    vehicle_world_z_at_last_contact_m=None,
+    weight_transfer_began_at_s=None,
 )
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
@@ -178,7 +184,7 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig.after(0.33, **FALLS)
     caught = rig.after(0.35, **FALLS)
     assert caught == PositionSetpoint(
-        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_ABOVE_VEHICLE_MOTORS_OFF_M, 3.0), 0.0
+        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M, 3.0), 0.0
     )
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
@@ -291,7 +297,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     """A loop that fell silent as it peeled off in vain, and hangs for ever, would else leave it
     there with turning motors. It stays where it is, and its thrust follows the orders."""
     below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, remembering(AT_CEILING, release_began_at_s=None), CEILING_M)
+    rig = Rig(below, remembering(AT_CEILING, weight_transfer_began_at_s=None), CEILING_M)
     sent: list[Command] = []
     thrust = 20000.0
     for i in range(395):

@@ -46,7 +46,7 @@ def decided_here(name: str) -> tuple[bytes, ...]:
             replace(
                 turn,
                 phase=new.phase,
-                row_name=new.row_name,
+                transition_name=new.transition_name,
                 is_holding_position=bool(new.hold_reason),
                 failed_attempts=new.failed_attempts,
                 command=command,

@@ -177,7 +177,7 @@ _ENTRY = {
     "entered_s": "t_s",
     "entry_m": "position_m",
     "entry_yaw_rad": "yaw_rad",
-    "row": "row_name",
+    "row": "transition_name",
     "reason": "reason",
     "diagnosis": "diagnosis",
 }

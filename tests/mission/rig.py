@@ -64,7 +64,7 @@ class Flight:
 
     @property
     def rows(self) -> set[str]:
-        return {tick.state.row_name for tick in self.ticks}
+        return {tick.state.transition_name for tick in self.ticks}
 
     @property
     def stops_s(self) -> list[float]:

@@ -162,7 +162,7 @@ def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
         obs = event(observation(t_s, state.entry.position_m[2]))
         state, command = planner.step_mission(state, obs, profile)
         commands.append(command)
-        if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row_name != "":
+        if state.phase in (Phase.LANDING, Phase.ABORTED) and state.transition_name != "":
             break
     return state, commands
 
@@ -193,7 +193,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
 def test_without_a_corridor_no_place_is_outside_of_it(name: str) -> None:
     event, *_ = EVENTS[name]
     state, _ = planner.step_mission(state_in(Phase.ALIGN), event(observation(10.02)), PROFILE)
-    assert state.row_name != "corridor"
+    assert state.transition_name != "corridor"
 
 
 @pytest.mark.parametrize("name", [n for n, e in EVENTS.items() if e[3] == LAND])
@@ -271,7 +271,11 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
-    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 10.0, **changes}
+    held = {
+        "vehicle_world_z_at_last_contact_m": HANG_Z_M,
+        "weight_transfer_began_at_s": 10.0,
+        **changes,
+    }
     return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 
@@ -344,7 +348,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
     falls = dict(falls)
     z_m, velocity = HANG_Z_M + falls.pop("z_m"), (0.0, 0.0, falls.pop("vz_mps"))
     look = at(z_m, velocity_mps=velocity, **falls)
-    flight = fly(hanging(release_began_at_s=released_s), look, ticks * TICK_S)
+    flight = fly(hanging(weight_transfer_began_at_s=released_s), look, ticks * TICK_S)
     assert flight.state.phase is Phase.RECOVER
     assert is_setpoint(flight.command, HANG_Z_M + above_m[0], HANG_Z_M + above_m[1])
     if above_m[0] >= 0.0:
@@ -361,7 +365,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str, Any]) -> None:
     """Released, or with the motors stopped already: they spin again, and then it goes down."""
     falls = at(HANG_Z_M - 0.01, velocity_mps=(0.0, 0.0, -0.3), acc_z_g=0.2, thrust=0.0)
-    flight = fly(hanging(Phase.LANDING, release_began_at_s=9.0, **stopped), falls, 0.06)
+    flight = fly(hanging(Phase.LANDING, weight_transfer_began_at_s=9.0, **stopped), falls, 0.06)
     state = flight.state
     assert state.phase is Phase.LANDING
     assert is_setpoint(flight.command, above_m=HANG_Z_M + 0.5)

@@ -49,9 +49,9 @@ def test_without_permission_it_lands_in_the_end(x_m: float) -> None:
         state_in(Phase.ALIGN, BEGIN_S), look, MAX_WAIT_FOR_CLIMB_PERMISSION_S + 1.0, one_phase=True
     )
     if x_m:
-        assert flown.state.row_name == "align-timeout"
+        assert flown.state.transition_name == "align-timeout"
         return
-    assert flown.state.row_name == "climb-not-permitted"
+    assert flown.state.transition_name == "climb-not-permitted"
     assert (flown.state.phase, flown.state.outcome) == (Phase.LANDING, Outcome.SAFETY)
     assert flown.state.reason == f"no permission to climb for 20 s: {WHY}"
     assert flown.ticks[-1].t_s == pytest.approx(BEGIN_S + MAX_WAIT_FOR_CLIMB_PERMISSION_S, abs=0.1)

@@ -46,7 +46,7 @@ def touching(
         "target": target_at(
             BEGIN_S, place_m, (0, 0, HANG_Z_M), last_measured_at_s=BEGIN_S - unseen_s
         ),
-        "imu": ImuMotion(t_s=BEGIN_S, climb_steady_since_s=steady_s),
+        "imu": ImuMotion(t_s=BEGIN_S, climb_rate_steady_since_s=steady_s),
     }
     return at(HANG_Z_M, obs=seen, **{"thrust": PRESSED, **changes})(BEGIN_S)
 

@@ -215,7 +215,7 @@ def test_a_constant_speed_is_steady_whatever_it_is(
         t_s += dt_s
         speed = speed.update_steady_speed(t_s, velocity, dt_s)
     assert (
-        t_s - min(speed.climb_steady_since_s, t_s) >= 1.9
+        t_s - min(speed.climb_rate_steady_since_s, t_s) >= 1.9
         or abs(climb_mps) <= MAX_STEADY_CLIMB_DEVIATION_MPS
     )
     # The first deviation is from a mean that has moved for one sample.
@@ -227,7 +227,7 @@ def test_a_constant_speed_is_steady_whatever_it_is(
     jerked = speed.update_steady_speed(
         t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_DEVIATION_MPS), dt_s
     )
-    assert jerked.climb_steady_since_s == t_s + dt_s
+    assert jerked.climb_rate_steady_since_s == t_s + dt_s
 
 
 # --- Pushes --------------------------------------------------------------------------------------

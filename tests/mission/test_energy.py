@@ -204,7 +204,7 @@ NEAR_ITS_END = replace(FINE_BATTERY, takeoff_rest_v=3.79, rest_v=3.77)
 def test_no_attempt_begins_on_a_battery_near_its_end(phase: Phase) -> None:
     state = flown(phase, NEAR_ITS_END, 2.0, battery_v=3.24)
     assert state.phase is Phase.LANDING
-    assert state.row_name == "too-little-left"
+    assert state.transition_name == "too-little-left"
     assert state.outcome is Outcome.SAFETY
     assert " s left" in state.reason
     assert flown(phase, FINE_BATTERY, 2.0).phase in (Phase.ASCEND, Phase.ESTIMATE)
@@ -234,8 +234,8 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
 ) -> None:
     lasts_s = 2.0 if phase is Phase.ALIGN else 1.0
     state = flown(phase, energy, lasts_s, profile, battery_v=battery_v)
-    assert (state.row_name == "too-little-left") is gated
-    assert gated or phase is not Phase.ALIGN or state.row_name == "aligned"
+    assert (state.transition_name == "too-little-left") is gated
+    assert gated or phase is not Phase.ALIGN or state.transition_name == "aligned"
     if gated and energy.rest_v is None:
         assert "unknown" in state.reason
         assert state.battery.hover_time_left_s is None

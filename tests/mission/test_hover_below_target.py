@@ -125,14 +125,16 @@ def test_a_hover_needs_no_thrust_for_a_press() -> None:
     rows = []
     for profile in (raw, hover):
         heavy = remembering(state_in(Phase.ASCEND, z_m=STANDOFF_Z_M), hover_thrust=59500.0)
-        rows.append(fly(heavy, at(STANDOFF_Z_M, thrust=59500.0), 0.1, profile).state.row_name)
+        rows.append(
+            fly(heavy, at(STANDOFF_Z_M, thrust=59500.0), 0.1, profile).state.transition_name
+        )
     assert rows == ["too-weak", ""]
 
 
 @pytest.mark.parametrize(("flown_s", "row"), [(124.0, ""), (126.0, "time-over")])
 def test_the_time_of_the_mission_includes_that_of_the_hover(flown_s: float, row: str) -> None:
     state = remembering(state_in(Phase.ALIGN), flight_started_at_s=BEGIN_S - flown_s)
-    assert fly(state, at(), TICK_S, HOVERING).state.row_name == row
+    assert fly(state, at(), TICK_S, HOVERING).state.transition_name == row
 
 
 def test_the_battery_has_to_last_for_the_hover() -> None:
@@ -140,7 +142,9 @@ def test_the_battery_has_to_last_for_the_hover() -> None:
     rows = []
     for duration_s in (5.0, 300.0):
         profile = changed({"planner.hover.duration_s": duration_s}, HOVERING)
-        rows.append(fly(state_in(Phase.ALIGN), at(), 0.6, profile, one_phase=True).state.row_name)
+        rows.append(
+            fly(state_in(Phase.ALIGN), at(), 0.6, profile, one_phase=True).state.transition_name
+        )
     assert rows == ["aligned", "too-little-left"]
 
 
@@ -180,5 +184,5 @@ def test_a_hover_near_the_ground_or_the_limit_is_refused_in_a_sentence(
     profile: Profile, words: str
 ) -> None:
     state = fly(state_in(Phase.ALIGN), at(), 0.6, profile, one_phase=True).state
-    assert (state.phase, state.row_name) == (Phase.LANDING, "hover-height")
+    assert (state.phase, state.transition_name) == (Phase.LANDING, "hover-height")
     assert words in state.reason

@@ -26,7 +26,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.belief.contact import IMU_SHOWS_SUPPORT, MOTORS_OFF_AS_COMMANDED
 from perchctl.mission.belief.motion import FusionAge
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
 from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
@@ -91,7 +91,7 @@ BEGUN: dict[str, tuple[dict[str, Any], type[Any]]] = {
         {"stop_or_land_command_count": 1, "last_stop_or_land_command_at_s": NOW_S - 1.0},
         Land,
     ),
-    "released": ({"release_began_at_s": NOW_S - 0.5}, RawThrust),
+    "released": ({"weight_transfer_began_at_s": NOW_S - 0.5}, RawThrust),
     "stopped": (
         {
             "motor_stop_commanded_at_s": NOW_S - 0.2,
@@ -137,7 +137,7 @@ def context(
 def test_what_is_known_decides_how_it_comes_down(known: str, held: bool) -> None:
     free = KNOWN[known][-1]
     c = context(known, held)
-    state, command = descent.act(c)
+    state, command = descent.act_in_landing(c)
     assert isinstance(command, PositionSetpoint if held and free is Land else free)
     assert state.severity >= c.state.severity
     if isinstance(command, PositionSetpoint):
@@ -153,7 +153,7 @@ def test_what_has_begun_goes_on_whatever_is_known(known: str, name: str) -> None
     if (known, name) == ("sight", "ordered"):
         return
     remembered, sent = BEGUN[name]
-    _, command = descent.act(context(known, name != "ordered", **remembered))
+    _, command = descent.act_in_landing(context(known, name != "ordered", **remembered))
     assert isinstance(command, sent)
     assert not isinstance(command, RawThrust) or command.thrust <= 20000
 
@@ -161,7 +161,7 @@ def test_what_has_begun_goes_on_whatever_is_known(known: str, name: str) -> None
 @pytest.mark.parametrize("known", KNOWN)
 def test_below_the_hand_over_it_lands_by_itself_or_level(known: str) -> None:
     assert DECKS.planner.landing.handover_m > LOW_M
-    command = descent.act(context(known, z_m=LOW_M))[1]
+    command = descent.act_in_landing(context(known, z_m=LOW_M))[1]
     assert isinstance(command, Land if known in ("position", "onboard") else RawThrust)
 
 
@@ -170,17 +170,19 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     """By no landing of its own, whose trajectory ends while the magnet still holds. Deaf, nobody
     can watch what the weight does: it goes on by setpoints."""
     assert is_setpoint(
-        descent.act(context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S - 0.1))[1]
+        descent.act_in_landing(context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S - 0.1))[1]
     )
-    state, command = descent.act(context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S + 0.1))
+    state, command = descent.act_in_landing(
+        context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S + 0.1)
+    )
     assert isinstance(command, RawThrust)
-    assert state.release_began_at_s == NOW_S
+    assert state.weight_transfer_began_at_s == NOW_S
     if known == "onboard":
-        deaf, command = descent.act(
+        deaf, command = descent.act_in_landing(
             context(known, True, since_s=PEEL_OFF_MAGNET_TIMEOUT_S + 0.1, tel={"t_s": 8.0})
         )
         assert is_setpoint(command, distance_below_m=HANG_Z_M)
-        assert deaf.release_began_at_s is None
+        assert deaf.weight_transfer_began_at_s is None
 
 
 # --- What each part of it takes --------------------------------------------------------------
@@ -196,7 +198,7 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     )
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
     obs = at(MIN_HEIGHT_TO_INFER_HANGING_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
-    return type(descent.act(Context(observing(began, obs, profile)))[1])
+    return type(descent.act_in_landing(Context(observing(began, obs, profile)))[1])
 
 
 @pytest.mark.parametrize(
@@ -275,11 +277,11 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     """By such positions a landing would speed up until it tilts over."""
     begin = remembering(
         state_in(Phase.ALIGN, NOW_S),
-        mounting=MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS),
+        mounting=CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS),
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
-    assert (state.phase, state.row_name, state.belief.is_position_diverged) == (
+    assert (state.phase, state.transition_name, state.belief.is_position_diverged) == (
         Phase.LANDING,
         "mounting",
         astray,
@@ -325,7 +327,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
         floor_detected_at_s=NOW_S - 0.5, last_commanded_raw_thrust=half, dead_reckoning=aside,
     )  # fmt: skip
-    state, command = descent.act(c)
+    state, command = descent.act_in_landing(c)
     assert (state.descent.floor_detected_at_s is not None) is stands
     assert isinstance(command, RawThrust)
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
@@ -340,7 +342,7 @@ def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, flo
     c = Context(
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
     )
-    state, _ = descent.act(c)
+    state, _ = descent.act_in_landing(c)
     assert (state.descent.floor_detected_at_s is not None) is floor
 
 
@@ -350,7 +352,7 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     as where the landing is ordered just after the lift-off."""
     sinks = {"velocity_mps": (0.0, 0.0, vz_mps)}
     c = context("sight", z_m=0.0, tel=sinks, last_commanded_raw_thrust=0.9 * HOVER_THRUST)
-    assert isinstance(descent.act(c)[1], StopMotors if stops else RawThrust)
+    assert isinstance(descent.act_in_landing(c)[1], StopMotors if stops else RawThrust)
 
 
 # --- What pictures and accelerometer agree on ---------------------------------------------------
@@ -387,7 +389,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
         NOW_S - age_s, (0.0, 0.0), dead_reckoning.acceleration_bias_world_mps2[:2], 0.0
     )
     c = context_at(c.state, replace(c.obs, imu=imu, visual_inertial_motion=felt), c.profile)
-    command = descent.act(c)[1]
+    command = descent.act_in_landing(c)[1]
     assert isinstance(command, RawThrust)
     assert command.roll_rad == pytest.approx(0.0, abs=1e-9)
     known = min(1.0, true_for_s / 4.0)
@@ -441,7 +443,7 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     state = remembering(
         state, dead_reckoning=replace(state.belief.dead_reckoning, velocity_mps=(0.0, 0.0, -0.4))
     )
-    _, command = descent.act(context_at(state, obs, c.profile))
+    _, command = descent.act_in_landing(context_at(state, obs, c.profile))
     assert isinstance(command, RawThrust)
     assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
@@ -457,7 +459,7 @@ def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -
         dead_reckoning=dead_reckoning,
         is_position_diverged=diverged,
     )
-    _, command = descent.act(c)
+    _, command = descent.act_in_landing(c)
     assert isinstance(command, RawThrust)
     assert (command.thrust > 0.97 * HOVER_THRUST) is diverged
 
@@ -471,8 +473,8 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_HEIGHT_TO_INFER_HANGING_M),
         last_telemetry=telemetry(NOW_S, MIN_HEIGHT_TO_INFER_HANGING_M),
-        catch_setpoint_above_vehicle_m=1.0, condition_start_times_s={MOTORS_OFF_AS_COMMANDED: 0.0,
-        BATTERY_LOW: 1.0},
+        catch_setpoint_height_above_vehicle_m=1.0,
+        condition_start_times_s={MOTORS_OFF_AS_COMMANDED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
@@ -482,10 +484,10 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         later_s if stale else 0.0
     )
     assert after.belief.condition_start_times_s[BATTERY_LOW] == 1.0
-    assert (after.catch_setpoint_above_vehicle_m is None) is stale
+    assert (after.catch_setpoint_height_above_vehicle_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
-    held = remembering(state, catch_setpoint_above_vehicle_m=None)
+    held = remembering(state, catch_setpoint_height_above_vehicle_m=None)
     assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
         assert (after.belief.dead_reckoning_since_s is not None) is stale
@@ -640,16 +642,16 @@ REMEMBERED = st.sampled_from(
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
-            "release_began_at_s": 9.9,
+            "weight_transfer_began_at_s": 9.9,
         },
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
             "in_magnet_reach_since_s": 9.0,
-            "release_began_at_s": 9.0,
+            "weight_transfer_began_at_s": 9.0,
             "motor_stop_commanded_at_s": 9.8,
             "stop_or_land_command_count": 2,
         },
-        {"catch_setpoint_above_vehicle_m": 1.0},
+        {"catch_setpoint_height_above_vehicle_m": 1.0},
         {"must_end_press": True},
         {"hover_thrust": 0.0},
         {"dead_reckoning_since_s": 9.0, "dead_reckoned_height_m": 1.0},
@@ -716,7 +718,7 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         floor_m = takeoff_position_m[2] if takeoff_position_m else 0.0
         if (
             isinstance(command, PositionSetpoint)
-            and state.catch_setpoint_above_vehicle_m is None
+            and state.catch_setpoint_height_above_vehicle_m is None
             and before.phase is state.phase
         ):
             assert command.z_m <= max(z_m, floor_m + 0.05) + 1e-9

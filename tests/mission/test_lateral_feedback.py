@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import CameraImuMismatch, Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
-from perchctl.mission.setpoints import LEAN_ACCELERATION_DAMPING_S2
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
+from perchctl.mission.setpoints import TILT_ACCELERATION_DAMPING_S2
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import (
     HANG_Z_M,
@@ -73,7 +73,7 @@ def test_a_lean_is_met_by_a_setpoint_on_its_other_side(
     along_m = at_once.x_m * math.cos(towards_rad) + at_once.y_m * math.sin(towards_rad)
     across_m = at_once.y_m * math.cos(towards_rad) - at_once.x_m * math.sin(towards_rad)
     assert along_m == pytest.approx(
-        -LEAN_ACCELERATION_DAMPING_S2 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05
+        -TILT_ACCELERATION_DAMPING_S2 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05
     )
     assert across_m == pytest.approx(0.0, abs=1e-4)
     later = fly(ascending(), leaning(lean_rad, towards_rad, heading_rad, math.inf), 4.0).command
@@ -233,7 +233,7 @@ def test_pictures_and_lean_hold_the_vehicle_where_its_estimate_wanders() -> None
     for pictures in (True, False):
         vehicle = Hovering(0.0, 0.02, wander_m=0.002, pictures=pictures)
         confirmed = remembering(
-            ascending(), mounting=MountingMonitor(is_camera_mounting_confirmed=True)
+            ascending(), mounting=CameraMountingMonitor(is_camera_mounting_confirmed=True)
         )
         flight = fly(confirmed, vehicle, 20.0, one_phase=True)
         assert flight.ticks[-1].t_s > BEGIN_S + 15.0
@@ -254,7 +254,7 @@ def test_a_burst_of_lost_pictures_ends_no_ascent() -> None:
         )
 
     flight = fly(ascending(), look, 2.0, one_phase=True)
-    assert flight.state.row_name == "ascend-lost"
+    assert flight.state.transition_name == "ascend-lost"
     assert flight.ticks[-1].t_s == pytest.approx(BEGIN_S + 1.5, abs=0.03)
     climbs_m = [
         tick.command.z_m for tick in flight.ticks if isinstance(tick.command, PositionSetpoint)
@@ -289,7 +289,7 @@ def test_the_pictures_tell_whether_the_vehicle_has_settled(
 def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
     """Neither one whose mounting is wrong, nor one whose pictures disagree with the
     accelerometer."""
-    turned = MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)
+    turned = CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)
     late = CameraImuMismatch(0.2, 0.0)
     for state, changes, known in (
         (ascending(), {}, True),

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.mounting import (
-    MountingMonitor,
-    MountingSample,
-    make_mounting_sample,
-    update_mounting_monitor,
+    CameraMountingMonitor,
+    CameraMountingSample,
+    make_camera_mounting_sample,
+    update_camera_mounting_monitor,
 )
 from perchctl.vehicle import Command, PositionSetpoint
 from tests.helpers.mission import CEILING_M, remembering, state_in, target_at, telemetry
@@ -37,16 +37,18 @@ def turned(deg: float) -> Seen:
     return lambda t_s, p: p + M * (TARGET - p)
 
 
-def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[MountingMonitor, float]:
+def flown(
+    seen: Seen, way_m: float = 0.5, noise_m: float = 0.003
+) -> tuple[CameraMountingMonitor, float]:
     """Half a second still, then straight on; the watch, and how far it flew until it spoke."""
     rng = np.random.default_rng(0)
-    watch, t_s, moved_m = MountingMonitor(), 0.0, 0.0
+    watch, t_s, moved_m = CameraMountingMonitor(), 0.0, 0.0
     while moved_m < way_m and not watch.is_camera_mounting_wrong:
         t_s += FRAME_S
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = update_mounting_monitor(watch, MountingSample(t_s, p, spoiled))
+        watch = update_camera_mounting_monitor(watch, CameraMountingSample(t_s, p, spoiled))
     return watch, moved_m
 
 
@@ -63,14 +65,14 @@ def test_a_mounting_that_leads_to_the_target_is_left_alone(deg: float) -> None:
     assert not flown(turned(deg))[0].is_camera_mounting_wrong
 
 
-def _tilting(deg: float) -> MountingMonitor:
+def _tilting(deg: float) -> CameraMountingMonitor:
     """A vehicle on its place, 1.5 m below, that leans by 5 deg to all sides for four seconds."""
-    watch, reach_m = MountingMonitor(), 1.5 * math.tan(math.radians(5.0))
+    watch, reach_m = CameraMountingMonitor(), 1.5 * math.tan(math.radians(5.0))
     for i in range(120):
         t_s = i * FRAME_S
         lean = reach_m * complex(math.sin(4.0 * t_s), 0.8 * math.sin(5.0 * t_s + 1.0))
-        watch = update_mounting_monitor(
-            watch, MountingSample(t_s, 0j, turned(deg)(t_s, lean), lean)
+        watch = update_camera_mounting_monitor(
+            watch, CameraMountingSample(t_s, 0j, turned(deg)(t_s, lean), lean)
         )
     return watch
 
@@ -89,10 +91,10 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
     tel = telemetry(
         1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
     )
-    sight = make_mounting_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
+    sight = make_camera_mounting_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
     assert sight.vehicle_world_xy_m == pytest.approx(0.3 + 0.1j)
     assert sight.target_world_xy_m == pytest.approx(0.5 + 0.2j)
-    assert sight.vehicle_to_up_axis_world_xy_m == pytest.approx(
+    assert sight.vehicle_to_up_axis_at_target_height_world_xy_m == pytest.approx(
         1.2j * math.sin(math.radians(10.0)), rel=0.02
     )
 
@@ -100,9 +102,9 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(contradicting_sighting_count=9, camera_yaw_error_rad=math.pi / 2)
+    watch = CameraMountingMonitor(contradicting_sighting_count=9, camera_yaw_error_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
-    assert flight.state.row_name == "mounting"
+    assert flight.state.transition_name == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
     assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
 
@@ -130,11 +132,11 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
     frame_shift_m: Callable[[int], float],
 ) -> None:
     """The estimate moves: target and vehicle, which follows it, move alike."""
-    watch = MountingMonitor()
+    watch = CameraMountingMonitor()
     for i in range(900):
         shift = frame_shift_m(i)
-        watch = update_mounting_monitor(
-            watch, MountingSample(i * FRAME_S, complex(shift), TARGET + shift)
+        watch = update_camera_mounting_monitor(
+            watch, CameraMountingSample(i * FRAME_S, complex(shift), TARGET + shift)
         )
         assert not watch.is_camera_mounting_wrong
 
@@ -161,7 +163,7 @@ class Follows(Motors):
 def test_a_turned_mounting_lands_and_says_so(deg: int) -> None:
     it = Follows(deg)
     state = fly(state_in(Phase.ALIGN), it, 4.0, one_phase=True).state
-    assert (state.phase, state.row_name, state.outcome) == (
+    assert (state.phase, state.transition_name, state.outcome) == (
         Phase.LANDING,
         "mounting",
         Outcome.SAFETY,
@@ -194,5 +196,5 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
         )(t_s)
 
     state = fly(state_in(Phase.ALIGN), look, 0.58).state
-    assert state.row_name == "mounting"
+    assert state.transition_name == "mounting"
     assert "camera.mount does not point the camera up" in state.reason

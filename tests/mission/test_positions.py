@@ -95,7 +95,7 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
             sent.append(command)
         if state.phase is Phase.LANDING:
             break
-    assert (state.phase, state.row_name, state.outcome) == LOST
+    assert (state.phase, state.transition_name, state.outcome) == LOST
     assert "variance keeps growing" in state.reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
@@ -192,7 +192,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
     drift_mps: float,
 ) -> None:
     """To thrust again for a slide of the estimate would take a vehicle off its magnet."""
-    begin = at_the_magnet(release_began_at_s=BEGIN_S)
+    begin = at_the_magnet(weight_transfer_began_at_s=BEGIN_S)
     flight = fly(begin, Hangs(drift_mps), 12.0, MOCAP, feels=True)
     assert flight.state.phase is Phase.PERCHED
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
@@ -203,7 +203,7 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
 def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     carries: float, drift_mps: float
 ) -> None:
-    it, begin = Hangs(drift_mps, carries), at_the_magnet(release_began_at_s=BEGIN_S)
+    it, begin = Hangs(drift_mps, carries), at_the_magnet(weight_transfer_began_at_s=BEGIN_S)
     flight = fly(begin, it, 4.0, MOCAP, feels=True, one_phase=True)
     assert not flight.stops_s
     assert it.fell_s is not None
@@ -213,7 +213,7 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
 
 STOPPED: dict[str, Any] = {
     "motor_stop_commanded_at_s": BEGIN_S - 1.0,
-    "release_began_at_s": BEGIN_S - 3.0,
+    "weight_transfer_began_at_s": BEGIN_S - 3.0,
     "stop_or_land_command_count": 5,
 }
 
@@ -254,7 +254,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
         state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, vehicle_world_z_at_last_contact_m=0.6,
-        release_began_at_s=9.0,
+        weight_transfer_began_at_s=9.0,
         motor_stop_commanded_at_s=9.9, position_last_stale_at_s=BEGIN_S,
         in_magnet_reach_since_s=8.0,
     )  # fmt: skip
@@ -419,7 +419,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last_telemetry=None)
     it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
-    assert (state.phase, state.row_name) == (Phase.LANDING, "position-astray")
+    assert (state.phase, state.transition_name) == (Phase.LANDING, "position-astray")
     assert "perchctl check --lift" in state.reason
     assert -0.9 < it.met_mps < 0.0
     assert it.highest_m < 0.3
@@ -466,7 +466,7 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
 ) -> None:
     begin = remembering(state_in(phase, z_m=body_m[2]), **changes)
     state = fly(begin, at(position_m=body_m), profile=profile).state
-    assert (state.row_name == "position-astray") is lands
+    assert (state.transition_name == "position-astray") is lands
 
 
 @pytest.mark.parametrize(("profile", "lands"), [(MOCAP, True), (BY_TARGET, False)])
@@ -476,7 +476,7 @@ def test_the_camera_s_latency_excuses_only_positions_by_the_camera(
     begin = state_in(Phase.APPROACH, z_m=0.02)
     look = at(position_m=(0.2, 0.0, 0.02), obs={"camera_latency_sigma_s": 0.05})
     state = fly(begin, look, profile=profile).state
-    assert (state.row_name == "position-astray") is lands
+    assert (state.transition_name == "position-astray") is lands
 
 
 @pytest.mark.parametrize("profile", [MOCAP, PROFILE])
@@ -494,8 +494,8 @@ def test_positions_that_are_late_swing_it_up_and_down(
     """A catch falls as fast, and a take-off may be set down by hand. Seed 20701208 climbed into its
     target at 1 m/s, and was taken for held by something else."""
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
-    assert (state.row_name == "position-astray") is (lands and profile is MOCAP)
-    assert ("vertical oscillation" in state.reason) is (state.row_name == "position-astray")
+    assert (state.transition_name == "position-astray") is (lands and profile is MOCAP)
+    assert ("vertical oscillation" in state.reason) is (state.transition_name == "position-astray")
 
 
 def gains_beside(
@@ -544,5 +544,5 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
     """They have added 0.3 m/s to the left: so the attitude leans by 0.05 rad that the vehicle does
     not, and what is reckoned by it would brake a speed that is none."""
     state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
-    assert state.row_name == "position-astray"
+    assert state.transition_name == "position-astray"
     assert abs(state.belief.dead_reckoning.velocity_mps[1]) < 0.15

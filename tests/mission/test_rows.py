@@ -22,7 +22,7 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, MountingMonitor
+from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
 from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
@@ -92,7 +92,7 @@ class Case:
             state, command = planner.step_mission(state, self.look(t_s), self.profile, table)
             if state.phase is self.to:
                 fits = self.command is None or isinstance(command, self.command)
-                fits = fits and self.row in (None, state.row_name)
+                fits = fits and self.row in (None, state.transition_name)
                 return fits and state.outcome is self.outcome
         return False
 
@@ -195,7 +195,7 @@ CASES: dict[str, Case] = {
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
         state={"mounting":
-        MountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)},
+        CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -387,7 +387,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     )  # fmt: skip
     locked = at(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(BEGIN_S + TICK_S)
     state, _ = planner.step_mission(state, locked, PROFILE)
-    assert (state.phase, state.row_name, state.outcome) == (
+    assert (state.phase, state.transition_name, state.outcome) == (
         P.PERCHED,
         "hung-but-locked",
         O.ENDED_BY_OPERATOR,

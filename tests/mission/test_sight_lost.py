@@ -96,7 +96,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
     blind_m = heights[round(HOLD_S / TICK_S) + 1 :]
     assert all(after <= before for before, after in pairwise(blind_m))
     assert blind_m[-1] < blind_m[0]
-    assert flight.state.row_name == "position-lost"
+    assert flight.state.transition_name == "position-lost"
     assert "descending level" in flight.state.reason
 
 
@@ -109,7 +109,11 @@ def test_what_sightings_contradict_is_not_flown_by(
 ) -> None:
     """It comes down level as soon as they have done so for longer than one of them may be wrong."""
     seen = at(
-        1.0, obs={"rejected_sighting_to_estimate_m": beside_m, "external_position_age_s": age_s}
+        1.0,
+        obs={
+            "rejected_sighting_to_estimate_distance_m": beside_m,
+            "external_position_age_s": age_s,
+        },
     )
     state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
     assert (state.phase is Phase.LANDING) is lands
@@ -182,7 +186,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
     assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_SPEED_GAINED_IN_GUST_MPS)
     if flight.state.phase is Phase.LANDING:
-        assert flight.state.row_name == "position-lost"
+        assert flight.state.transition_name == "position-lost"
         assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
@@ -226,7 +230,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
         state_in(Phase.LANDING, z_m=1.9), vehicle_world_z_at_last_contact_m=1.9,
-        release_began_at_s=BEGIN_S - 1.0,
+        weight_transfer_began_at_s=BEGIN_S - 1.0,
         in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
         dead_reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
@@ -274,12 +278,14 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
 def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside() -> None:
     """By other means it has the time that it always had."""
     flight = lost(state_in(Phase.PERCH, z_m=2.1), 1.4, 2.1)
-    rows = [tick.state.row_name for tick in flight.ticks if tick.state.phase is Phase.RECOVER]
+    rows = [
+        tick.state.transition_name for tick in flight.ticks if tick.state.phase is Phase.RECOVER
+    ]
     assert rows[0] == "pressed-blindly"
     assert flight.state.failed_attempts == 1
     assert "after the last sight" in flight.state.reason
     decks = fly(state_in(Phase.PERCH, z_m=2.1), unseen(2.1, for_s=1.3))
-    assert decks.state.row_name != "pressed-blindly"
+    assert decks.state.transition_name != "pressed-blindly"
 
 
 def pressed_past_the_sight(
@@ -310,7 +316,7 @@ def pressed_past_the_sight(
 def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() -> None:
     """Though the estimate sinks, and half a second later places nothing any more."""
     state = pressed_past_the_sight()
-    assert (state.phase, state.row_name) == (Phase.COMPLETE, "contact")
+    assert (state.phase, state.transition_name) == (Phase.COMPLETE, "contact")
     assert state.entry.t_s - BEGIN_S > HOLD_S
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
 
@@ -322,7 +328,7 @@ def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
     lateral_offset_m: float, sigma_m: float
 ) -> None:
     state = pressed_past_the_sight(lateral_offset_m, sigma_m)
-    assert (state.phase, state.row_name, state.failed_attempts) == (
+    assert (state.phase, state.transition_name, state.failed_attempts) == (
         Phase.RECOVER,
         "beside-the-magnet",
         1,

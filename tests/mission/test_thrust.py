@@ -128,7 +128,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
 ) -> None:
     start = remembering(state_in(Phase.ALIGN), hover_thrust=hover)
     state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, lateral_offset_m=0.2)
-    assert state.row_name == row
+    assert state.transition_name == row
     assert row != "too-weak" or "battery too low" in state.reason
 
 
@@ -147,14 +147,14 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
     """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
     state = remembering(
         state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), commanded_raw_thrust=commanded_raw_thrust,
-        release_began_at_s=9.5,
+        weight_transfer_began_at_s=9.5,
         setpoint=None if commanded_raw_thrust else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
     for t_s in times(0.38):
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
         state = replace(observing(state, obs, PROFILE), t_s=t_s)
     b = state.belief
-    assert b.is_thrust_known is MAGNET_HOLDS_VEHICLE.predicate(b) is known
+    assert b.is_reported_thrust_reliable is MAGNET_HOLDS_VEHICLE.predicate(b) is known
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
@@ -177,7 +177,7 @@ def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     saturated = {THRUST_SATURATED_WITHOUT_CLIMB: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
     state = remembering(
-        above, condition_start_times_s=saturated, catch_setpoint_above_vehicle_m=None
+        above, condition_start_times_s=saturated, catch_setpoint_height_above_vehicle_m=None
     )
     for _ in range(2):
         state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)

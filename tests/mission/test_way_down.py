@@ -109,7 +109,7 @@ BITS = st.tuples(
 STATES: tuple[dict[str, Any], ...] = (
     {},
     {"vehicle_world_z_at_last_contact_m": HANG_Z_M},
-    {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 9.9},
+    {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "weight_transfer_began_at_s": 9.9},
     {"stop_or_land_command_count": 2, "last_stop_or_land_command_at_s": 9.9},
     {"hover_thrust": 0.0},
 )
@@ -167,7 +167,7 @@ def motors_off(seen: list[Observation]) -> bool:
 @settings(max_examples=400)
 @example(
     bits=[(8, 0.02, 0.0, 1.0, 0.0, 0.01)],
-    begin={"vehicle_world_z_at_last_contact_m": HANG_Z_M, "release_began_at_s": 9.9},
+    begin={"vehicle_world_z_at_last_contact_m": HANG_Z_M, "weight_transfer_began_at_s": 9.9},
     doubt={},
     flying=False,
 )
@@ -204,8 +204,8 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
                 floor = on_the_floor(
                     seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
                 )
-                ceiling = (begin or state.release_began_at_s) and on_the_ceiling(seen)
-                assert floor or ceiling or (state.release_began_at_s and motors_off(seen))
+                ceiling = (begin or state.weight_transfer_began_at_s) and on_the_ceiling(seen)
+                assert floor or ceiling or (state.weight_transfer_began_at_s and motors_off(seen))
                 return
             if state.phase is not Phase.LANDING:
                 return
@@ -240,7 +240,9 @@ def test_motors_that_are_off_despite_an_order_are_stopped_before_the_flight_ends
     """The supervisor ends a flight whose motors idle, and soon lets them turn by the last order
     again: seed 20731163 ended with raw thrust as its last order, and a motor turned 5 s later."""
     idles = at(z_m, acc_z_g=1.15, **OFF)
-    ticks = fly(hanging(commanded_raw_thrust=1000, release_began_at_s=BEGIN_S), idles, 3.0).ticks
+    ticks = fly(
+        hanging(commanded_raw_thrust=1000, weight_transfer_began_at_s=BEGIN_S), idles, 3.0
+    ).ticks
     assert ticks[-1].state.phase is ends
     orders = [tick.command for tick in ticks if not isinstance(tick.command, Idle)]
     assert isinstance(orders[-1], StopMotors)
@@ -337,7 +339,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
     flight = fly(begin, hand, 20.0, PROFILES[positioning], feels=True)
     state = flight.state
     assert (state.phase, state.outcome) == (Phase.ABORTED, Outcome.SAFETY)
-    assert state.row_name == "held-elsewhere"
+    assert state.transition_name == "held-elsewhere"
     # It neither fights on in the hand, nor stops without its weight having hung in it.
     assert flight.stops_s[0] < 10.0 + 8.0
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
@@ -438,7 +440,7 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     pressing = landing(phase=Phase.PERCH, condition_start_times_s={TARGET_CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
-    obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_steady_since_s=steady_s))
+    obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_rate_steady_since_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
     assert (after.belief.gear_to_target_at_last_contact is not None) is touched
@@ -475,12 +477,12 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
     on the floor before the link counts as lost. Seen again, it begins anew."""
     look = at(HANG_Z_M, thrust=1000.0)
-    half_way = hanging(Phase.COMPLETE, entered_s=8.0, release_began_at_s=9.5, t_s=9.98)
+    half_way = hanging(Phase.COMPLETE, entered_s=8.0, weight_transfer_began_at_s=9.5, t_s=9.98)
     state, command = step_mission(half_way, look(10.0), PROFILE)
     assert isinstance(command, RawThrust)
     state, command = step_mission(state, replace(look(10.0), t_s=10.2), PROFILE)
     assert is_setpoint(command, above_m=HANG_Z_M)
-    assert state.release_began_at_s is None
+    assert state.weight_transfer_began_at_s is None
     for i in range(12):
         seen_again = at(HANG_Z_M, thrust=20000.0)(10.22 + TICK_S * i)
         state, command = step_mission(state, seen_again, PROFILE)
@@ -505,7 +507,7 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     stopped = hanging(
         Phase.COMPLETE,
         in_magnet_reach_since_s=9.0,
-        release_began_at_s=9.0,
+        weight_transfer_began_at_s=9.0,
         motor_stop_commanded_at_s=10.0,
         last_stop_or_land_command_at_s=10.0,
         stop_or_land_command_count=1,
@@ -538,7 +540,9 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
 def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
-    slipped = landing(HANG_Z_M, Phase.RECOVER, catch_setpoint_above_vehicle_m=1.0, setpoint=below)
+    slipped = landing(
+        HANG_Z_M, Phase.RECOVER, catch_setpoint_height_above_vehicle_m=1.0, setpoint=below
+    )
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
     assert is_setpoint(command, distance_below_m=HANG_Z_M + 0.1)
@@ -664,6 +668,6 @@ def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -
     felt = Felt()
     felt(at()(BEGIN_S))
     flight = fly(landing(1.0, Phase.ALIGN), at(**frozen), 1.4, feels=felt, one_phase=True)
-    assert flight.state.row_name == "telemetry-stale"
+    assert flight.state.transition_name == "telemetry-stale"
     last_stale_s = PROFILE.safety.telemetry_land_s
     assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(last_stale_s, abs=0.1)

@@ -137,7 +137,7 @@ def whole_turn() -> TickRecord:
         observation=Observation(1.3, sample, synthetic.target(1.0, 1.0)),
         command=Land(0.0, 2.0),
         phase=Phase.LANDING,
-        row_name="fence",
+        transition_name="fence",
         is_holding_position=True,
         failed_attempts=2,
         external_positions=ExternalPositionStatus(0.1, None, 3, 99.0, None),

@@ -53,7 +53,7 @@ def test_the_corpus_is_worth_its_place() -> None:
     assert any(turn.external_positions for name in NAMES for turn in corpus(name).turns)
     assert any(turn.role == "redone" for turn in corpus("hung-within").turns)
     assert any(turn.inputs.late_samples for turn in corpus("hung-within").turns)
-    assert any(turn.row_name == "telemetry-stale" for turn in corpus("link-silent").turns)
+    assert any(turn.transition_name == "telemetry-stale" for turn in corpus("link-silent").turns)
 
 
 def test_flights_of_two_formats_are_in_it() -> None:

@@ -131,7 +131,7 @@ def test_the_first_field_is_named(one: Any, other: Any, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "field", "value"),
     [
-        ("row_name", "row", "fence"),
+        ("transition_name", "row", "fence"),
         ("is_holding_position", "held", True),
         ("failed_attempts", "attempts", 9),
     ],

@@ -81,7 +81,7 @@ THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE = 0.06
 """Largest difference between the current load and the filtered load, as a share of full thrust. A
 reading with a larger difference belongs to an earlier thrust and is not used."""
-MIN_COUNTED_CHARGE_FRACTION = 0.05
+MIN_CHARGE_FRACTION_FOR_COULOMB_COUNTING = 0.05
 """Share of the full charge below which the discharge counted from the assumed current is not used:
 the voltage curve is so steep there that the readings alone determine the charge."""
 MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
@@ -133,7 +133,7 @@ class BatteryFit:
 
     # resting voltage before take-off, estimated if the first reading was under load
     takeoff_rest_v: float | None = None
-    counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
+    coulomb_counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
     # load, low-pass filtered with `THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
     lagged_thrust_fraction: float = 0.0
     mean_airborne_thrust_fraction: float = 0.0  # mean over the last seconds in the air
@@ -211,7 +211,7 @@ def update_battery_fit(
     thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
-        counted_discharge_fraction=state.counted_discharge_fraction
+        coulomb_counted_discharge_fraction=state.coulomb_counted_discharge_fraction
         + thrust_fraction
         * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
         * dt_s,
@@ -323,7 +323,10 @@ def _add_voltage_reading_to_sums(
     from the typical sag and from the typical discharge ratio."""
     assert state.takeoff_rest_v is not None
     begun = charge_fraction_from_rest_v(state.takeoff_rest_v)
-    counted = max(min(begun, MIN_COUNTED_CHARGE_FRACTION), begun - state.counted_discharge_fraction)
+    counted = max(
+        min(begun, MIN_CHARGE_FRACTION_FOR_COULOMB_COUNTING),
+        begun - state.coulomb_counted_discharge_fraction,
+    )
     spent_v = rest_v_from_charge_fraction(begun) - rest_v_from_charge_fraction(counted)
     off_v = (
         state.takeoff_rest_v

@@ -18,7 +18,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.lateral_offset import LateralOffsetFilter, LateralState
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.motion import ZERO_VECTOR, ImuMotion, Vector
-from perchctl.mission.belief.mounting import MountingMonitor
+from perchctl.mission.belief.mounting import CameraMountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.belief.target import TargetBelief, VisualMotion
 from perchctl.mission.belief.thrust import HoverThrust
@@ -27,7 +27,7 @@ from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
-POSITION_SETTLING_AFTER_GAP_S = 0.5
+POSITION_SETTLING_TIME_AFTER_GAP_S = 0.5
 """Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
 trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
@@ -106,9 +106,10 @@ class Belief:
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
     #: Kalman filter of the lateral offset from the target
     lateral_offset_filter: LateralOffsetFilter = field(default_factory=LateralOffsetFilter)
-    mounting: MountingMonitor = field(default_factory=MountingMonitor)
-    #: low-passed `lean_sine_world_xy`, with the time constant `MEAN_LEAN_TIME_CONSTANT_S`
-    mean_lean_sine_world_xy: tuple[float, float] = (0.0, 0.0)
+    mounting: CameraMountingMonitor = field(default_factory=CameraMountingMonitor)
+    #: low-passed `thrust_direction_world_xy` (time constant
+    #: `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`)
+    mean_thrust_direction_world_xy: tuple[float, float] = (0.0, 0.0)
     #: height of the body where the magnet may hold it
     vehicle_world_z_at_last_contact_m: float | None = None
     gear_to_target_at_last_contact: GearToTargetDistance | None = None
@@ -237,14 +238,14 @@ class Belief:
     @cached_property
     def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `POSITION_SETTLING_AFTER_GAP_S`, have not led the vehicle away from its setpoint (diverged)
-        and, if they come from pictures, agree with the accelerometer."""
+        `POSITION_SETTLING_TIME_AFTER_GAP_S`, have not led the vehicle away from its setpoint
+        (diverged) and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
             self.is_target_position_source and self.obs.camera_imu_mismatch is not None
         )
         returns = (
             self.position_last_stale_at_s is not None
-            and self.obs.t_s - self.position_last_stale_at_s <= POSITION_SETTLING_AFTER_GAP_S
+            and self.obs.t_s - self.position_last_stale_at_s <= POSITION_SETTLING_TIME_AFTER_GAP_S
         )
         return not (doubted or self.is_position_stale or returns)
 
@@ -299,7 +300,7 @@ class Belief:
         )
 
     @cached_property
-    def can_descend_by_target(self) -> bool:
+    def can_descend_with_target_as_position_source(self) -> bool:
         """True if the estimate is good enough for a descent with the target as the only position
         source: the positions are trusted (recent, not diverged), no gust is uncorrected, and the
         flight data is reliable."""
@@ -312,21 +313,24 @@ class Belief:
     @cached_property
     def has_only_imu_for_descent(self) -> bool:
         """True if only accelerometer and attitude remain for a descent: with the target as the
-        position source, once `can_descend_by_target` is false; with a deck or motion capture, while
-        positions are missing or too new to be trusted, but not once they have diverged."""
+        position source, once `can_descend_with_target_as_position_source` is false; with a deck or
+        motion capture, while positions are missing or too new to be trusted, but not once they have
+        diverged."""
         if self.is_target_position_source:
-            return not self.can_descend_by_target
+            return not self.can_descend_with_target_as_position_source
         return not (self.is_position_trusted or self.is_position_diverged)
 
     @cached_property
-    def can_descend_by_position(self) -> bool:
+    def can_descend_under_position_control(self) -> bool:
         """True if the vehicle can descend under position control, by a position from any source
         (deck, motion capture or target): positions have not diverged, dead reckoning has not
         replaced them, and the heading is not lost (unless the telemetry is too old for the
-        alternative, raw thrust). With the target as the source, `can_descend_by_target` must hold
-        as well."""
+        alternative, raw thrust). With the target as the source,
+        `can_descend_with_target_as_position_source` must hold as well."""
         lost = self.is_position_diverged or self.dead_reckoning_since_s is not None
-        if lost or (self.is_target_position_source and not self.can_descend_by_target):
+        if lost or (
+            self.is_target_position_source and not self.can_descend_with_target_as_position_source
+        ):
             return False
         # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
@@ -368,7 +372,7 @@ class Belief:
         return vx_mps, vy_mps, vz_mps
 
     @cached_property
-    def lean_sine_world_xy(self) -> tuple[float, float]:
+    def thrust_direction_world_xy(self) -> tuple[float, float]:
         """Horizontal part (x, y) of the unit vector along the thrust, world axes. Its length is the
         sine of the tilt, and it points to where the vehicle leans."""
         tel = self.obs.telemetry
@@ -378,12 +382,16 @@ class Belief:
         return cos_yaw * level_x - sin_yaw * level_y, sin_yaw * level_x + cos_yaw * level_y
 
     @cached_property
-    def lean_acceleration_world_xy_mps2(self) -> tuple[float, float]:
-        """Lateral acceleration (x, y) in world axes, m/s^2, from the lean minus its mean (low-pass
-        filter with `MEAN_LEAN_TIME_CONSTANT_S`). The mean lean is assumed not to accelerate the
-        vehicle: it balances the wind, an uneven mass distribution, or an error of the estimated
-        attitude. Wrong after a change of the wind, until the mean has followed."""
-        (x, y), (mean_x, mean_y) = self.lean_sine_world_xy, self.mean_lean_sine_world_xy
+    def acceleration_from_tilt_world_xy_mps2(self) -> tuple[float, float]:
+        """Lateral acceleration (x, y) in world axes, m/s^2, from the tilt minus its mean (a
+        low-pass filter with the time constant `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`). The mean
+        tilt is assumed not to accelerate the vehicle: it balances the wind, an uneven mass
+        distribution, or an error of the estimated attitude. Wrong after a change of the wind, until
+        the mean has followed."""
+        (x, y), (mean_x, mean_y) = (
+            self.thrust_direction_world_xy,
+            self.mean_thrust_direction_world_xy,
+        )
         return GRAVITY_MPS2 * (x - mean_x), GRAVITY_MPS2 * (y - mean_y)
 
     @cached_property
@@ -416,7 +424,7 @@ class Belief:
         return self.hover_thrust_estimate.thrust
 
     @cached_property
-    def is_thrust_known(self) -> bool:
+    def is_reported_thrust_reliable(self) -> bool:
         """True if the reported thrust can be used: no raw thrust is commanded, or the reported
         thrust agrees with it or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
         return (

@@ -88,7 +88,7 @@ MIN_DESCENT_TO_ACCEPT_FLOOR_M = 0.1
 """Distance below its start at which a descent counts as under way, m."""
 MAX_DESCENT_IF_HELD_AT_START_M = 0.1
 """Distance from its start within which a vehicle in a descent may still be held there, m."""
-MAX_DRIFTED_HEIGHT_STANDING_ON_FLOOR_M = 0.3
+MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M = 0.3
 """Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
 hanging, m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M`
 applies to a vehicle that has not drifted yet.)"""
@@ -101,7 +101,7 @@ MAX_HANGING_GEAR_TO_TARGET_Z_M = 0.15
 magnet."""
 MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
 """Least height difference between gear and target, m, of a vehicle that stands on the floor."""
-MAX_CLIMB_RATE_OF_FALL_AFTER_RELEASE_MPS = -0.05
+MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS = -0.05
 """Climb rate below which a released vehicle with a low specific force is falling, m/s."""
 MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS = -0.15
 """Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
@@ -126,7 +126,7 @@ def current_gear_to_target(b: Belief) -> GearToTargetDistance:
     contact, from the newest image if that is more precise, otherwise by dead reckoning from the
     last sighting. With decks, the standard deviation then grows, because the estimated position
     drifts and the impact on the ceiling disturbs it."""
-    reckoned, seen = _reckoned_gear_to_target(b), _gear_to_target_seen_in_contact(b)
+    reckoned, seen = _dead_reckoned_gear_to_target(b), _gear_to_target_seen_in_contact(b)
     return reckoned if seen is None or reckoned.sigma_m < seen.sigma_m else seen
 
 
@@ -150,7 +150,7 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     ):
         return None
     x_m, y_m, z_m = target.measured_gear_to_target_world_m.tolist()
-    before_touch_s = max(0.0, b.imu.climb_steady_since_s - target.last_measured_at_s)
+    before_touch_s = max(0.0, b.imu.climb_rate_steady_since_s - target.last_measured_at_s)
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
@@ -164,7 +164,7 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     return GearToTargetDistance(math.hypot(x_m, y_m), sigma_m)
 
 
-def _reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
+def _dead_reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
     dead_reckoning = b.dead_reckoning
     sigma_m = math.hypot(
         dead_reckoning.gear_to_target_sigma_m,
@@ -277,7 +277,7 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
     if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_FIRMWARE_POSITION_MODE_THRUST:
         most = max(most, MIN_FIRMWARE_POSITION_MODE_THRUST)
-    return b.is_thrust_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
+    return b.is_reported_thrust_reliable and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
 def is_above_hover_thrust(b: Belief) -> bool:
@@ -337,7 +337,7 @@ def _is_in_contact_with_target(b: Belief) -> bool:
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
-    motionless_s = b.obs.t_s - b.imu.climb_steady_since_s
+    motionless_s = b.obs.t_s - b.imu.climb_rate_steady_since_s
     return (
         abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
@@ -345,7 +345,7 @@ def _is_in_contact_with_target(b: Belief) -> bool:
         and (steady or motionless_s >= perch.contact_dwell_s)
         and b.is_accelerometer_reading_one_g
         and b.hover_thrust > 0
-        and b.is_thrust_known
+        and b.is_reported_thrust_reliable
         and is_above_hover_thrust(b)
     )
 
@@ -361,8 +361,8 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
 def _is_hanging_with_motors_stopped(b: Belief) -> bool:
     """True if the motors have stopped and the vehicle hangs where it made contact."""
     return (
-        b.command_history.release_began_at_s is not None
-        and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
+        b.command_history.weight_transfer_began_at_s is not None
+        and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_reported_thrust_reliable)
         and is_vertically_motionless(b)
         and not is_slipping(b)
     )
@@ -377,7 +377,7 @@ def _is_hanging(b: Belief) -> bool:
         return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
     held = (
         is_thrust_too_low_to_fly(b)
-        and b.height_m > MAX_DRIFTED_HEIGHT_STANDING_ON_FLOOR_M
+        and b.height_m > MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M
         and is_vertically_motionless(b)
     )
     if not b.command_history.maneuver.descends_to_floor:
@@ -465,13 +465,13 @@ def _does_imu_show_support(b: Belief) -> bool:
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
         0 < hover < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
-        and b.is_thrust_known
+        and b.is_reported_thrust_reliable
         and (
             is_above_hover_thrust(b)
             or tel.thrust <= (2.0 - MIN_PRESS_TO_HOVER_THRUST_RATIO) * hover
         )
         and b.is_accelerometer_reading_one_g
-        and b.obs.t_s - b.imu.climb_steady_since_s >= perch.contact_dwell_s
+        and b.obs.t_s - b.imu.climb_rate_steady_since_s >= perch.contact_dwell_s
     )
 
 
@@ -622,7 +622,10 @@ def has_slipped(b: Belief) -> bool:
     `complete.slip_dwell_s`. During the release by raw thrust, the first sign of free fall is
     enough."""
     tel, complete = b.telemetry, b.profile.planner.complete
-    falls = b.command_history.release_began_at_s is not None and tel.acc_z_g < complete.slip_acc_g
-    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_OF_FALL_AFTER_RELEASE_MPS:
+    falls = (
+        b.command_history.weight_transfer_began_at_s is not None
+        and tel.acc_z_g < complete.slip_acc_g
+    )
+    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS:
         return True
     return b.true_for_s(SLIPPING) >= complete.slip_dwell_s

@@ -67,7 +67,7 @@ class MotionSample(NamedTuple):
     its lean causes and its estimated velocity, both (x, y) in world axes."""
 
     t_s: float
-    lean_acceleration_world_xy_mps2: LateralVector
+    acceleration_from_tilt_world_xy_mps2: LateralVector
     estimated_velocity_world_xy_mps: LateralVector
 
 
@@ -180,11 +180,11 @@ class LateralOffsetFilter:
                 assert before is not None
                 mean_mps2 = _add_scaled(
                     (
-                        0.5 * before.lean_acceleration_world_xy_mps2[0],
-                        0.5 * before.lean_acceleration_world_xy_mps2[1],
+                        0.5 * before.acceleration_from_tilt_world_xy_mps2[0],
+                        0.5 * before.acceleration_from_tilt_world_xy_mps2[1],
                     ),
                     0.5,
-                    sample.lean_acceleration_world_xy_mps2,
+                    sample.acceleration_from_tilt_world_xy_mps2,
                 )
                 predicted = predicted._propagate(min(t_s, sample.t_s), mean_mps2)
                 if sample.t_s > t_s:
@@ -194,7 +194,7 @@ class LateralOffsetFilter:
                 )
             before = sample
         return predicted._propagate(
-            t_s, (0.0, 0.0) if before is None else before.lean_acceleration_world_xy_mps2
+            t_s, (0.0, 0.0) if before is None else before.acceleration_from_tilt_world_xy_mps2
         )
 
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:

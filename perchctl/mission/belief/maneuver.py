@@ -61,7 +61,7 @@ class CommandHistory:
     maneuver_start_position_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
     raw_thrust: int | None = None  # last command; None in position mode
-    release_began_at_s: float | None = None  # start of the release by raw thrust
+    weight_transfer_began_at_s: float | None = None  # start of the release by raw thrust
     motor_stop_commanded_at_s: float | None = None  # first order to stop the motors
     # time at which a descent by raw thrust detected the floor
     floor_detected_at_s: float | None = None
@@ -72,14 +72,14 @@ class CommandHistory:
         return (
             self.maneuver.descends_to_floor
             and self.raw_thrust is not None
-            and self.is_before_release_and_motor_stop
+            and self.is_before_weight_transfer_and_motor_stop
         )
 
     @property
-    def is_before_release_and_motor_stop(self) -> bool:
+    def is_before_weight_transfer_and_motor_stop(self) -> bool:
         """True until raw thrust begins to transfer the vehicle's weight to the magnet (the release)
         or the motors are commanded to stop."""
-        return self.release_began_at_s is None and self.motor_stop_commanded_at_s is None
+        return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def with_frame_shift(
         self, setpoint_in_new_frame: PositionSetpoint | None, shift_m: Vector

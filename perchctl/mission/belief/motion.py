@@ -52,12 +52,12 @@ never reaches it, a fall reaches it after 5 cm. Closer to 0: noise counts as a f
 MAX_FROZEN_READING_S = 0.2
 """Time of identical readings that counts as a gap, s. Smaller: coarse readings freeze by
 chance."""
-MAX_FREE_FALL_READING_G = 0.6
+MAX_ACCELEROMETER_READING_IN_FREE_FALL_G = 0.6
 """Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
 fall."""
 MIN_FREE_FALL_DURATION_S = 0.1
-"""Time for which a falling vehicle reads less than `MAX_FREE_FALL_READING_G`, s; a rebound is
-shorter. Larger: a fall is detected 5 cm later."""
+"""Time for which a falling vehicle reads less than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`, s; a
+rebound is shorter. Larger: a fall is detected 5 cm later."""
 MAX_CLIMB_RATE_GAINED_IN_FALL_MPS = -0.25
 """Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle falls
 whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
@@ -220,12 +220,13 @@ class FallDetector:
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
     `MAX_CLIMB_RATE_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less
-    than `MAX_FREE_FALL_READING_G` for `MIN_FREE_FALL_DURATION_S`, longer than a rebound lasts. A
-    slow sink goes undetected because it is learned as an offset.
+    than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G` for `MIN_FREE_FALL_DURATION_S`, longer than a
+    rebound lasts. A slow sink goes undetected because it is learned as an offset.
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
-    # time since which the accelerometer has read less than `MAX_FREE_FALL_READING_G`
+    # time since which the accelerometer has read less than
+    # `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`
     low_g_since_s: float = math.inf
     climb_rate_gained_mps: float = 0.0
     up_acceleration_offset_mps2: float = 0.0
@@ -251,7 +252,11 @@ class FallDetector:
             MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
             sink - sink * dt_s / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S,
         )
-        light = min(self.low_g_since_s, t_s) if acc_z_g < MAX_FREE_FALL_READING_G else math.inf
+        light = (
+            min(self.low_g_since_s, t_s)
+            if acc_z_g < MAX_ACCELEROMETER_READING_IN_FREE_FALL_G
+            else math.inf
+        )
         fell = sink < MAX_CLIMB_RATE_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
         return replace(
             self,
@@ -354,7 +359,8 @@ class SteadySpeedDetector:
     """Loop times at which the vertical speed became constant, and at which the lateral velocity
     came close to its mean."""
 
-    climb_steady_since_s: float = math.inf  # time since which the vertical speed has been constant
+    # time since which the vertical speed has been constant
+    climb_rate_steady_since_s: float = math.inf
     steady_climb_mps: float = 0.0
     # time since which the lateral velocity has been constant
     lateral_steady_since_s: float = math.inf
@@ -364,9 +370,12 @@ class SteadySpeedDetector:
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """Return the detector after `dt_s`; `velocity_mps` is the newest velocity in world axes."""
         x, y, z = velocity_mps
-        climb_steady_since_s, steady_climb_mps = self.climb_steady_since_s, self.steady_climb_mps
+        climb_rate_steady_since_s, steady_climb_mps = (
+            self.climb_rate_steady_since_s,
+            self.steady_climb_mps,
+        )
         if abs(z - steady_climb_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
-            climb_steady_since_s, steady_climb_mps = t_s, z
+            climb_rate_steady_since_s, steady_climb_mps = t_s, z
         lateral_steady_since_s, (mean_x, mean_y) = (
             self.lateral_steady_since_s,
             self.mean_lateral_velocity_mps,
@@ -377,7 +386,7 @@ class SteadySpeedDetector:
             lateral_steady_since_s = t_s
         return replace(
             self,
-            climb_steady_since_s=climb_steady_since_s,
+            climb_rate_steady_since_s=climb_rate_steady_since_s,
             steady_climb_mps=steady_climb_mps,
             lateral_steady_since_s=lateral_steady_since_s,
             mean_lateral_velocity_mps=mean_lateral_velocity_mps,
@@ -510,7 +519,7 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     and whether the vehicle may have fallen during it."""
     motion = replace(
         motion,
-        climb_steady_since_s=new.t_s,
+        climb_rate_steady_since_s=new.t_s,
         steady_climb_mps=motion.velocity_gained_mps[2],
         lateral_steady_since_s=new.t_s,
         mean_lateral_velocity_mps=motion.velocity_gained_mps[:2],

@@ -16,8 +16,8 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
-MIN_SIGHTINGS_TO_JUDGE_MOUNTING = 10
+CAMERA_MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
+MIN_SIGHTINGS_TO_JUDGE_CAMERA_MOUNTING = 10
 """Number of sightings that a judgement requires."""
 MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
 """Motion of the axis, m, above which the mounting is judged and above which it is proven."""
@@ -30,7 +30,7 @@ of the target, m."""
 MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # share of the target's spread
 MIN_FITTED_ROTATION_MODULUS = 0.5  # modulus of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
-MIN_WRONG_CAMERA_YAW_RAD = math.radians(65.0)
+MIN_DETECTED_CAMERA_YAW_ERROR_RAD = math.radians(65.0)
 MIN_CONTRADICTING_SIGHTINGS = 4
 """Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
 poses end the flight."""
@@ -49,46 +49,51 @@ _MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 
 
 @dataclass(frozen=True)
-class MountingSample:
+class CameraMountingSample:
     """Positions of vehicle and target at `t_s` in the world, as x + iy in m.
 
-    `vehicle_to_up_axis_world_xy_m` is the vector from the vehicle to the point where its upward
-    axis meets the target's plane.
+    `vehicle_to_up_axis_at_target_height_world_xy_m` is the vector from the vehicle to the point
+    where its upward axis meets the target's plane.
     """
 
     t_s: float
     vehicle_world_xy_m: complex
     target_world_xy_m: complex
-    vehicle_to_up_axis_world_xy_m: complex = 0j
+    vehicle_to_up_axis_at_target_height_world_xy_m: complex = 0j
 
     @property
     def up_axis_at_target_height_world_xy_m(self) -> complex:
         """Point, world x + iy in m, where the vehicle's upward axis meets the horizontal plane at
         the target's height."""
-        return self.vehicle_world_xy_m + self.vehicle_to_up_axis_world_xy_m
+        return self.vehicle_world_xy_m + self.vehicle_to_up_axis_at_target_height_world_xy_m
 
 
-def make_mounting_sample(t_s: float, telemetry: Telemetry, target_world_m: Array) -> MountingSample:
+def make_camera_mounting_sample(
+    t_s: float, telemetry: Telemetry, target_world_m: Array
+) -> CameraMountingSample:
     """Return the sample for a target at `target_world_m` (3,), world, and the vehicle's pose in
     `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
-    vehicle_to_up_axis_world_xy_m = (float(target_world_m[2]) - z) * up
+    vehicle_to_up_axis_at_target_height_world_xy_m = (float(target_world_m[2]) - z) * up
     place = complex(float(target_world_m[0]), float(target_world_m[1]))
-    return MountingSample(
+    return CameraMountingSample(
         t_s,
         complex(x, y),
         place,
-        complex(float(vehicle_to_up_axis_world_xy_m[0]), float(vehicle_to_up_axis_world_xy_m[1])),
+        complex(
+            float(vehicle_to_up_axis_at_target_height_world_xy_m[0]),
+            float(vehicle_to_up_axis_at_target_height_world_xy_m[1]),
+        ),
     )
 
 
 @dataclass(frozen=True)
-class MountingMonitor:
+class CameraMountingMonitor:
     """The sightings since the target came into view, and whether they contradict the camera's
     mounting in the profile."""
 
-    sightings: tuple[MountingSample, ...] = ()
+    sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
     # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
     is_camera_mounting_confirmed: bool = False
@@ -109,13 +114,15 @@ class MountingMonitor:
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 
-def update_mounting_monitor(old: MountingMonitor, sample: MountingSample) -> MountingMonitor:
+def update_camera_mounting_monitor(
+    old: CameraMountingMonitor, sample: CameraMountingSample
+) -> CameraMountingMonitor:
     """Return the monitor after one more frame that measured the target."""
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
-    kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= MOUNTING_CHECK_WINDOW_S)
+    kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= CAMERA_MOUNTING_CHECK_WINDOW_S)
     if kept and _is_target_or_estimate_jump(kept, sample):
-        return MountingMonitor(check_paused_until_s=sample.t_s + JUMP_PAUSE_S)
+        return CameraMountingMonitor(check_paused_until_s=sample.t_s + JUMP_PAUSE_S)
     if sample.t_s < old.check_paused_until_s:
         return old
     new = replace(
@@ -123,13 +130,13 @@ def update_mounting_monitor(old: MountingMonitor, sample: MountingSample) -> Mou
     )
     return (
         new
-        if len(new.sightings) < MIN_SIGHTINGS_TO_JUDGE_MOUNTING
-        else _judge_mounting(new, old.contradicting_sighting_count)
+        if len(new.sightings) < MIN_SIGHTINGS_TO_JUDGE_CAMERA_MOUNTING
+        else _judge_camera_mounting(new, old.contradicting_sighting_count)
     )
 
 
 def _is_target_or_estimate_jump(
-    earlier_samples: tuple[MountingSample, ...], sample: MountingSample
+    earlier_samples: tuple[CameraMountingSample, ...], sample: CameraMountingSample
 ) -> bool:
     last = earlier_samples[-1]
     far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_DISTANCE_GROWTH_MPS * (sample.t_s - last.t_s)
@@ -149,9 +156,9 @@ def _is_target_or_estimate_jump(
     return False
 
 
-def _judge_mounting(
-    monitor: MountingMonitor, previous_contradicting_sighting_count: int
-) -> MountingMonitor:
+def _judge_camera_mounting(
+    monitor: CameraMountingMonitor, previous_contradicting_sighting_count: int
+) -> CameraMountingMonitor:
     aims, targets = (
         [s.up_axis_at_target_height_world_xy_m for s in monitor.sightings],
         [s.target_world_xy_m for s in monitor.sightings],
@@ -175,7 +182,7 @@ def _judge_mounting(
     if (
         abs(along) >= MIN_MOVING_RATIO
         and abs(turn) >= MIN_FITTED_ROTATION_MODULUS
-        and abs(cmath.phase(turn)) >= MIN_WRONG_CAMERA_YAW_RAD
+        and abs(cmath.phase(turn)) >= MIN_DETECTED_CAMERA_YAW_ERROR_RAD
         and spread_m >= MIN_TARGET_POSITION_SPREAD_RMS_M
         and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO * spread_m
     ):

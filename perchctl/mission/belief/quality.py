@@ -109,10 +109,10 @@ def position_loss_text(b: Belief) -> str:
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
     if b.profile.positioning.source.is_deck:
         why = why or NO_ESTIMATE_CORRECTION_TEXT
-    if b.obs.rejected_sighting_to_estimate_m > 0.0:
+    if b.obs.rejected_sighting_to_estimate_distance_m > 0.0:
         why = (
-            f"the target places the vehicle {b.obs.rejected_sighting_to_estimate_m:.2f} m from its "
-            f"estimated position"
+            f"the target shows the vehicle {b.obs.rejected_sighting_to_estimate_distance_m:.2f} m "
+            f"from its estimate"
         )
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
     return f"{text}: {why}" if why else text

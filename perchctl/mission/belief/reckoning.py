@@ -461,7 +461,7 @@ def accumulate_unexplained_position_step(
     """Return the dead reckoning with one more step of the estimated position added to their sum,
     which makes the offset at a contact less certain. A step is the motion between two samples
     beyond what the estimated velocity explains. After a gap in the samples, no step is added."""
-    dt_s = _position_time_s(sample) - _position_time_s(last)
+    dt_s = _position_timestamp_s(sample) - _position_timestamp_s(last)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
     x_m, y_m = (
@@ -483,7 +483,7 @@ def accumulate_unexplained_position_step(
     )
 
 
-def _position_time_s(sample: Telemetry) -> float:
+def _position_timestamp_s(sample: Telemetry) -> float:
     """Return the time, s, at which the sample's position was valid. It is older than the attitude
     by the sample's `behind_s`; a difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` is
     ignored."""

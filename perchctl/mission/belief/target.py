@@ -11,7 +11,7 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vision import TargetEstimate
 
-MIN_TARGET_FAR_ABOVE_GEAR_M = 0.5
+MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M = 0.5
 """Height above the gear beyond which the target cannot hold the vehicle, m. Larger: a vehicle that
 has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
 hold."""
@@ -66,7 +66,7 @@ class TargetBelief:
         vehicle."""
         return (
             self.world_position_m is not None
-            and self.gear_to_target_z_m > MIN_TARGET_FAR_ABOVE_GEAR_M
+            and self.gear_to_target_z_m > MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M
         )
 
     @classmethod

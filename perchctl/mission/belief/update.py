@@ -21,7 +21,7 @@ import numpy as np
 
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.battery import update_battery_fit_from_telemetry
-from perchctl.mission.belief.belief import POSITION_SETTLING_AFTER_GAP_S, Belief
+from perchctl.mission.belief.belief import POSITION_SETTLING_TIME_AFTER_GAP_S, Belief
 from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     IMU_SHOWS_SUPPORT,
@@ -42,9 +42,9 @@ from perchctl.mission.belief.lateral_offset import MotionSample
 from perchctl.mission.belief.maneuver import CommandHistory
 from perchctl.mission.belief.motion import ZERO_VECTOR, Vector
 from perchctl.mission.belief.mounting import (
-    MountingMonitor,
-    make_mounting_sample,
-    update_mounting_monitor,
+    CameraMountingMonitor,
+    make_camera_mounting_sample,
+    update_camera_mounting_monitor,
 )
 from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
@@ -79,7 +79,7 @@ MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
 thrust."""
 KEEPALIVE_RAW_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
-MEAN_LEAN_TIME_CONSTANT_S = 0.5
+MEAN_THRUST_DIRECTION_TIME_CONSTANT_S = 0.5
 """Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
 TARGET_SCATTER_FRACTION_KEPT_PER_FRAME = 0.9
@@ -101,7 +101,9 @@ def update_belief(
         command_history=command_history,
         world_frame_shift_in_tick_m=ZERO_VECTOR,
     )
-    sample = MotionSample(obs.telemetry.t_s, b.lean_acceleration_world_xy_mps2, b.velocity_mps[:2])
+    sample = MotionSample(
+        obs.telemetry.t_s, b.acceleration_from_tilt_world_xy_mps2, b.velocity_mps[:2]
+    )
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
     if has_tick_gap(belief, obs, profile):
@@ -116,7 +118,7 @@ def update_belief(
     b = _update_dead_reckoning(b)
     comes_down = (
         command_history.maneuver.descends_to_floor
-        and command_history.is_before_release_and_motor_stop
+        and command_history.is_before_weight_transfer_and_motor_stop
     )
     if comes_down and b.dead_reckoning_since_s is None and b.has_only_imu_for_descent:
         b = start_dead_reckoning(b)
@@ -223,7 +225,7 @@ def _shift_remembered_positions(b: Belief) -> Belief:
     moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
     returns = (
         b.position_last_stale_at_s is not None
-        and obs.t_s - b.position_last_stale_at_s <= POSITION_SETTLING_AFTER_GAP_S
+        and obs.t_s - b.position_last_stale_at_s <= POSITION_SETTLING_TIME_AFTER_GAP_S
     )
     if dt_s > MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S or returns:
         moved_m = (0.0, 0.0, 0.0)
@@ -267,7 +269,11 @@ def _compare_thrust_with_command(b: Belief) -> Belief:
         else b.thrust_differs_from_command_since_s
     )
     b = replace(b, thrust_differs_from_command_since_s=since_s if apart else None)
-    return b if b.is_thrust_known else replace(b, thrust_last_differed_from_command_at_s=b.obs.t_s)
+    return (
+        b
+        if b.is_reported_thrust_reliable
+        else replace(b, thrust_last_differed_from_command_at_s=b.obs.t_s)
+    )
 
 
 # --- Dead reckoning ---
@@ -333,7 +339,7 @@ def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckon
     within ten seconds."""
     obs = b.obs
     rests = (
-        obs.t_s - obs.imu.climb_steady_since_s >= STILL_AT_CONTACT_DWELL_S
+        obs.t_s - obs.imu.climb_rate_steady_since_s >= STILL_AT_CONTACT_DWELL_S
         and obs.t_s - obs.imu.last_fall_at_s > HANGING_CONFIRMATION_DWELL_S
     )
     hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
@@ -433,7 +439,7 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
     it."""
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
     # a released or stopped vehicle does not move into or out of reach
-    if not b.command_history.is_before_release_and_motor_stop:
+    if not b.command_history.is_before_weight_transfer_and_motor_stop:
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
     near = (
@@ -509,19 +515,19 @@ def _update_estimators(b: Belief) -> Belief:
         battery_fit=update_battery_fit_from_telemetry(
             b.battery_fit, obs.telemetry, obs.battery_reading_age_s, dt_s, mah
         ),
-        mounting=b.mounting if held else _update_mounting(b),
-        mean_lean_sine_world_xy=_filter_lean(b, sample_dt_s),
+        mounting=b.mounting if held else _update_camera_mounting(b),
+        mean_thrust_direction_world_xy=_filter_thrust_direction(b, sample_dt_s),
     )
 
 
-def _filter_lean(b: Belief, sample_dt_s: float) -> tuple[float, float]:
+def _filter_thrust_direction(b: Belief, sample_dt_s: float) -> tuple[float, float]:
     """Return the mean lean after a sample that covers `sample_dt_s`."""
-    gain = 1.0 - math.exp(-sample_dt_s / MEAN_LEAN_TIME_CONSTANT_S)
-    (x, y), (mean_x, mean_y) = b.lean_sine_world_xy, b.mean_lean_sine_world_xy
+    gain = 1.0 - math.exp(-sample_dt_s / MEAN_THRUST_DIRECTION_TIME_CONSTANT_S)
+    (x, y), (mean_x, mean_y) = b.thrust_direction_world_xy, b.mean_thrust_direction_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)
 
 
-def _update_mounting(b: Belief) -> MountingMonitor:
+def _update_camera_mounting(b: Belief) -> CameraMountingMonitor:
     obs, target = b.obs, b.obs.target
     measured = (
         target is not None and target.is_measured_in_newest_frame and target.world_m is not None
@@ -534,6 +540,6 @@ def _update_mounting(b: Belief) -> MountingMonitor:
     ):
         return b.mounting
     assert b.last_target_world_m is not None
-    return update_mounting_monitor(
-        b.mounting, make_mounting_sample(obs.t_s, obs.telemetry, b.last_target_world_m)
+    return update_camera_mounting_monitor(
+        b.mounting, make_camera_mounting_sample(obs.t_s, obs.telemetry, b.last_target_world_m)
     )

@@ -45,7 +45,7 @@ CLIMB_WITHHELD = Condition[Context](
 """The fleet's parent does not permit the climb."""
 
 
-def act(c: Context) -> Action:
+def act_in_align(c: Context) -> Action:
     """Move under the target at the setpoint's height."""
     return fly_under_target(c, (c.state.setpoint or make_setpoint_at_vehicle(c)).z_m)
 
@@ -105,7 +105,7 @@ ALIGN = PhaseDefinition(
     maneuver=Maneuver(
         is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
-    act=act,
+    act=act_in_align,
     conditions=(ALIGNED, CLIMB_WITHHELD),
     exits=(
         Transition(

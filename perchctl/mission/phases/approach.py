@@ -11,7 +11,7 @@ from perchctl.mission.setpoints import Action, fly_to, step_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_HEIGHT_TO_CORRECT_HEIGHT_M = 0.1
+MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
 stands jumps up."""
@@ -35,7 +35,7 @@ TAKEOFF_HEIGHT_REACHED = Condition[Context](
 """The vehicle hovers near the take-off height."""
 
 
-def act(c: Context) -> Action:
+def act_in_approach(c: Context) -> Action:
     """Climb to `takeoff_height_m` above the take-off position by position setpoints, so that the
     firmware levels the vehicle out if they stop arriving."""
     planner, state, b = c.planner, c.state, c.belief
@@ -49,13 +49,13 @@ def act(c: Context) -> Action:
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
     setpoint = step_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_M)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M)
 
 
 APPROACH = PhaseDefinition(
     phase=Phase.APPROACH,
     maneuver=Maneuver(is_in_free_air=True),
-    act=act,
+    act=act_in_approach,
     conditions=(TAKEOFF_HEIGHT_REACHED,),
     exits=(
         Transition(

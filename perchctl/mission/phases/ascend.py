@@ -34,7 +34,7 @@ the hover begins during the climb. Smaller: an error of the height keeps it from
 HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
 """The same distance of the setpoint, m, which stays at this height during the hover. Larger: the
 vehicle hovers too low. Smaller: noise of the target's height keeps the hover from beginning."""
-MAX_TARGET_LOST_S = 1.5
+MAX_TIME_WITHOUT_TARGET_S = 1.5
 """Time since the last sighting of the target after which an ascent or a hover is given up, s, if a
 positioning system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that
 has moved or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
@@ -47,7 +47,7 @@ def ascent_cone_radius_m(c: Context) -> float:
     return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.gear_to_target_z_m)
 
 
-def ascent_end_below_target_m(c: Context) -> float:
+def ascent_end_distance_below_target_m(c: Context) -> float:
     """Return the distance of the gear below the target at which the ascent ends, m."""
     hover = c.planner.hover
     return c.planner.ascend.standoff_m if hover is None else hover.below_m
@@ -57,7 +57,7 @@ def has_reached_ascent_end_height(c: Context) -> bool:
     """True if the gear has reached the height at which the ascent settles."""
     return (
         c.belief.target.gear_to_target_z_m
-        <= ascent_end_below_target_m(c) + c.planner.ascend.settle_z_m
+        <= ascent_end_distance_below_target_m(c) + c.planner.ascend.settle_z_m
     )
 
 
@@ -85,12 +85,12 @@ def _is_at_hover_position(c: Context) -> bool:
     which the mission hovers. The tolerances are those of ALIGN, since the small marker may be too
     far away to be seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
-    goal_z_m = target.vehicle_world_z_when_touching_m - ascent_end_below_target_m(c)
+    goal_z_m = target.vehicle_world_z_when_touching_m - ascent_end_distance_below_target_m(c)
     return (
         target.is_fresh
         and setpoint is not None
         and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_HEIGHT_TOLERANCE_M
-        and abs(target.gear_to_target_z_m - ascent_end_below_target_m(c))
+        and abs(target.gear_to_target_z_m - ascent_end_distance_below_target_m(c))
         <= HOVER_HEIGHT_TOLERANCE_M
         and target.gear_to_target_distance_xy_m <= align.xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
@@ -111,7 +111,7 @@ def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, every moment without it is too long, since the position drifts."""
     b = c.belief
-    patience_s = 0.0 if b.is_target_position_source else MAX_TARGET_LOST_S
+    patience_s = 0.0 if b.is_target_position_source else MAX_TIME_WITHOUT_TARGET_S
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 
@@ -127,18 +127,18 @@ AT_HOVER_POSITION = Condition[Context](
 """The mission hovers, and the vehicle is slow and aligned where it does."""
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_ascend(state: PlannerState, previous_context: Context) -> PlannerState:
     """Reset the search: if the aligned target is lost later, the search starts from the
     beginning."""
     del previous_context
     return replace(state, searched_position_count=0)
 
 
-def act(c: Context) -> Action:
+def act_in_ascend(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or make_setpoint_at_vehicle(c)
-    goal_z = target.vehicle_world_z_when_touching_m - ascent_end_below_target_m(c)
+    goal_z = target.vehicle_world_z_when_touching_m - ascent_end_distance_below_target_m(c)
     may_climb = (
         target.is_fresh
         and target.gear_to_target_distance_xy_m
@@ -165,8 +165,8 @@ ASCEND = PhaseDefinition(
         learns_hover_thrust=True,
         climbs_to_target=True,
     ),
-    enter=enter,
-    act=act,
+    enter=enter_ascend,
+    act=act_in_ascend,
     conditions=(NEAR_STANDOFF_HEIGHT, SETTLED_AT_STANDOFF, AT_HOVER_POSITION),
     exits=(
         back_off_row(
@@ -197,7 +197,7 @@ ASCEND = PhaseDefinition(
             {Phase.ASCEND},
             lambda c: c.true_for_s(AT_HOVER_POSITION) >= c.planner.ascend.settle_dwell_s,
             Phase.HOVER,
-            lambda c: f"steady {ascent_end_below_target_m(c):g} m below the target",
+            lambda c: f"steady {ascent_end_distance_below_target_m(c):g} m below the target",
         ),
         Transition(
             "settled",

@@ -14,7 +14,11 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
-from perchctl.mission.release import reduce_press_before_release, release_by_thrust, stop_motors
+from perchctl.mission.release import (
+    reduce_press_before_weight_transfer,
+    stop_motors,
+    transfer_weight_by_raw_thrust,
+)
 from perchctl.mission.rest import is_still_hanging
 from perchctl.mission.setpoints import Action
 from perchctl.mission.state import PlannerState
@@ -25,26 +29,26 @@ MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S = 10.0
 """Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_complete(state: PlannerState, previous_context: Context) -> PlannerState:
     """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],
         gear_to_target_at_last_contact=gear_to_target_at_last_touch_or_now(previous_context.belief),
     )
-    return replace(state, belief=belief, release_began_at_s=None)
+    return replace(state, belief=belief, weight_transfer_began_at_s=None)
 
 
-def act(c: Context) -> Action:
+def act_in_complete(c: Context) -> Action:
     """Transfer the weight from the rotors to the magnet in two stages (the release), stop the
     motors once the whole weight hangs, and monitor the vehicle."""
     if c.state.motor_stop_commanded_at_s is not None:
         return stop_motors(c)
     holds = c.true_for_s(MAGNET_HOLDS_VEHICLE) >= c.planner.complete.hold_dwell_s
     return (
-        release_by_thrust(c)
-        if holds or c.state.release_began_at_s is not None
-        else reduce_press_before_release(c)
+        transfer_weight_by_raw_thrust(c)
+        if holds or c.state.weight_transfer_began_at_s is not None
+        else reduce_press_before_weight_transfer(c)
     )
 
 
@@ -57,7 +61,7 @@ def time_since_motor_stop_command_s(c: Context) -> float:
     )
 
 
-def is_release_monitoring_over(c: Context) -> bool:
+def is_hang_monitoring_over(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return (
         time_since_motor_stop_command_s(c) >= c.planner.complete.watch_s
@@ -68,8 +72,8 @@ def is_release_monitoring_over(c: Context) -> bool:
 COMPLETE = PhaseDefinition(
     phase=Phase.COMPLETE,
     maneuver=Maneuver(),
-    enter=enter,
-    act=act,
+    enter=enter_complete,
+    act=act_in_complete,
     exits=(
         back_off_row(
             "slipped",
@@ -95,7 +99,7 @@ COMPLETE = PhaseDefinition(
         Transition(
             "perched",
             {Phase.COMPLETE},
-            lambda c: is_release_monitoring_over(c) and is_still_hanging(c),
+            lambda c: is_hang_monitoring_over(c) and is_still_hanging(c),
             Phase.PERCHED,
             "hanging still with the motors off",
             outcome=Outcome.PERCHED,
@@ -103,7 +107,7 @@ COMPLETE = PhaseDefinition(
         land_row(
             "fell-unseen",
             {Phase.COMPLETE},
-            is_release_monitoring_over,
+            is_hang_monitoring_over,
             "it is unknown whether the vehicle still hangs",
         ),
         land_row(

@@ -25,7 +25,7 @@ TARGET_POSITION_STEADY = Condition[Context](
 """The target is fresh, and its position is steady within `estimate.spread_m`."""
 
 
-def act(c: Context) -> Action:
+def act_in_estimate(c: Context) -> Action:
     """Hold the setpoint while several frames confirm the target's position."""
     return fly_to(c, c.state.setpoint or make_setpoint_at_vehicle(c))
 
@@ -35,7 +35,7 @@ ESTIMATE = PhaseDefinition(
     maneuver=Maneuver(
         is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
-    act=act,
+    act=act_in_estimate,
     conditions=(TARGET_UNTRACKED, TARGET_POSITION_STEADY),
     exits=(
         Transition(

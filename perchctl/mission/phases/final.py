@@ -13,12 +13,12 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, StopMotors
 
 
-def rest(c: Context) -> Action:
+def stay_idle(c: Context) -> Action:
     """Stay at rest without sending a command."""
     return c.state, Idle()
 
 
-def abort(c: Context) -> Action:
+def act_in_aborted(c: Context) -> Action:
     """Stop the motors once. Without a stop command, the firmware would lock a hanging vehicle whose
     motors stand still."""
     if c.state.stop_or_land_command_count:
@@ -31,6 +31,6 @@ def abort(c: Context) -> Action:
     ), c.state.entry.stop_command or ends
 
 
-PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=rest)
-LANDED = PhaseDefinition(phase=Phase.LANDED, maneuver=Maneuver(), act=rest)
-ABORTED = PhaseDefinition(phase=Phase.ABORTED, maneuver=Maneuver(), act=abort)
+PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=stay_idle)
+LANDED = PhaseDefinition(phase=Phase.LANDED, maneuver=Maneuver(), act=stay_idle)
+ABORTED = PhaseDefinition(phase=Phase.ABORTED, maneuver=Maneuver(), act=act_in_aborted)

@@ -64,7 +64,7 @@ def time_since_hover_began_s(c: Context) -> float:
     return c.t_s - c.state.hover_errors.hover_began_at_s
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
     """Restart the hover timer and the position errors. Both continue if the vehicle has only
     climbed back to its hover position within `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`."""
     if (
@@ -75,7 +75,7 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
 
 
-def act(c: Context) -> Action:
+def act_in_hover(c: Context) -> Action:
     """Stay under the target at the setpoint's height. Lower the setpoint if the target is nearer
     than intended."""
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
@@ -120,8 +120,8 @@ HOVER = PhaseDefinition(
         learns_hover_thrust=True,
         climbs_to_target=True,
     ),
-    enter=enter,
-    act=act,
+    enter=enter_hover,
+    act=act_in_hover,
     conditions=(SUNK_BELOW_HOVER_HEIGHT,),
     exits=(
         back_off_row(

@@ -6,7 +6,7 @@ from perchctl.mission.belief.contact import MOTORS_OFF_AS_COMMANDED, MOTORS_OFF_
 from perchctl.mission.belief.reckoning import correct_acceleration_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.descent import DESCENT_MANEUVER, act, enter_descent
+from perchctl.mission.descent import DESCENT_MANEUVER, act_in_landing, enter_descent
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
@@ -14,11 +14,11 @@ from perchctl.mission.transition import Predicate, Transition, abort_during_land
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
-TARGET_RECHECK_DURATION_S = 2.0
+TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S = 2.0
 """Time after the motors are off in which the camera may still show the target far above, s."""
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
     """Start the descent. If the row that started it asserts that external positions or the mounting
     are wrong, the descent does not use them. Unless the row asserts that the vehicle hangs, the
     last contact is forgotten."""
@@ -88,8 +88,8 @@ def _outcome_after_hanging(previous_outcome: Outcome | None) -> Outcome | None:
 LANDING = PhaseDefinition(
     phase=Phase.LANDING,
     maneuver=DESCENT_MANEUVER,
-    enter=enter,
-    act=act,
+    enter=enter_landing,
+    act=act_in_landing,
     exits=(
         Transition(
             "hung",
@@ -121,7 +121,9 @@ LANDING = PhaseDefinition(
         ),
         abort_during_landing_row(
             "hangs-or-stands",
-            lambda c: c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= TARGET_RECHECK_DURATION_S,
+            lambda c: (
+                c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S
+            ),
             "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
             "whether the vehicle hangs or stands: look before you touch it",
         ),

@@ -37,7 +37,7 @@ in view; with the target alone, by dead reckoning. Larger: the vehicle presses o
 radius. Smaller: a covered marker ends attempts that would succeed."""
 
 
-def act(c: Context) -> Action:
+def act_in_perch(c: Context) -> Action:
     """Raise the setpoint through the target while x, y and heading keep following it.
 
     The integral of the lateral error is frozen, and the height is not corrected
@@ -71,7 +71,7 @@ def contact_evidence_text(c: Context) -> str:
 PERCH = PhaseDefinition(
     phase=Phase.PERCH,
     maneuver=Maneuver(presses_against_target=True),
-    act=act,
+    act=act_in_perch,
     exits=(
         back_off_row(
             "beside-the-magnet",

@@ -18,7 +18,7 @@ from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_falling_vehicle,
-    choose_catch_setpoint_above_vehicle_m,
+    choose_catch_setpoint_height_above_vehicle_m,
     end_press,
     forget_contact_when_below,
 )
@@ -34,7 +34,7 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_THRUST_TO_HOVER_RATIO_WITHOUT_CATCH = 0.85
+MIN_THRUST_TO_HOVER_RATIO_WITHOUT_FALL_CATCH = 0.85
 """Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
 MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
@@ -43,7 +43,7 @@ MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time that the vehicle recovers before the last failed attempt ends the flight, s."""
-UNLIMITED_SETPOINT_DESCENT_MPS = 10.0
+UNLIMITED_SETPOINT_DESCENT_RATE_MPS = 10.0
 """Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
 STEADY_AFTER_ATTEMPT = Condition[Context](
@@ -52,7 +52,7 @@ STEADY_AFTER_ATTEMPT = Condition[Context](
 """The vehicle is slower than `recover.steady_mps`."""
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_recover(state: PlannerState, previous_context: Context) -> PlannerState:
     """Record the last touch, and prepare a catch if the vehicle falls."""
     old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
@@ -60,7 +60,7 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     # A vehicle whose motors carry most of its weight hardly falls.
     falls = (
         VehicleDiagnosis.SLIPPED_OFF_CONTACT in diagnosis
-        and thrust < MIN_THRUST_TO_HOVER_RATIO_WITHOUT_CATCH * b.hover_thrust
+        and thrust < MIN_THRUST_TO_HOVER_RATIO_WITHOUT_FALL_CATCH * b.hover_thrust
     )
     belief = replace(
         state.belief,
@@ -72,8 +72,10 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
         state,
         belief=belief,
         motor_stop_commanded_at_s=None,
-        release_began_at_s=None,
-        catch_setpoint_above_vehicle_m=choose_catch_setpoint_above_vehicle_m(b.hover_thrust, thrust)
+        weight_transfer_began_at_s=None,
+        catch_setpoint_height_above_vehicle_m=choose_catch_setpoint_height_above_vehicle_m(
+            b.hover_thrust, thrust
+        )
         if falls
         else None,
         obstacle_blocked_at_z_m=z_m
@@ -105,7 +107,7 @@ def _find_gear_to_target_at_touch(
     return None
 
 
-def act(c: Context) -> Action:
+def act_in_recover(c: Context) -> Action:
     """Hold `descend_m` below the position where the attempt ended, in position mode throughout."""
     if (caught := catch_falling_vehicle(c)) is not None:
         return caught
@@ -118,10 +120,12 @@ def act(c: Context) -> Action:
     state, away = end_press(c)
     if away is not None:
         return state, away
-    if state.catch_setpoint_above_vehicle_m is not None:
+    if state.catch_setpoint_height_above_vehicle_m is not None:
         x, y, z = c.telemetry.position_m  # position where the fall has stopped
         entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
-        state = replace(state, catch_setpoint_above_vehicle_m=None, setpoint=None, entry=entry)
+        state = replace(
+            state, catch_setpoint_height_above_vehicle_m=None, setpoint=None, entry=entry
+        )
     z = state.entry.position_m[2] - recover.descend_m
     setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     if setpoint.z_m > z:
@@ -133,7 +137,9 @@ def act(c: Context) -> Action:
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
-    return fly_to(c, step_towards(c, setpoint, goal, max_down_mps=UNLIMITED_SETPOINT_DESCENT_MPS))
+    return fly_to(
+        c, step_towards(c, setpoint, goal, max_down_mps=UNLIMITED_SETPOINT_DESCENT_RATE_MPS)
+    )
 
 
 def has_recovered(c: Context) -> bool:
@@ -161,8 +167,8 @@ def unsteady_reason(c: Context) -> str:
 RECOVER = PhaseDefinition(
     phase=Phase.RECOVER,
     maneuver=Maneuver(is_in_free_air=True, is_camera_guided=True, retreats_after_attempt=True),
-    enter=enter,
-    act=act,
+    enter=enter_recover,
+    act=act_in_recover,
     conditions=(STEADY_AFTER_ATTEMPT,),
     exits=(
         land_row(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.mounting import MountingMonitor
+from perchctl.mission.belief.mounting import CameraMountingMonitor
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase
@@ -23,12 +23,12 @@ from perchctl.vehicle import PositionSetpoint
 
 MIN_CLEARANCE_BELOW_OBSTACLE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
-MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M = 0.2
+MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M = 0.2
 """Largest lateral distance flown to a target seen before, while the camera's mounting is
 unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
 
-def enter(state: PlannerState, previous_context: Context) -> PlannerState:
+def enter_search(state: PlannerState, previous_context: Context) -> PlannerState:
     """Start the search at the vehicle's last setpoint."""
     setpoint = previous_context.state.setpoint
     if setpoint is None:
@@ -37,7 +37,7 @@ def enter(state: PlannerState, previous_context: Context) -> PlannerState:
     return replace(state, entry=replace(state.entry, position_m=place_m, yaw_rad=setpoint.yaw_rad))
 
 
-def act(c: Context) -> Action:
+def act_in_search(c: Context) -> Action:
     """Wait, climb one step, turn one step and wait again, never above the height limit. If the
     target was seen before, search from below its last position instead."""
     search, state, b = c.planner.search, c.state, c.belief
@@ -55,7 +55,9 @@ def act(c: Context) -> Action:
         there = body_world_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_target_motion_undetermined
         x, y = (
-            _limit_move_before_mounting_check(b.mounting, (x, y), there) if unconfirmed else there
+            _limit_move_before_camera_mounting_check(b.mounting, (x, y), there)
+            if unconfirmed
+            else there
         )
         height = min(z, b.target.vehicle_world_z_when_touching_m - c.planner.ascend.near_m)
     else:
@@ -69,21 +71,21 @@ def act(c: Context) -> Action:
     return fly_to(c, step_towards(c, old, goal, max_up_mps=c.planner.ascend.speed_mps))
 
 
-def _limit_move_before_mounting_check(
-    mounting: MountingMonitor,
+def _limit_move_before_camera_mounting_check(
+    mounting: CameraMountingMonitor,
     start_world_xy_m: tuple[float, float],
     goal_world_xy_m: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), limited to `MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M`
-    from the vehicle's position at the last sighting of the target, or from `start_world_xy_m` if
-    there was none."""
+    """Return the goal, world x and y (m), limited to
+    `MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M` from the vehicle's position at the last
+    sighting of the target, or from `start_world_xy_m` if there was none."""
     if mounting.sightings:
         start_world_xy_m = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
             mounting.sightings[-1].vehicle_world_xy_m.imag,
         )
     dx, dy = goal_world_xy_m[0] - start_world_xy_m[0], goal_world_xy_m[1] - start_world_xy_m[1]
-    part = min(1.0, MAX_LATERAL_MOVE_BEFORE_MOUNTING_CHECK_M / max(math.hypot(dx, dy), 1e-6))
+    part = min(1.0, MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M / max(math.hypot(dx, dy), 1e-6))
     return start_world_xy_m[0] + part * dx, start_world_xy_m[1] + part * dy
 
 
@@ -97,8 +99,8 @@ def not_found_reason(c: Context) -> str:
 SEARCH = PhaseDefinition(
     phase=Phase.SEARCH,
     maneuver=Maneuver(is_in_free_air=True, is_camera_guided=True, requires_pictures=True),
-    enter=enter,
-    act=act,
+    enter=enter_search,
+    act=act_in_search,
     exits=(
         Transition(
             "found",
