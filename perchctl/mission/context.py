@@ -42,8 +42,8 @@ class Context:
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick. `true_for_s` of the condition says how long it
-        has done so."""
+        """What supports the vehicle in this tick. `true_for_s` of the condition that shows it says
+        for how long."""
         return find_support(self.belief)
 
     def true_for_s(self, condition: Condition[Any]) -> float:

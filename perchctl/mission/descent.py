@@ -1,10 +1,11 @@
-"""The only descent: for the planner's LANDING, the watchdog of a silent loop, and the rescue.
+"""The one descent for all cases: the planner's LANDING, a silent loop (watchdog), and the rescue.
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 A descent, a release or a motor stop that has begun is completed even if the evidence changes. A
-vehicle that still descends uses one of four policies. `descend` chooses it by which data is known
-and fresh, and by whether the magnet may hold the vehicle (see the table in docs/mission.md):
+vehicle that still descends uses one of four policies. `descend` chooses the policy according to
+which data is known and fresh, and whether the magnet may hold the vehicle (see the table in
+docs/mission.md):
 
 - by position setpoints, straight down;
 - level, by raw thrust controlled by the vertical speed, without a position;
@@ -12,9 +13,9 @@ and fresh, and by whether the magnet may hold the vehicle (see the table in docs
 - peeled off the magnet by a setpoint below; if the magnet does not let go, the weight is
   transferred to it.
 
-Only a catch climbs. The firmware's own landing follows a trajectory on its own clock and then stops
-the motors, wherever the vehicle is by then. It is therefore commanded only if a position shows the
-vehicle away from the ceiling.
+Only the catch of a fall commands a climb. The firmware's own landing follows a trajectory on its
+own clock and then stops the motors, wherever the vehicle is by then. That landing is therefore
+commanded only if a position shows the vehicle away from the ceiling.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M = 0.35
 falls."""
 PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
-weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
+weight to the magnet, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go
+late."""
 MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
 """Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
 MAX_LANDED_HEIGHT_M = 0.05
@@ -95,13 +97,13 @@ LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing commands, s. Without its notify message, the firmware does not execute a
 command (docs/firmware.md, "Order without notify")."""
 MIN_LANDING_COMMANDS = 3
-"""Number of landing commands before the telemetry can confirm that the vehicle lands."""
+"""Number of landing commands before the telemetry can confirm that the vehicle is landing."""
 MAX_LANDING_COMMANDS = 6
 """Largest number of landing commands."""
 ONBOARD_LANDING_PEAK_SPEED_MPS = 0.35
 """Peak speed of the quintic landing trajectory, m/s."""
 ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
-"""Time added to the quintic's duration, s."""
+"""Time added to the duration of the quintic landing trajectory, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
 MAX_ASSUMED_HEIGHT_DRIFT_M = 1.0
@@ -117,9 +119,9 @@ MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the descent without the mission's transition table. The watchdog calls it
-    when the loop has stopped responding, and the rescue after an exception. The first call begins
-    the landing. `state` is None if the planner has not run yet."""
+    """Fly one tick of the descent without the mission's transition table. The watchdog calls this
+    function when the loop has stopped responding, and the rescue calls it after an exception. The
+    first call begins the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
@@ -127,8 +129,8 @@ def step_landing(
 
 
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
-    """Store in the state what later ticks need to know of `command` (raw thrust, time, end of the
-    thrust check), and return both as the result of the tick."""
+    """Store in the state what later ticks need to know about `command` (raw thrust, time, end of
+    the thrust check), and return both as the result of the tick."""
     order = state.commanded_raw_thrust
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
@@ -179,8 +181,8 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     if vehicle_world_z_at_last_contact_m is None and (
         previous_state.phase is Phase.PERCH or pressed_unseen
     ):
-        # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
-        # ceiling. It counts as free only after a sighting from below.
+        # The vehicle may be within the magnet's reach, even below a sheet that hangs from an unseen
+        # ceiling. The vehicle counts as free only after a sighting from below.
         vehicle_world_z_at_last_contact_m = tel.position_m[2]
     # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
     state = move_setpoint_to_vehicle(Context(state))
@@ -230,11 +232,11 @@ def act_in_landing(c: Context) -> Action:
 def descend(c: Context) -> Action:
     """Descend by one of four policies.
 
-    - Level, by raw thrust: without a position. With the target as the positioning system, also from
-      `landing.handover_m` down, because the firmware's own landing would follow the camera's
+    - Level, by raw thrust: without a position. With the target as the positioning system, also
+      below `landing.handover_m`, because the firmware's own landing would follow the camera's
       estimate to a floor of unknown height.
-    - Peel off: within the magnet's reach, lower the setpoint until the vehicle comes off. If it
-      does not, transfer its weight to the magnet.
+    - Peel off: within the magnet's reach, lower the setpoint until the vehicle comes off. If the
+      vehicle does not come off, transfer its weight to the magnet.
     - By setpoints: with a position, down to `landing.handover_m`.
     - The firmware's own landing: below that height, or at once if height, telemetry or loop are
       unreliable.
@@ -400,9 +402,9 @@ def make_onboard_landing_command(
     """Return the command for the firmware's own landing from height `vehicle_world_z_m`, a quintic
     from rest to rest.
 
-    The motors stop at the end of the trajectory. Its goal is therefore below the ground by more
-    than the estimated height may have drifted during `time_in_flight_s`, and never above the
-    vehicle.
+    The motors stop at the end of the trajectory. The goal of the trajectory is therefore below the
+    ground by more than the estimated height may have drifted during `time_in_flight_s`, and never
+    above the vehicle.
     """
     drifted_m = min(
         MAX_ASSUMED_HEIGHT_DRIFT_M,
@@ -471,8 +473,8 @@ def _command_onboard_landing(c: Context) -> Action:
 
 
 def _transfer_weight_to_magnet(c: Context) -> Action:
-    """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than a perch
-    does."""
+    """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than in a
+    perch."""
     return transfer_weight_by_raw_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
 
 

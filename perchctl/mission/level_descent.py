@@ -6,7 +6,7 @@ setpoint. Then
 
     T = T_h (1 - k (v + u + s)) / cos(tilt)
 
-is a proportional rate controller. The gain k falls with the age of v, otherwise the vehicle would
+is a proportional rate controller. The gain k falls with the age of v; otherwise, the vehicle would
 oscillate. With old telemetry and the target in view, v is the climb rate from pictures. A vehicle
 that does not sink gets less and less thrust until it sinks, the magnet lets go, or the floor is
 detected. Laterally, the vehicle leans against the wind and brakes
@@ -31,62 +31,66 @@ from perchctl.vehicle import RawThrust
 
 SINK_RATE_SETPOINT_MPS = 0.7
 """Sink rate setpoint, m/s. The gyroscope's offset moves the vehicle 2 m laterally in 4 s. Larger:
-the vehicle lands harder if the floor is not detected. Smaller: it lands further from the target's
-axis."""
+the vehicle lands harder if the floor is not detected. Smaller: the vehicle lands further from the
+target's axis."""
 NEAR_FLOOR_SINK_RATE_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
 MAX_NEAR_FLOOR_HEIGHT_M = 0.6
 """Height below which the vehicle sinks at `NEAR_FLOOR_SINK_RATE_SETPOINT_MPS`, m."""
 MAX_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS = 0.5
-"""Largest gain k from the error of the sink rate to the thrust, in shares of the hover thrust per
-m/s. Larger: the vehicle oscillates."""
+"""Largest gain k from the error of the sink rate to the thrust, as a fraction of the hover thrust
+per m/s. Larger: the vehicle oscillates."""
 MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS = 0.2
-"""Smallest gain k, with old telemetry, in shares of the hover thrust per m/s."""
+"""Smallest gain k, used with old telemetry, as a fraction of the hover thrust per m/s."""
 SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M = 0.06
-"""Product of the gain k and the age of the vertical speed, between the smallest and the largest
-gain."""
+"""Product of the gain k and the age of the vertical speed, as long as k is between its smallest and
+its largest value."""
 THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
 SINK_RATE_SETPOINT_BY_CAMERA_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
 MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS = 0.2
-"""Sink rate measured by pictures below which the vehicle does not sink, m/s; the error of single
-detections is half of it."""
+"""Sink rate measured from pictures below which the vehicle counts as not sinking, m/s; the error of
+single detections is half as large."""
 CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
-"""Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
-like a motion. Smaller: it drifts further."""
+"""Tilt per lateral speed measured from pictures, rad per m/s. Larger: the vehicle oscillates, since
+the tilt itself looks like a motion. Smaller: it drifts further."""
 SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
-"""Time at a constant setpoint after which no speed remains, s."""
+"""Time at a constant setpoint after which the vehicle has come to rest, s."""
 THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.25
-"""Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
+"""Rate at which the thrust of a vehicle that does not sink is reduced, as a fraction of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
 THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S = 0.1
-"""Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
-the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
+"""Rate at which the thrust is reduced in a descent by pictures, as a fraction of the hover thrust
+per second; pictures show only after a quarter of a second that the vehicle sinks. Larger: the
+vehicle falls at first. Smaller: the vehicle stands on the floor for longer with its motors
+running."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
-"""Sink rate below which the vehicle does not sink, m/s."""
+"""Sink rate measured by telemetry below which the vehicle counts as not sinking, m/s."""
 MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
-"""Smallest commanded thrust, as a share of the hover thrust."""
+"""Smallest commanded thrust, as a fraction of the hover thrust."""
 MIN_TILT_COSINE_TO_COMPENSATE_THRUST = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_GAIN_RAD_PER_MPS = 0.25
-"""Lean per lateral speed."""
+"""Tilt per lateral speed, rad per m/s."""
 MAX_CAMERA_VELOCITY_AGE_S = 0.5
-"""Oldest lateral speed from pictures that the vehicle brakes, s. Larger: after the last picture it
-keeps leaning against a speed that is gone. Smaller: a few lost pictures end the braking."""
+"""Largest age of a lateral speed from pictures that the vehicle still brakes, s. Larger: after the
+last picture, the vehicle keeps leaning against a speed that no longer exists. Smaller: a few lost
+pictures end the braking."""
 MAX_BRAKE_TILT_RAD = 0.22
-"""Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
+"""Largest tilt that brakes the lateral speed, rad; it costs 2.5 % of the thrust."""
 MAX_WIND_COMPENSATION_TILT_RAD = 0.2
-"""Largest lean against the wind, rad: a wind of 6 m/s. Larger: an impact or a wrong bias moves the
-vehicle far off."""
+"""Largest tilt against the wind, rad; it balances a wind of 6 m/s. Larger: an impact or a wrong
+bias moves the vehicle far off."""
 MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S = 0.2
-"""Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
+"""Age of the lateral speed above which the vehicle brakes less, s; otherwise it would oscillate."""
 INITIAL_LATERAL_VELOCITY_SIGMA_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
 LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 = 0.1
-"""Growth of that uncertainty, m/s per second: an attitude error of 0.01 rad adds 0.1."""
+"""Growth of the lateral speed's uncertainty, m/s per second: an attitude error of 0.01 rad adds
+0.1."""
 MAX_LATERAL_VELOCITY_SIGMA_MPS = 0.3
 """Largest uncertainty of the lateral speed, m/s."""
 MAX_VISUAL_ATTITUDE_BIAS_AGE_S = 6.0
@@ -94,37 +98,39 @@ MAX_VISUAL_ATTITUDE_BIAS_AGE_S = 6.0
 MIN_SPECIFIC_FORCE_IF_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
 MAX_SUPPORTED_TO_HOVER_THRUST_RATIO = 0.88
-"""Largest thrust at which a vehicle that reads 1 g must be resting on something, as a share of the
-hover thrust."""
+"""Largest thrust at which a vehicle that reads 1 g must be resting on something, as a fraction of
+the hover thrust."""
 MAX_SPECIFIC_FORCE_IF_AIRBORNE_G = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
 TOUCHDOWN_TO_HOVER_THRUST_RATIO = 0.5
-"""Thrust right after the floor was detected, as a share of the hover thrust."""
+"""Thrust right after the floor was detected, as a fraction of the hover thrust."""
 TOUCHDOWN_THRUST_DURATION_S = 0.25
-"""Time for which that thrust lasts, s; an impact within this time belongs to the touchdown."""
+"""Time for which the reduced thrust lasts after the floor was detected, s; an impact within this
+time belongs to the touchdown."""
 MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
-"""Height below which an impact from below is the floor's, m."""
+"""Height below which an impact from below is that of the floor, m."""
 TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
-"""Time beyond the expected duration after which the vehicle has landed or hangs, s."""
+"""Time beyond the expected duration of a descent after which the vehicle must have landed or be
+hanging, s."""
 TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
-"""The same margin without a measured vertical speed, s."""
+"""Value of `TOUCHDOWN_OVERDUE_MARGIN_S` without a measured vertical speed, s."""
 MAX_DESCENT_BY_SETPOINTS_DURATION_S = 1.5
-"""Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
-its own estimate, s."""
+"""Time for which a vehicle with old telemetry and an imprecise hover thrust descends by setpoints,
+using its own estimate, s."""
 MIN_MEAN_DESCENT_SINK_RATE_MPS = 0.35
-"""Least mean speed of the descent, m/s."""
+"""Smallest mean speed of the descent, m/s."""
 MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M = 0.1
-"""Distance of the vehicle below its contact from which the magnet has let go, m. Larger: a vehicle
-that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to
-have come off."""
+"""Distance of the vehicle below its contact beyond which the magnet has let go, m. Larger: a
+vehicle that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle
+seems to have come off."""
 MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, at which the magnet
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
 MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA = 0.75
-"""Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
-in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
-Smaller: the motors run on the floor for longer."""
+"""Fraction of the hover thrust below which a vehicle that does not move in the pictures must be
+standing on the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks
+like the floor. Smaller: the motors run on the floor for longer."""
 MAX_THRUST_RAMP_INTEGRATION_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
@@ -168,7 +174,7 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
 
 def should_wait_for_climb_rate(c: Context) -> bool:
     """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
-    setpoints are then better, for at most `MAX_DESCENT_BY_SETPOINTS_DURATION_S`."""
+    in that case, setpoints are better, for at most `MAX_DESCENT_BY_SETPOINTS_DURATION_S`."""
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
@@ -371,14 +377,14 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     heading.
 
     The lateral reading of the accelerometer is the air's force per mass w, m/s^2, because the
-    thrust acts along the body's z axis. To balance it, the thrust needs the lateral part -w. The
-    estimated attitude is wrong by b / g, where b is the bias of accelerometer and attitude. The
-    estimated lean must therefore be (b - w) / g.
+    thrust acts along the body's z axis. To balance this force, the thrust needs the lateral part
+    -w. The estimated attitude is wrong by b / g, where b is the bias of accelerometer and attitude.
+    The estimated tilt must therefore be (b - w) / g.
 
     Both b and w are means over the time with a known position, so an offset of the accelerometer
     cancels. Means over less than `ACCELERATION_BIAS_TIME_CONSTANT_S` have less weight. Means from
-    wrong positions have none, and the bias that pictures have shown recently is used instead. The
-    present reading is not used, since most of it is the drag of the vehicle's own motion, which
+    wrong positions have no weight, and the bias that pictures have shown recently is used instead.
+    The present reading is not used, since most of it is the drag of the vehicle's own motion, which
     brakes it.
     """
     b = c.belief

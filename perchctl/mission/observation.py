@@ -42,7 +42,7 @@ class Observation:
     camera_problem: str | None = None  #: None, or one sentence
     link_problem: str | None = None  #: None, or one sentence
     battery_reading_age_s: float = 0.0  #: age of the newest battery voltage
-    #: the state estimate moved further than any flight could
+    #: the state estimate moved further than the vehicle could have flown
     has_estimated_position_jumped: bool = False
     heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
     tick_start_delay_s: float = 0.0  #: delay of the start of this tick
@@ -58,7 +58,7 @@ class Observation:
     #: why the last target in view belongs to another vehicle
     target_refusal_reason: str | None = None
     external_position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
-    #: why no external position is sent; None while they are
+    #: why no external position is sent; None while positions are sent
     external_position_problem: str | None = None
     #: distance from the estimate to the newest sighting; 0 if it was accepted
     rejected_sighting_to_estimate_distance_m: float = 0.0

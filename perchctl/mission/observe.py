@@ -19,7 +19,7 @@ def observe(
     of a falling vehicle is cancelled. After a jump of the estimate, the remembered positions move
     with it."""
     if has_tick_gap(state.belief, obs, profile):
-        # The setpoint of a catch is far above; keeping it would make the vehicle press.
+        # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press.
         setpoint = state.setpoint if state.catch_setpoint_height_above_vehicle_m is None else None
         state = replace(
             state,

@@ -49,7 +49,7 @@ class Phase(Enum):
         return self in FINAL_PHASES
 
 
-# Sets of phases in which rows apply. The first ones are defined by the phases they exclude, so that
+# Sets of phases in which rows apply. The first sets are defined by the phases they exclude, so that
 # the most severe rows apply in a new phase by default.
 FINAL_PHASES = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 """Final phases."""
@@ -62,9 +62,10 @@ PRE_CONTACT_PHASES = PRE_LANDING_PHASES - {Phase.COMPLETE}
 CAMERA_GUIDED_PHASES = frozenset(
     {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER, Phase.HOVER}
 )
-"""Phases in which the camera guides the vehicle: their maneuver is `is_camera_guided`."""
+"""Phases in which the camera guides the vehicle: their maneuver has `is_camera_guided` set."""
 FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
-"""Phases in which nothing but air should touch the vehicle: their maneuver is `is_in_free_air`."""
+"""Phases in which nothing but air should touch the vehicle: their maneuver has `is_in_free_air`
+set."""
 PHASES_IN_WHICH_MAGNET_MAY_ATTACH = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
 PUBLISHED_METHOD_PHASES = (
@@ -125,7 +126,8 @@ _EXIT_CODES: dict[Outcome, int] = {
 
 class VehicleDiagnosis(Flag):
     """What a transition asserts about the vehicle, in addition to its reason. The next phase starts
-    from it. Code that needs such a fact tests the diagnosis, never the name of a row."""
+    from this diagnosis. Code that needs such a fact tests the diagnosis, never the name of a
+    row."""
 
     NONE = 0
     BLOCKED_BY_OBSTACLE = auto()
@@ -145,13 +147,14 @@ class VehicleDiagnosis(Flag):
     PROFILE_MAY_BE_WRONG = auto()
     """The profile's camera or positioning section may be wrong and should be checked."""
     RETURNING_TO_HOVER_HEIGHT = auto()
-    """A hover has sunk below its place, and continues once the vehicle has climbed back."""
+    """The vehicle has sunk below its hover position; the hover continues once it has climbed
+    back."""
     LANDING_UNCONFIRMED = auto()
     """The end of the landing could not be confirmed in time."""
 
 
 class OperatorRequest(IntEnum):
-    """The operator's command, which never decreases: `LAND`, then `CUT_MOTORS`."""
+    """The operator's request, which can only escalate: `LAND`, then `CUT_MOTORS`."""
 
     NONE = 0
     LAND = 1

@@ -1,12 +1,12 @@
 """The perching planner: `step_mission(state, observation, profile) -> (state, command)`.
 
-Pure: it uses no clock and no input but its arguments, so a log replays to identical commands. One
-tick:
+The planner is pure: it uses no clock and no input other than its arguments, so replaying a log
+yields identical commands. One tick:
 
     observation ──> belief ──> decision (table) ──> action (phase) ──> command
 
-For each command, consider that it may be the last packet that arrives. After a position setpoint
-without a successor, the firmware levels out after 0.5 s and cuts the motors after 2 s
+Each command is chosen as if it were the last packet to arrive. If nothing follows a position
+setpoint, the firmware levels the vehicle after 0.5 s and cuts the motors after 2 s
 (docs/firmware.md, "When setpoints stop").
 """
 
@@ -101,8 +101,8 @@ def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) ->
 def _enter_phase(c: Context, row: Transition) -> PlannerState:
     """Return the state after the transition of `row` into the next phase."""
     state = c.state
-    # A commanded press has wound up the integrators, whatever thrust is reported. A fall that is
-    # being caught runs at full thrust without pressing.
+    # A commanded press has wound up the integrators, whatever thrust is reported. A vehicle whose
+    # fall is being caught runs at full thrust without pressing.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
     presses_against_target = state.phase is Phase.PERCH or is_pressing(c.belief)
     new = replace(

@@ -62,8 +62,8 @@ class Event:
         obs: Observation,
         profile: Profile,
     ) -> list[Event]:
-        """Return the events of one tick; `previous_state` is the previous state, None in the first
-        tick."""
+        """Return the events of one tick; `previous_state` is the planner's state before the tick,
+        None in the first tick."""
         events: list[Event] = []
         if previous_state is None:
             previous_state = PlannerState.initial_on_ground(obs, profile)
@@ -101,7 +101,7 @@ class SentCommand:
     """A command that was handed to the link outside the loop's ticks, at `t_s` on the loop's clock.
     Whether it arrived is unknown.
 
-    `sender` is ``watchdog`` while the loop does not respond, also for the operator's stop;
+    `sender` is ``watchdog`` while the loop does not respond, including for the operator's stop;
     ``rescue`` after an error; ``reconnect`` for a command repeated after a lost link; ``preflight``
     for arming a vehicle that does not arm itself; ``farewell`` for disarming it, and for the zero
     setpoint that closes the link.
@@ -149,7 +149,8 @@ class TickInputs:
     is_camera_source_live: bool = True
     is_detection_requested: bool = True  # the frame was meant to be searched for markers
     sends_sightings_as_position: bool = True  # sightings are the vehicle's external position
-    has_discarded_sightings: bool = False  # earlier ones, because positions had diverged
+    # earlier sightings were discarded because positions had diverged
+    has_discarded_sightings: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,8 +262,8 @@ class Tick:
 
 class Watcher(Protocol):
     """Receiver of ticks and events: flight log, panel or live page. A watcher that raises an
-    exception is detached, and the flight continues without it; its attribute `name` appears in the
-    message."""
+    exception is detached, and the flight continues without it; the watcher's attribute `name`
+    appears in the message."""
 
     def tick(self, tick: Tick) -> None:
         """Handle a flown tick."""

@@ -1,8 +1,8 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
 In position mode, the onboard controller never goes below `MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw
-thrust continues down to motors at rest (docs/firmware.md, "Release in raw mode"): the whole weight
-is transferred to the magnet and monitored before the motors are stopped.
+thrust can be reduced until the motors stand still (docs/firmware.md, "Release in raw mode"): the
+whole weight is transferred to the magnet and monitored before the motors are stopped.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
 MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M = 0.08
-"""Distance of the vehicle below the contact from which it has left it, m."""
+"""Distance below the contact beyond which the vehicle has left it, m."""
 MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
 """Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
 the vehicle."""
@@ -31,14 +31,15 @@ INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
 """Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
 INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M = 0.25
-"""The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
+"""Distance of the setpoint below a vehicle that has left the contact, m, to unwind the onboard
+integrators. Larger: the vehicle falls."""
 PRESS_END_TIMEOUT_S = 4.0
-"""Time after which `end_press` ends, whether or not the vehicle has come off, s."""
+"""Time after which `end_press` gives up, even if the vehicle has not come off, s."""
 
 # --- release ---
 MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
-"""Share of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down to
-which the raw thrust of a press is lowered."""
+"""Fraction of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down
+to which the raw thrust of a press is lowered."""
 EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the commanded one, s."""
 
@@ -57,7 +58,7 @@ CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
 MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO = 0.5
-"""Share of hover thrust above which the motors count as running."""
+"""Fraction of hover thrust above which the motors count as running."""
 MIN_FALL_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
 MAX_FALL_CATCH_DURATION_S = 2.0
@@ -161,8 +162,8 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.
 
 
 def hold_contact_by_position(c: Context) -> Action:
-    """Hold by position while the telemetry is old, to stay in contact or to catch an undetected
-    fall."""
+    """Hold by position control while the telemetry is old, to stay in contact or to catch an
+    undetected fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
@@ -218,8 +219,9 @@ def stop_motors(c: Context) -> Action:
 def choose_catch_setpoint_height_above_vehicle_m(
     hover_thrust: float, reported_thrust: float
 ) -> float:
-    """Return the distance, m, at which a setpoint above a falling vehicle catches it, given its
-    present `reported_thrust`."""
+    """Return the height, m, of the setpoint above a falling vehicle that catches the fall. The
+    height depends on whether the motors turn, which the reported and the hover thrust (0..65535)
+    show."""
     turning = reported_thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
     return (
         CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M

@@ -33,13 +33,13 @@ MIN_REPORTED_LATENCY_ERROR_S = 0.02
 """Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
 oscillate by centimetres."""
 MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
-"""Rotation error above which the report gives advice, deg: 35 mm at 1 m, more than the cone of an
-ascent allows."""
+"""Rotation error above which the report gives advice, deg: 2 deg are 35 mm at 1 m, more than the
+cone of an ascent allows."""
 
 
 def find_transition_diagnosis(transition_name: str) -> VehicleDiagnosis:
     """Return the diagnosis of the built-in row called `transition_name`; logs store that name.
-    `NONE` for any other name, such as that of your own row."""
+    `NONE` for any other name, such as the name of one of your own rows."""
     return next(
         (row.diagnosis for row in TABLE if row.name == transition_name), VehicleDiagnosis.NONE
     )
@@ -134,7 +134,7 @@ class CameraFindings:
 
 
 def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
-    """True if the difference exceeds both the threshold and 1.96 `sigma`, the half width of its 95
+    """True if the difference exceeds both the threshold and 3.92 `sigma`, the full width of its 95
     % interval."""
     return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT_INTERVAL * sigma)
 
@@ -265,7 +265,7 @@ def report_rest(
 def find_touchdown(c: Context) -> Touchdown | None:
     """Return the newest impact from below if it may be a touchdown, else None.
 
-    The speed is that of the state estimate if it is trusted, otherwise that of the dead reckoning.
+    The speed comes from the state estimate if that is trusted, otherwise from dead reckoning.
     """
     b = c.belief
     tel, imu, dead_reckoning = c.telemetry, b.imu, b.dead_reckoning

@@ -15,12 +15,12 @@ MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
 estimate."""
 MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
-"""Height, at the start of a descent or now, above which it distinguishes hanging from standing,
+"""Height, at the start of a descent or now, above which a vehicle cannot be standing on the floor,
 m."""
 MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
-"""Height below which the vehicle stands, m."""
+"""Height up to which a vehicle with its motors off stands on the floor, m."""
 MAX_DESCENT_IF_STILL_HANGING_M = 0.15
-"""Descent below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
+"""Height loss below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
 table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
 

@@ -1,8 +1,8 @@
 """The rows of the table that apply in many phases, most severe first.
 
-They come before the exits of each phase: operator commands, a locked or tumbled vehicle, a lost
-link, old telemetry, unreliable positions and pictures, limits and the battery; then a magnet that
-catches early, and obstacles.
+These rows come before the exits of each phase: operator commands, a locked or tumbled vehicle, a
+lost link, old telemetry, unreliable positions and pictures, limits and the battery; then a magnet
+that catches early, and obstacles.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ MAX_DISTANCE_FROM_SETPOINT_AT_LOW_HEIGHT_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
 `MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
 MAX_DISTANCE_FROM_SETPOINT_IN_LANDING_M = 0.4
-"""The same distance during a landing, m."""
+"""Lateral distance from the setpoint at which positions have diverged during a landing, m."""
 MAX_DISTANCE_FROM_SETPOINT_M = 0.8
-"""The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
-reaches the walls."""
+"""Lateral distance from the setpoint at which positions have diverged in all other cases, m:
+further than any draught moves the vehicle. Larger: the vehicle reaches the walls."""
 DISTANCE_FROM_SETPOINT_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the limit on the lateral distance from the setpoint with the target as the position
 source, in m per second of the camera latency's standard deviation: pictures that are 0.1 s later
@@ -82,24 +82,24 @@ ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
 MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS = 0.35
-"""Climb rate beyond that of the setpoint in the ascent which only such an oscillation reaches, m/s;
-flights with prompt positions exceed it by 0.1. Larger: the vehicle strikes the target. Smaller: a
-gust ends the flight."""
+"""Excess of the climb rate over that of the setpoint in the ascent which only an oscillation of
+position control reaches, m/s; in flights with prompt positions, the excess is 0.1. Larger: the
+vehicle strikes the target. Smaller: a gust ends the flight."""
 TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
 THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S = 2.0
 """Time at full thrust after which no thrust remains for a press, s."""
 HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
-"""Time after which the magnet has been distinguished from other supports, s."""
+"""Time that it takes to distinguish the magnet from other supports, s."""
 MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
 MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M = 0.3
-"""Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
-position control moves the vehicle further off. Smaller: an oscillation ends the flight."""
+"""Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
+position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
 MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S = 0.35
-"""Age of the newest position, including the latency, at which contradicting sightings are not a
-single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection ends
-the flight."""
+"""Age of the newest position, including the latency, at which contradicting sightings can no longer
+be a single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection
+ends the flight."""
 
 
 # --- Reliability of position, pictures and mounting ---
@@ -192,8 +192,8 @@ def divergence_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position has arrived for `positioning.land_s`. True earlier if the estimate is
-    useless: after an impact or gust that no sighting has corrected, because of its variance, or
+    """True if no position has arrived for `positioning.land_s`. Also true earlier if the estimate
+    is useless: after an impact or gust that no sighting has corrected, because of its variance, or
     because sightings contradict it."""
     b = c.belief
     if b.position_correction_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
@@ -231,7 +231,7 @@ def wrong_camera_latency_reason(c: Context) -> str:
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s
     found = f"the pictures are {1e3 * (assumed_s + error_s):.0f} ms old"
-    if not b.is_telemetry_fresh:  # with late telemetry, pictures in time seem late
+    if not b.is_telemetry_fresh:  # with late telemetry, pictures that are on time seem late
         return (
             f"the times of pictures and telemetry disagree by {1e3 * error_s:.0f} ms; "
             f"the newest telemetry is {b.telemetry_age_s:.1f} s old"
@@ -323,7 +323,8 @@ def is_thrust_insufficient_for_press(c: Context) -> bool:
 
 def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
     """Return the outcome if the supervisor has locked a vehicle that hangs. HOVERED becomes SAFETY,
-    since a hover must end on the floor; any other outcome stays; without one, it is PERCHED."""
+    since a hover must end on the floor; any other outcome is kept; without an outcome, the result
+    is PERCHED."""
     return (
         Outcome.SAFETY
         if previous_outcome is Outcome.HOVERED

@@ -1,9 +1,9 @@
 """Compute position setpoints: step towards a goal, apply learned corrections, and enforce all
 limits.
 
-The firmware flies to a setpoint p with a cascade of PID controllers. On top of it, for the
-reference r, the vehicle's position x (height z), its velocity v, and the acceleration a that it
-leans into:
+The firmware flies to a setpoint p with a cascade of PID controllers. On top of that cascade,
+perchctl computes p from the reference r, the vehicle's position x (height z), its velocity v, and
+the acceleration a due to its tilt:
 
     p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
                                      - TILT_ACCELERATION_DAMPING_S2 a))                    lateral
@@ -11,7 +11,7 @@ leans into:
 
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
 on the whole chain from setpoint to position: a setpoint acts through the attitude, so the present
-lean becomes velocity a tenth of a second later. Feedback of the lean permits higher gains without
+tilt becomes velocity a tenth of a second later. Feedback of the tilt permits higher gains without
 oscillation, but only while the telemetry is prompt. So `gain` is the smaller of two factors: one
 grows from 0 to 1 as the target comes closer, and one falls from 1 to 0 as the telemetry ages. At 0,
 the vehicle is left to its onboard controllers, which act without that delay.
@@ -31,7 +31,7 @@ from perchctl.vehicle import Command, PositionSetpoint
 Action = tuple[PlannerState, Command]
 
 HEIGHT_ERROR_GAIN = 1.5
-"""Gain on the height error, against the overshoot of the onboard integrator. Larger: the vehicle
+"""Gain on the height error, to counter the overshoot of the onboard integrator. Larger: the vehicle
 oscillates."""
 HEIGHT_DAMPING_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
@@ -39,13 +39,13 @@ MAX_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
 LATERAL_ERROR_GAIN = 3.0
 """Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate.
-Smaller: the thrust's fluctuation moves the vehicle further."""
+Smaller: fluctuations of the thrust move the vehicle further."""
 LATERAL_DAMPING_S = 1.1
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
-velocity moves the vehicle. Smaller: it oscillates."""
+velocity moves the vehicle. Smaller: the vehicle oscillates."""
 TILT_ACCELERATION_DAMPING_S2 = 0.13
-"""Damping of the lateral correction by the acceleration that the vehicle leans into, s^2. Larger:
-the vehicle answers an error late. Smaller: it oscillates with these gains."""
+"""Damping of the lateral correction by the acceleration due to the vehicle's tilt, s^2. Larger: the
+vehicle responds late to an error. Smaller: the vehicle oscillates with these gains."""
 MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
 """Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: late
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
@@ -62,8 +62,8 @@ MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M = 0.05
 MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
 """Largest lateral position error that the integral still accumulates while the vehicle moves, m."""
 MAX_LATERAL_INTEGRAL_M = 0.4
-"""Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
-further. Smaller: a wind keeps the vehicle off its target permanently."""
+"""Largest integral, m; it balances a wind of 5 m/s. Larger: the setpoint of a vehicle that is held
+winds up further. Smaller: a wind keeps the vehicle off its target permanently."""
 MAX_SPEED_HOVERING_IN_PLACE_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
@@ -73,7 +73,7 @@ vehicle further off."""
 HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
 """Sink rate commanded during a hold while the camera does not see the target, m/s."""
 MIN_HELD_SETPOINT_HEIGHT_M = 0.3
-"""Height above the ground at which that sink ends, m."""
+"""Height above the ground at which a held setpoint stops sinking, m."""
 
 
 def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
@@ -186,7 +186,7 @@ def update_lateral_integral(
 
 def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     """Return the state with its setpoint moved to the vehicle's position, if it hovers in place.
-    The integral takes up the difference, so that the command that is sent does not step.
+    The integral absorbs the difference, so that the command that is sent does not jump.
 
     A vehicle that moves keeps its setpoint and integral. Without a setpoint, or with diverged
     positions, the integral becomes zero.
@@ -236,8 +236,8 @@ def correct_setpoint(
 
 def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Return the shift (x, y) of the setpoint, m, world axes, that adds feedback of lateral
-    position, velocity and lean to that of the onboard controllers; zero far from the target or with
-    old telemetry."""
+    position, velocity and tilt to the feedback of the onboard controllers; zero far from the target
+    or with old telemetry."""
     near = (
         LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
     ) / LATERAL_FEEDBACK_FADE_IN_DISTANCE_M
@@ -269,7 +269,7 @@ def _lateral_error_and_velocity(
     c: Context, reference: PositionSetpoint
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
-    (x, y) in world axes. They come from pictures and lean while recent pictures show the target,
+    (x, y) in world axes. Both come from pictures and tilt while recent pictures show the target,
     otherwise from the state estimate. During take-off and landing, which do not follow the target,
     they always come from the state estimate."""
     lateral, tel, maneuver = c.belief.lateral_state, c.telemetry, c.belief.command_history.maneuver
@@ -277,8 +277,8 @@ def _lateral_error_and_velocity(
     if lateral is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
-    # The reference may still be on its way to the target. The offset is that of the gear as the
-    # vehicle heads now, and the reference's heading may differ.
+    # The reference may still be on its way to the target. The offset applies to the gear at the
+    # vehicle's present heading, and the reference's heading may differ.
     x_m, y_m = body_world_xy_under_target(c, tel.yaw_rad)
     return (
         reference.x_m - x_m + lateral.gear_to_target_world_xy_m[0],

@@ -20,7 +20,8 @@ class BatteryOutlook:
     """Predicted remaining time and attempts; None means unknown."""
 
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
-    # including the landing after the last one; None before the first sighting
+    # attempts that the battery allows, with the landing after the last one; None before the first
+    # sighting
     affordable_attempts: int | None = None
     consumed_charge_mah: float = 0.0  # charge consumed by the assumed current
     rest_v: float | None = None  # estimated resting voltage
@@ -43,15 +44,15 @@ class HoverErrors:
 
     An error is the hover position relative to the gear along x (forward), y (left) and z (up), m,
     in the level frame, and the heading error, rad, both from the filtered pose. The camera measures
-    them. An error of its calibration or mounting shifts the vehicle and the measurement alike, and
-    is therefore not included.
+    these errors. An error of the camera's calibration or mounting shifts the vehicle and the
+    measurement alike, and is therefore not included.
     """
 
     hover_began_at_s: float = 0.0  # start of the hover
     newest_frame_at_s: float = 0.0  # time of the newest of these frames
     frame_count: int = 0
     squared_error_sums_xyz_yaw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Sums of the squares of x, y, z and yaw."""
+    """Sums of the squared errors in x, y, z, m^2, and yaw, rad^2."""
 
     def with_error(
         self,
@@ -115,7 +116,7 @@ class PlannerState:
     search_step_began_at_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     lateral_integral_m: tuple[float, float] = (0.0, 0.0)
-    #: the phase began with the vehicle pressed at high thrust, and the press has not been ended
+    #: the phase began with the vehicle pressed at high thrust, and the press has not ended yet
     must_end_press: bool = False
     catch_setpoint_height_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
@@ -150,7 +151,8 @@ class PlannerState:
 
     @property
     def is_before_weight_transfer_and_motor_stop(self) -> bool:
-        """True until the release by raw thrust begins or the motors are stopped."""
+        """True until the weight transfer by raw thrust begins or the motors are commanded to
+        stop."""
         return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:

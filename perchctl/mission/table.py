@@ -89,8 +89,8 @@ TRANSITIONS_ALLOWED_FOR_OWN_ROWS = frozenset(
     if row.severity >= Severity.HOLD and not row.to.is_final
 ) | {(Phase.ALIGN, Phase.ALIGN, Severity.HOLD)}
 """Combinations of phase, next phase and severity allowed for your own rows: wait in ALIGN, or
-interrupt the mission as the built-in table does. None of them climbs, stops a motor, or proves a
-contact."""
+interrupt the mission as the built-in table does. None of these transitions climbs, stops a motor,
+or proves a contact."""
 
 
 def add_rows(
@@ -100,9 +100,10 @@ def add_rows(
     exits of the phases.
 
     A row of your own may wait in ALIGN, or lead to an earlier phase, to RECOVER or to LANDING
-    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`); in COMPLETE and LANDING, none applies. Raises InvalidValue
-    for a row that is not allowed, is not a valid `Transition`, or has a name that is taken. If a
-    function of a row raises in flight, InvalidValue names the row, and the vehicle lands.
+    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`). Your own rows do not apply in COMPLETE and LANDING. Raises
+    InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name that is
+    taken. If a function of a row raises in flight, InvalidValue names the row, and the vehicle
+    lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):

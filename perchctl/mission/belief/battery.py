@@ -2,9 +2,9 @@
 
 A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
 voltage as a function of its charge (`DISCHARGE_CURVE_REST_VOLTAGES_V`) and the current at full
-thrust (`PowerTrain`). It fits two parameters by least squares with exponential forgetting: the
+thrust (`PowerTrain`). Two parameters are fitted by least squares with exponential forgetting: the
 voltage sag at full thrust, and `true_to_counted_discharge_ratio`, the discharge rate of this
-battery divided by the rate counted from the assumed current:
+battery divided by the rate calculated from the assumed current:
 
     reading = rest voltage(charge) - sag * load
     d charge / dt = -true_to_counted_discharge_ratio * load * current / capacity
@@ -51,8 +51,8 @@ DISCHARGE_CURVE_REST_VOLTAGES_V = (
     4.1,
     4.2,
 )
-"""Resting voltage of a cell, V, at each charge in `DISCHARGE_CURVE_CHARGE_FRACTIONS` (0..1);
-slightly below the table in the firmware."""
+"""Resting voltage of a cell, V, at each charge in `DISCHARGE_CURVE_CHARGE_FRACTIONS` (0..1); the
+values are slightly below those in the firmware's table."""
 TYPICAL_FULL_THRUST_SAG_V = 0.63
 """Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
 battery could finish."""
@@ -62,42 +62,39 @@ late."""
 MIN_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
 TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.1
-"""Discharge rate of a typical battery, divided by the rate counted from the assumed current."""
+"""Discharge rate of a typical battery, divided by the rate calculated from the assumed current."""
 TRUE_TO_COUNTED_DISCHARGE_RATIO_SIGMA = 0.3
-"""Standard deviation of that ratio between batteries."""
+"""Standard deviation of the ratio of true to calculated discharge between batteries."""
 MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.0
-"""Lower bound of the fitted ratio."""
+"""Lower bound of the fitted ratio of true to calculated discharge."""
 MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO = 3.0
-"""Upper bound of the fitted ratio."""
+"""Upper bound of the fitted ratio of true to calculated discharge."""
 ONE_SECOND_MEAN_VOLTAGE_SIGMA_V = 0.02
-"""Standard deviation of one second of averaged voltage readings, V."""
+"""Standard deviation of the mean of the voltage readings over one second, V."""
 BATTERY_FIT_TIME_CONSTANT_S = 40.0
-"""Time constant with which the fit forgets old readings, s. Larger: the fit follows a change of
-temperature late."""
+"""Time constant with which the fit forgets old readings, s. Larger: the fit adapts late to a change
+in temperature."""
 REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
 THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
-"""Time constant with which the voltage reading follows a change of thrust, s."""
+"""Time constant with which the voltage reading follows a change in thrust, s."""
 MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE = 0.06
-"""Largest difference between the current load and the filtered load, as a share of full thrust. A
-reading with a larger difference belongs to an earlier thrust and is not used."""
+"""Largest difference between the present load and the filtered load, as a fraction of full thrust.
+With a larger difference, the voltage reading still reflects an earlier thrust and is not used."""
 MIN_CHARGE_FRACTION_FOR_COULOMB_COUNTING = 0.05
-"""Share of the full charge below which the discharge counted from the assumed current is not used:
-the voltage curve is so steep there that the readings alone determine the charge."""
+"""Fraction of the full charge below which the discharge calculated from the assumed current is not
+used: the voltage curve is so steep there that the readings alone determine the charge."""
 MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
-"""Smallest load, as a share of full thrust, at which a reading contributes to the fitted sag."""
+"""Smallest load, as a fraction of full thrust, at which a reading contributes to the fitted sag."""
 MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
-"""Time of readings under load that an estimate requires, s."""
-LOW_POWER_REPORT_DELAY_S = 5.0
-"""Time below the low-power voltage after which the firmware reports low power, s (source: power
-management). Larger: perchctl starts attempts that the battery cannot finish."""
+"""Total time of readings under load that an estimate requires, s."""
 MAX_BATTERY_READING_AGE_S = 1.0
-"""Age at which a voltage reading is no longer used, s."""
+"""Age beyond which a voltage reading is no longer used, s."""
 
 
 class SagModel(NamedTuple):
     """The two fitted parameters of the battery model: the voltage sag at full thrust, V, and the
-    true discharge rate divided by the rate counted from the assumed current."""
+    true discharge rate divided by the rate calculated from the assumed current."""
 
     full_thrust_sag_v: float
     true_to_counted_discharge_ratio: float
@@ -107,9 +104,10 @@ class NormalEquationSums(NamedTuple):
     """Weighted sums over the voltage readings: the normal equations of the least-squares fit.
 
     The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
-    `TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO` predict. The fit explains it by the thrust, as a share
-    of full thrust, times the deviation of the sag, plus the counted drop of the resting voltage
-    since take-off, V, times the deviation of the discharge ratio.
+    `TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO` predict. The fit models this error as a sum of two
+    products: the thrust, as a fraction of full thrust, times the deviation of the sag from its
+    typical value; and the drop of the resting voltage since take-off, V, calculated from the
+    assumed current, times the deviation of the discharge ratio.
     """
 
     thrust_squared: float = 0.0
@@ -127,18 +125,19 @@ class BatteryFit:
     """State of the battery fit after the newest reading.
 
     The fit has two unknowns: the voltage sag at full thrust, V, and the true discharge rate divided
-    by the rate counted from the assumed current. Charges are shares of the full charge; thrusts are
-    shares of full thrust.
+    by the rate calculated from the assumed current. Charges are fractions of the full charge;
+    thrusts are fractions of full thrust.
     """
 
     # resting voltage before take-off, estimated if the first reading was under load
     takeoff_rest_v: float | None = None
     coulomb_counted_discharge_fraction: float = 0.0  # charge consumed by the assumed current alone
-    # load, low-pass filtered with `THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S` as the reading is
+    # load after a low-pass filter with `THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S`, because the voltage
+    # reading lags in the same way
     lagged_thrust_fraction: float = 0.0
     mean_airborne_thrust_fraction: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
-    time_under_load_s: float = 0.0  # total time of readings under load
+    time_under_load_s: float = 0.0  # total time covered by readings under load
     time_since_battery_reading_s: float = 0.0  # time since the last reading
     normal_equation_sums: NormalEquationSums = ZERO_SUMS
 
@@ -152,7 +151,7 @@ class PowerTrain:
 
     Attributes:
         full_thrust_current_a: current of the four motors at full thrust, A; at lower thrust, the
-            current is assumed proportional to the thrust.
+            current is assumed to be proportional to the thrust.
         low_power_warning_v: voltage below which the firmware reports low power, V, unless
             `pm.lowVoltage` is set.
     """
@@ -162,11 +161,11 @@ class PowerTrain:
 
 
 BRUSHED_POWER_TRAIN = PowerTrain(full_thrust_current_a=4.4, low_power_warning_v=3.2)
-"""Drive of the vehicles with brushed motors, which arm themselves."""
+"""Power train of vehicles with brushed motors, which arm themselves."""
 BRUSHLESS_POWER_TRAIN = PowerTrain(full_thrust_current_a=7.3, low_power_warning_v=3.35)
 """The current of the brushless motors is not published. The value assumes the same current per
-newton as the brushed motors (0.80 N at full thrust, 0.48 N brushed). It is an upper bound because
-brushless motors are designed to be more efficient."""
+newton as for brushed motors (full thrust is 0.80 N brushless and 0.48 N brushed). It is an upper
+bound because brushless motors are designed to be more efficient."""
 
 
 def identify_power_train(telemetry: Telemetry) -> PowerTrain:
@@ -351,7 +350,7 @@ def _add_voltage_reading_to_sums(
 def full_thrust_discharge_fraction_per_s(
     battery_capacity_mah: float, power_train: PowerTrain
 ) -> float:
-    """Return the share of the full charge that one second of full thrust consumes."""
+    """Return the fraction of the full charge that one second of full thrust consumes."""
     return power_train.full_thrust_current_a / (3.6 * battery_capacity_mah)
 
 

@@ -1,9 +1,9 @@
 """The planner's belief about the vehicle: one frozen value per tick.
 
 `update_belief` computes it once per tick from the previous belief, the observation, the commands
-sent so far, and the profile. The belief makes no decisions and knows no phases. Quantities that
-follow from its fields are properties, computed on first access. Every claim has a variance or an
-age; an unknown one is infinite.
+sent so far, and the profile. The belief makes no decisions and does not depend on the mission
+phase. Quantities that follow from its fields are properties, computed on first access. Every
+estimate has a variance or an age, which is infinite while the estimate is unknown.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
 POSITION_SETTLING_TIME_AFTER_GAP_S = 0.5
-"""Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
-trusted before it has converged."""
+"""Time that the state estimate needs to converge once positions return after a gap, s. Smaller: the
+estimate is trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
-"""How much older than the camera's latency the newest external position may be while it still
-corrects the estimated velocity, s: three pictures at 30 per second. Larger: `has_uncorrected_gust`
-reacts to an impact later."""
+"""Largest age of the newest external position, in addition to the camera's latency, at which it
+still corrects the estimated velocity, s: three pictures at 30 per second. Larger:
+`has_uncorrected_gust` reacts to an impact later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
-"""Lateral speed that the vehicle gains without a sighting in an impact or gust, m/s; flights
-without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error counts
-as an impact."""
+"""Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
+flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
+counts as an impact."""
 GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
 """Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
 deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
 uncertain latency, impacts go unnoticed."""
 MAX_THRUST_REPORT_DELAY_S = 0.2
-"""Time within which the telemetry reports a commanded raw thrust, s. Smaller: late telemetry looks
-like a thrust that the vehicle does not follow."""
+"""Time within which the telemetry reports a commanded raw thrust, s. Smaller: with late telemetry,
+the vehicle seems to ignore the commanded thrust."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +85,14 @@ class Belief:
     # --- world frame of the state estimate, and how far to trust it ---
     takeoff_position_m: Vector | None = None  #: position where the flight started
     first_estimate_jump_at_s: float | None = None  #: first jump of the state estimate
-    world_frame_shift_in_tick_m: Vector = (
-        ZERO_VECTOR  #: motion of the estimate's world frame in this tick
-    )
+    #: shift of the estimate's world frame in this tick
+    world_frame_shift_in_tick_m: Vector = ZERO_VECTOR
     position_last_stale_at_s: float | None = None  #: last time at which the position was stale
-    #: external positions lead away from the setpoint and count as no evidence from then on
+    #: external positions have led the vehicle away from its setpoint and are no longer evidence
     is_position_diverged: bool = False
-    #: heading is so wrong that position control would leave its setpoint
+    #: heading is so wrong that position control would move the vehicle away from its setpoint
     is_heading_lost: bool = False
-    #: time since which only accelerometer and attitude are used
+    #: time at which the belief switched to accelerometer and attitude alone
     dead_reckoning_since_s: float | None = None
     #: height above the ground, integrated since `dead_reckoning_since_s`
     dead_reckoned_height_m: float = 0.0
@@ -101,7 +100,7 @@ class Belief:
     # --- motion, target and contact ---
     dead_reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     last_target_world_m: Array | None = None  #: target's world position in its last measured frame
-    target_position_scatter_m: float = 0.0  #: distance between the targets of successive frames
+    target_position_scatter_m: float = 0.0  #: scatter of the target's position from frame to frame
     #: vehicle's velocity from pictures alone
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
     #: Kalman filter of the lateral offset from the target
@@ -110,21 +109,21 @@ class Belief:
     #: low-passed `thrust_direction_world_xy` (time constant
     #: `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`)
     mean_thrust_direction_world_xy: tuple[float, float] = (0.0, 0.0)
-    #: height of the body where the magnet may hold it
+    #: height of the vehicle at which the magnet may hold it
     vehicle_world_z_at_last_contact_m: float | None = None
     gear_to_target_at_last_contact: GearToTargetDistance | None = None
-    #: time since which the gear is within the magnet's reach
+    #: time at which the gear came within the magnet's reach
     in_magnet_reach_since_s: float | None = None
     #: start time of each true condition
     condition_start_times_s: dict[Condition[Any], float] = field(default_factory=dict)
 
     # --- thrust and battery ---
     hover_thrust_estimate: HoverThrust = field(default_factory=HoverThrust)
-    #: thrust that the rotors produce, 0..65535; None before a sample
+    #: thrust that the rotors produce, 0..65535; None before the first sample
     rotor_thrust: float | None = None
-    #: time since which the reported thrust differs from the commanded one
+    #: time at which the reported thrust began to differ from the commanded one
     thrust_differs_from_command_since_s: float | None = None
-    #: last tick in which that difference was older than `MAX_THRUST_REPORT_DELAY_S`
+    #: last tick in which they had differed for longer than `MAX_THRUST_REPORT_DELAY_S`
     thrust_last_differed_from_command_at_s: float = -math.inf
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
@@ -332,7 +331,8 @@ class Belief:
             self.is_target_position_source and not self.can_descend_with_target_as_position_source
         ):
             return False
-        # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
+        # A descent by raw thrust needs a fresh vertical speed. Without one, only the firmware's own
+        # landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
         return not (self.is_heading_lost and (self.is_target_position_source or heard))
 
@@ -374,7 +374,7 @@ class Belief:
     @cached_property
     def thrust_direction_world_xy(self) -> tuple[float, float]:
         """Horizontal part (x, y) of the unit vector along the thrust, world axes. Its length is the
-        sine of the tilt, and it points to where the vehicle leans."""
+        sine of the tilt, and it points in the direction in which the vehicle leans."""
         tel = self.obs.telemetry
         level_x = math.sin(tel.pitch_rad) * math.cos(tel.roll_rad)
         level_y = -math.sin(tel.roll_rad)
@@ -386,8 +386,8 @@ class Belief:
         """Lateral acceleration (x, y) in world axes, m/s^2, from the tilt minus its mean (a
         low-pass filter with the time constant `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`). The mean
         tilt is assumed not to accelerate the vehicle: it balances the wind, an uneven mass
-        distribution, or an error of the estimated attitude. Wrong after a change of the wind, until
-        the mean has followed."""
+        distribution, or an error of the estimated attitude. The result is wrong after a change of
+        the wind, until the mean has settled."""
         (x, y), (mean_x, mean_y) = (
             self.thrust_direction_world_xy,
             self.mean_thrust_direction_world_xy,
@@ -444,9 +444,9 @@ class Belief:
     @cached_property
     def lateral_state(self) -> LateralState | None:
         """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, in
-        world axes, estimated from pictures and lean. None if the last pictures are too old or too
-        few. None, too, if they contradict the vehicle's motion: the camera may then be mounted
-        rotated, and feedback of this velocity would not damp the motion."""
+        world axes, estimated from pictures and tilt. None if the last pictures are too old or too
+        few. Also None if the pictures contradict the vehicle's motion: the camera may then be
+        rotated relative to the profile, and feedback of this velocity would not damp the motion."""
         if self.mounting.is_camera_mounting_wrong or self.obs.camera_imu_mismatch is not None:
             return None
         return self.lateral_offset_filter.predict(self.obs.t_s)
@@ -464,8 +464,8 @@ class Belief:
 
     @cached_property
     def does_camera_motion_match_vehicle(self) -> bool:
-        """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
-        the target is the positioning system, otherwise with its state estimate."""
+        """True if the motion in the pictures agrees with the vehicle's own motion: with its
+        accelerometer if the target is the positioning system, otherwise with its state estimate."""
         if self.is_target_position_source:
             return (
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None

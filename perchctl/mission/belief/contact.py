@@ -1,23 +1,25 @@
 """Evidence that something supports, presses or holds the vehicle.
 
-Without a force sensor, a contact shows in three readings together. A vehicle in the air accelerates
-by thrust minus weight. A supported or pressed vehicle reads 1 g and does not move, whatever its
-thrust. Thrust far from hover thrust, at 1 g and at rest, is therefore a contact: with more thrust
-the vehicle presses, with less something supports it. The vehicle's position and its maneuver then
-distinguish the magnet from the floor, and both from another object.
+The vehicle has no force sensor, so a contact is inferred from thrust, accelerometer and motion
+together. In the air, thrust minus weight accelerates the vehicle. A supported or pressed vehicle
+reads 1 g and does not move, whatever its thrust. A vehicle at rest that reads 1 g is therefore in
+contact if its thrust is far from hover thrust: with more thrust it presses, with less something
+supports it. The vehicle's position and its maneuver then distinguish the magnet from the floor, and
+both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`TARGET_CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and
-against an unknown object without a position (`IMU_SHOWS_SUPPORT`). The last one also covers too
-little thrust, by the same threshold below hover thrust as the other is above it:
-`MIN_PRESS_TO_HOVER_THRUST_RATIO` moves all of these, and `Support.AIR`. `HANGING`,
-`MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to support the vehicle
-(`is_thrust_too_low_to_fly`).
+against an unknown object without a position (`IMU_SHOWS_SUPPORT`). `IMU_SHOWS_SUPPORT` also covers
+too little thrust; that threshold is as far below hover thrust as the first one is above it. A
+change of `MIN_PRESS_TO_HOVER_THRUST_RATIO` therefore affects all of these conditions, and
+`Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to
+support the vehicle (`is_thrust_too_low_to_fly`).
 
-`find_support` says in one word what these conditions show: the vehicle flies, presses, hangs on the
-magnet, hangs on something else, stands, or it is unknown. How long the evidence has lasted is the
-condition's `true_for_s`; each row chooses its own dwell time by what a mistake would cost.
+`find_support` combines these conditions into one result: the vehicle flies, presses, hangs on the
+magnet, hangs on something else or stands, or its support is unknown. `true_for_s` returns how long
+a condition has lasted. Each row of the transition table has its own dwell time, chosen by what a
+mistake would cost.
 """
 
 from __future__ import annotations
@@ -33,28 +35,29 @@ from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
 MIN_PRESS_TO_HOVER_THRUST_RATIO = 1.08
-"""Reported thrust over hover thrust from which a vehicle at rest is pressing: more than five
-standard deviations of the hover thrust learned in quiet flight. Larger: a weak press goes
-undetected. Smaller: a gust or a sagging battery looks like a press."""
+"""Ratio of reported thrust to hover thrust at which a vehicle at rest counts as pressing: a margin
+of more than five standard deviations of the hover thrust learned in quiet flight. Larger: a weak
+press goes undetected. Smaller: a gust or a sagging battery looks like a press."""
 MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
-"""Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
-much the vehicle needs."""
+"""Fraction of full thrust above which the motors are saturated, so that the thrust no longer shows
+how much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
 MIN_PRESS_TO_COMMANDED_THRUST_RATIO = 0.99
-"""Reported thrust over the commanded thrust of a raw press from which the vehicle always counts as
-pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
+"""Ratio of reported to commanded thrust at which a vehicle that presses by raw thrust always counts
+as pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
 vehicle seems to press while it hovers."""
 MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS = 0.93
-"""Hover thrust, as a share of full thrust, above which the thrust left for a press is too small to
-prove one. Smaller: a press is never detected on a heavy vehicle."""
+"""Hover thrust, as a fraction of full thrust, above which too little thrust remains to prove a
+press. Smaller: a press is never detected on a heavy vehicle."""
 MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
-"""Share of hover thrust up to which thrust cannot hold the vehicle in the air; above it, the ground
-effect of the ceiling may."""
+"""Fraction of hover thrust up to which thrust cannot hold the vehicle in the air. With more thrust,
+the ground effect of the ceiling may hold it."""
 MAX_MOTORS_STOPPED_THRUST = 5000
 """Largest raw thrust, 0..65535, at which the motors stand still."""
 MIN_POSSIBLE_HOVER_THRUST = 1000
-"""Smallest reported thrust, 0..65535, that may be hover thrust; any vehicle's is far larger."""
+"""Smallest reported thrust, 0..65535, that may be hover thrust; the hover thrust of any vehicle is
+far larger."""
 
 # --- motion and position ---
 MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
@@ -70,28 +73,28 @@ MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
-"""Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
-climb is detected late."""
+"""Distance of the setpoint above a motionless vehicle beyond which something must be blocking it,
+m. Larger: a blocked climb is detected late."""
 GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
-"""Distance by which the touch itself moves the gear, m."""
+"""Standard deviation of the distance by which the touch itself moves the gear, m."""
 LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
-"""Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice what a
-settled one moves. Larger: a contact's offset is reported less precisely than it is known.
-Smaller: a vehicle that is pushed just before it touches is reported too precisely."""
+"""Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice that of a
+settled vehicle. Larger: the offset of a contact is reported as less precise than it is. Smaller: if
+the vehicle is pushed just before it touches, the offset is reported as more precise than it is."""
 DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
 MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M = 0.02
-"""Upward drift of the estimate in spite of which a slip is still detected, m."""
+"""Largest upward drift of the estimated height with which a slip is still detected, m."""
 MIN_DESCENT_TO_ACCEPT_FLOOR_M = 0.1
-"""Distance below its start at which a descent counts as under way, m."""
+"""Height loss beyond which a descending vehicle counts as having come down, m."""
 MAX_DESCENT_IF_HELD_AT_START_M = 0.1
-"""Distance from its start within which a vehicle in a descent may still be held there, m."""
+"""Height loss within which a descending vehicle may still be held where its descent began, m."""
 MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M = 0.3
 """Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
 hanging, m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M`
-applies to a vehicle that has not drifted yet.)"""
+applies before take-off, when the height has not drifted yet.)"""
 MIN_HEIGHT_OF_BLOCKED_CLIMB_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
 MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M = 0.1
@@ -100,32 +103,33 @@ MAX_HANGING_GEAR_TO_TARGET_Z_M = 0.15
 """Largest height difference between gear and target, m, at which the vehicle may hang on its
 magnet."""
 MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
-"""Least height difference between gear and target, m, of a vehicle that stands on the floor."""
+"""Smallest height difference between gear and target, m, of a vehicle that stands on the floor."""
 MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS = -0.05
-"""Climb rate below which a released vehicle with a low specific force is falling, m/s."""
+"""Climb rate below which a vehicle with a low specific force is falling during the weight transfer,
+m/s."""
 MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS = -0.15
 """Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
 falls."""
 
 # --- time ---
 MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S = 5.0
-"""Time after a stop command from which the motors count as off, s: the flying bit stays set for 2
-s."""
+"""Time after a stop command from which zero thrust alone shows that the motors are off, s: the
+flying bit stays set for 2 s."""
 MOTORS_OFF_DWELL_S = 0.1
 """Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
 sample ends the flight. Larger: the flight ends later."""
 HANGING_CONFIRMATION_DWELL_S = 1.0
-"""Time that the proof of a magnet's hold takes, s."""
+"""Time for which a vehicle must hang to prove that the magnet holds it, s."""
 
 
 # --- Offset of the gear from the target ---
 
 
 def current_gear_to_target(b: Belief) -> GearToTargetDistance:
-    """Return the distance between the gear and the target's axis, with its standard deviation: in a
-    contact, from the newest image if that is more precise, otherwise by dead reckoning from the
-    last sighting. With decks, the standard deviation then grows, because the estimated position
-    drifts and the impact on the ceiling disturbs it."""
+    """Return the distance between the gear and the target's axis, with its standard deviation:
+    during a contact, from the newest image if that is more precise, otherwise by dead reckoning
+    from the last sighting. With decks, the standard deviation then grows, because the estimated
+    position drifts and the impact on the ceiling disturbs it."""
     reckoned, seen = _dead_reckoned_gear_to_target(b), _gear_to_target_seen_in_contact(b)
     return reckoned if seen is None or reckoned.sigma_m < seen.sigma_m else seen
 
@@ -134,11 +138,11 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     """Return the distance between the gear and the target's axis in the newest image that shows the
     target, if that image was exposed during the present contact or just before it; otherwise None.
 
-    Friction holds the gear while it is pressed, so the distance in an image remains true until the
-    contact ends, and the state estimate, which wanders by millimetres, has no part in it. Before
-    the touch, a settled vehicle hardly moves sideways. Images that contradict the vehicle's motion
-    are not used: they may be older than they seem. The distance is wrong if the vehicle is pushed
-    or slides after the exposure.
+    Friction holds the gear while it is pressed, so the distance in an image remains valid until the
+    contact ends. It does not depend on the state estimate, which wanders by millimetres. Before the
+    touch, a settled vehicle hardly moves sideways. Images that contradict the vehicle's motion are
+    not used: they may be older than they seem. The distance is wrong if the vehicle is pushed or
+    slides after the exposure.
     """
     target = b.obs.target
     if (
@@ -154,7 +158,7 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
-    # If the climb is too slow for its end to change the speed, the image still shows the gap.
+    # If the climb is so slow that the speed does not show its end, the image still shows the gap.
     before_touch_s = max(before_touch_s, z_m / perch.climb_mps)
     sigma_m = math.hypot(
         target.measured_gear_to_target_sigma_m,
@@ -211,9 +215,9 @@ def contact_height_tolerance_m(b: Belief) -> float:
     holds the vehicle may be the target.
 
     The tolerance grows with the time since the last sighting, because the estimated height drifts.
-    It is at most twice `perch.contact_z_m`, so that an obstacle further below is not mistaken for
-    the target. The condition `TARGET_CONTACT`, which proves a touch of the target, uses its own
-    tolerances.
+    The tolerance is at most twice `perch.contact_z_m`, so that an obstacle further below is not
+    mistaken for the target. The condition `TARGET_CONTACT`, which proves a touch of the target,
+    uses its own tolerances.
     """
     planner = b.profile.planner
     drift_mps = (
@@ -371,7 +375,7 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
 def _is_hanging(b: Belief) -> bool:
     """True if something holds the vehicle up: it is motionless, off the floor, at a thrust too
     small to support it. Without a position, a magnet cannot be distinguished from the floor; the
-    slow release is safe for both."""
+    slow weight transfer is safe in both cases."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.is_position_valid:
         return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
@@ -496,20 +500,20 @@ SLIPPING = Condition("slipping", is_slipping)
 HANGING_WITH_MOTORS_STOPPED = Condition(
     "the whole weight hangs", _is_hanging_with_motors_stopped, required_data=RequiredData.TELEMETRY
 )
-"""The whole weight hangs: the motors stand still, and nothing slips."""
+"""The vehicle hangs with its whole weight: the motors stand still, and it does not slip."""
 HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
 """Something holds the vehicle up, off the floor."""
 MOTORS_OFF_AS_COMMANDED = Condition(
     "motors stopped", _are_motors_off_as_commanded, required_data=RequiredData.TELEMETRY
 )
-"""The motors are off, and the last command does not let them turn."""
+"""The motors are off, and the last command does not make them turn."""
 MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
     "motors off despite a thrust command",
     _are_motors_off_despite_thrust_command,
     required_data=RequiredData.TELEMETRY,
 )
 """The motors are off although the last command was raw thrust: the supervisor has ended the flight.
-It soon lets them turn by that command again (docs/firmware.md, "Supervisor")."""
+The supervisor soon lets that command start them again (docs/firmware.md, "Supervisor")."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, required_data=RequiredData.POSITION)
 """The vehicle stands on the floor."""
 CLIMB_BLOCKED = Condition("blocked", _is_pressing_against_obstacle)
@@ -520,7 +524,8 @@ IMU_SHOWS_SUPPORT = Condition(
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
-"""Something supports or presses the vehicle, proven by accelerometer and thrust alone."""
+"""Something supports the vehicle, or it presses against something: proven by accelerometer and
+thrust alone."""
 THRUST_SATURATED_WITHOUT_CLIMB = Condition(
     "thrust at its limit",
     _is_thrust_saturated,
@@ -541,7 +546,7 @@ SUPPORT_CONDITIONS = (
     IMU_SHOWS_SUPPORT,
     THRUST_SATURATED_WITHOUT_CLIMB,
 )
-"""All conditions of this module."""
+"""All conditions defined in this module."""
 
 
 class Support(Enum):
@@ -558,11 +563,11 @@ class Support(Enum):
 def find_support(b: Belief) -> Support:
     """Return what supports the vehicle, from the conditions that are true in this tick.
 
-    A hanging vehicle is on the magnet only if its gear is certainly within the magnet's radius. It
-    is on another object only if the gear is certainly outside that radius or certainly below the
+    A vehicle hangs on the magnet only if its gear is certainly within the magnet's radius. It hangs
+    on another object only if the gear is certainly outside that radius or certainly below the
     target. (The gear cannot be above the target, because the ceiling is there: such an estimate is
     wrong and proves nothing.) In all other cases, the support is UNKNOWN, and a row of the
-    transition table must assume the more dangerous of the two.
+    transition table must assume the more dangerous of the two supports.
 
     The support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates,
     and in the first tick of a maneuver.
@@ -599,7 +604,7 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     valid position during a press, because the last sighting is accurate enough for a while. During
     a descent, `HANGING` needs no position and accepts telemetry as old as
     `safety.telemetry_hold_s`. Otherwise, a vehicle with poor telemetry would hang on the magnet
-    with its motors running. The release that then begins still needs fresh telemetry.
+    with its motors running. The weight transfer that then begins still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
@@ -619,8 +624,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 def has_slipped(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: `is_slipping` has been true for
-    `complete.slip_dwell_s`. During the release by raw thrust, the first sign of free fall is
-    enough."""
+    `complete.slip_dwell_s`. During the weight transfer by raw thrust, the first sign of free fall
+    is enough."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = (
         b.command_history.weight_transfer_began_at_s is not None

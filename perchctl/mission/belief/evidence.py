@@ -1,8 +1,8 @@
 """Conditions that become evidence after they have been true for some time.
 
-A condition is true or false in one tick. It counts as evidence only after it has been true without
-interruption for a dwell time, so that a single wrong sample proves nothing. `ConditionStartTimes`
-maps each true condition to the time at which it became true.
+In each tick, a condition is either true or false. It counts as evidence only after it has been true
+without interruption for a dwell time, so that a single wrong sample proves nothing.
+`ConditionStartTimes` maps each true condition to the time at which it became true.
 """
 
 from __future__ import annotations

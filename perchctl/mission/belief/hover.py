@@ -2,10 +2,11 @@
 
 Hover thrust is the reference for every proof of contact and for a descent by raw thrust. In quiet
 flight, the measurement is the thrust itself (`learn_hover_thrust_in_quiet_flight`). In a descent by
-raw thrust, it is the thrust divided by the specific force (`learn_hover_thrust_in_descent`). Before
-either has happened, `estimate_hover_thrust` falls back on the accelerometer, with a larger standard
-deviation. The estimate is wrong while something supports part of the weight undetected, and after a
-long descent by the scale error of the accelerometer.
+raw thrust, the measurement is the thrust divided by the specific force
+(`learn_hover_thrust_in_descent`). Before either has happened, `estimate_hover_thrust` falls back on
+the accelerometer, with a larger standard deviation. The estimate is wrong while something
+undetected supports part of the weight. After a long descent, the estimate contains the scale error
+of the accelerometer.
 """
 
 from __future__ import annotations
@@ -21,26 +22,28 @@ from perchctl.mission.belief.thrust import (
 from perchctl.values import replace
 
 HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT = 0.067
-"""Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
-second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
-longer."""
+"""Random walk of the hover thrust in a descent by raw thrust, as a fraction of the thrust per
+square root of a second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks
+too fast for a longer time."""
 FALLBACK_HOVER_THRUST_SIGMA_FRACTION = 0.12
-"""Standard deviation, as a share, of an estimate from the accelerometer alone while the vehicle may
-have been supported. Larger: a descent may correct the estimate further. Smaller: a wrong estimate
-persists."""
+"""Relative standard deviation of a hover thrust estimated from the accelerometer alone, while the
+vehicle may have been supported. Larger: a descent may correct the estimate further. Smaller: a
+wrong estimate persists."""
 MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT = 0.04
-"""Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
-obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
+"""Smallest relative standard deviation of the hover thrust at the start of a descent. Larger:
+contact with an obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too
+fast."""
 MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS = 3.0
-"""Largest correction during a descent, in standard deviations at its start. Larger: contact with an
-obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
+"""Largest correction of the hover thrust during a descent, in standard deviations at the start of
+the descent. Larger: contact with an obstacle corrupts the estimate. Smaller: with a weak battery,
+the vehicle sinks too fast."""
 MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION = 0.2
-"""Largest difference, as a share, between the thrust in quiet flight and the estimate; a larger one
-means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
-Smaller: a real change is rejected."""
+"""Largest relative difference between the thrust in quiet flight and the estimated hover thrust; a
+larger difference means that the ceiling or a hand holds the vehicle. Larger: a held vehicle
+corrupts the estimate. Smaller: a real change is rejected."""
 ROTOR_THRUST_TIME_CONSTANT_S = 0.06
 """Time constant with which the rotors follow a commanded thrust, s (docs/firmware.md; 50 to 80 ms
-in real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
+in real flights). Larger or smaller: a step in the thrust corrupts the estimated hover thrust."""
 MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S = 1.0
 """Age beyond which telemetry says nothing about the present thrust, s."""
 MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 0.7
@@ -50,19 +53,20 @@ MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: an impact corrupts the estimate."""
 MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST = 0.5
-"""Share of the hover thrust at the start of the descent below which thrust is not proportional to
-force, so that nothing is learned from it."""
+"""Fraction of the hover thrust at the start of the descent below which thrust is not proportional
+to force, so nothing is learned from such a thrust."""
 MIN_SPECIFIC_FORCE_DIVISOR_G = 0.75
-"""Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
+"""Smallest specific force by which the thrust of a single sample is divided, g; a lower one is
+raised to this value."""
 MAX_SPECIFIC_FORCE_DIVISOR_G = 1.5
-"""Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
-it."""
+"""Largest specific force by which the thrust of a single sample is divided, g; a higher one is
+lowered to this value."""
 
 
 def estimate_hover_thrust(b: Belief) -> HoverThrust:
-    """Return the hover thrust measured by the filter (`HoverThrust`). While it has measured
-    nothing, return the mean ratio of thrust (0..65535) to specific force (g) in flight, and without
-    that, the ratio in the newest sample. Both fallbacks have the standard deviation
+    """Return the hover thrust measured by the filter (`HoverThrust`). Before the first measurement,
+    return the mean ratio of thrust (0..65535) to specific force (g) in flight or, if there is none,
+    the ratio in the newest sample. Both fallbacks have the standard deviation
     `FALLBACK_HOVER_THRUST_SIGMA_FRACTION`."""
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
@@ -96,7 +100,7 @@ def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
 
 
 def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
-    """Return the estimate after a tick of a descent by raw thrust; `dt_s` as in
+    """Return the estimate after a tick of a descent by raw thrust; `dt_s` is defined as in
     `learn_hover_thrust_in_quiet_flight`. The estimate does not change while the floor or a magnet
     may support part of the weight, or while the telemetry is too old or outside the range in which
     thrust is proportional to force."""

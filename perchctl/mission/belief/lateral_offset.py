@@ -1,17 +1,17 @@
-"""The vehicle's lateral offset from the target, by a Kalman filter of its own.
+"""Estimate the vehicle's lateral offset from the target with a separate Kalman filter.
 
-Below the target, a picture measures the offset to a fraction of a millimetre, but a tenth of a
-second late, and the estimated position wanders by two millimetres meanwhile. Attitude and estimated
-velocity say better how the vehicle has moved since: a hovering vehicle accelerates to where it
-leans. For each of the axes x and y, with the offset e from the gear to the target, the vehicle's
-velocity v, and the acceleration a of the lean:
+Below the target, a picture measures the offset to a fraction of a millimetre, but it arrives a
+tenth of a second late, and the estimated position wanders by two millimetres meanwhile. Attitude
+and estimated velocity show better how the vehicle has moved since the exposure: a hovering vehicle
+accelerates in the direction in which it leans. For each of the axes x and y, with the offset e from
+the gear to the target, the vehicle's velocity v, and the acceleration a due to the tilt:
 
     de/dt = -v        dv/dt = a + w        picture: e + n_e        state estimate: v + n_v
 
-w is white noise (gusts, thrust that fluctuates, an error of the mean lean), n_e the noise of a
-picture's pose, n_v that of the estimated velocity. Pictures come late, so the filter stays at the
-exposure of the newest picture and keeps the telemetry samples since then; a later time is predicted
-through these samples.
+w is white noise (gusts, fluctuations of the thrust, an error of the mean tilt), n_e is the noise of
+a picture's pose, and n_v is the noise of the estimated velocity. Pictures arrive late, so the
+filter's state stays at the exposure time of the newest picture. The filter keeps the telemetry
+samples since then and uses them to predict the state at a later time.
 """
 
 from __future__ import annotations
@@ -25,30 +25,32 @@ from perchctl.values import replace
 LateralVector = tuple[float, float]
 
 ACCELERATION_NOISE_SIGMA_MPS2 = 0.15
-"""Standard deviation of the acceleration that the lean does not explain, m/s^2. Larger: the
+"""Standard deviation of the acceleration that the tilt does not explain, m/s^2. Larger: the
 velocity follows the noise of single pictures. Smaller: after a gust, the offset lags behind."""
 ACCELERATION_NOISE_CORRELATION_TIME_S = 0.1
-"""Correlation time of that acceleration, s. Larger: as a larger standard deviation."""
+"""Correlation time of the acceleration that the tilt does not explain, s. A larger value has the
+same effect as a larger standard deviation."""
 MIN_PICTURE_OFFSET_SIGMA_M = 0.0005
-"""Smallest standard deviation of a picture's offset, m: attitude and exposure time are not exact,
-either. Smaller: the velocity follows their errors."""
+"""Smallest standard deviation of an offset measured in a picture, m: attitude and exposure time are
+not exact either. Smaller: the velocity follows their errors."""
 INITIAL_VELOCITY_SIGMA_MPS = 0.3
 """Standard deviation of the unknown velocity at the first picture, m/s."""
 ESTIMATED_VELOCITY_SIGMA_MPS = 0.04
-"""Standard deviation of the estimated velocity, m/s, as if each sample had an error of its own; the
-error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an acceleration that the
-lean does not explain is noticed a picture later. Smaller: the error of the estimate moves the
-vehicle."""
+"""Standard deviation of the estimated velocity, m/s, with the errors of the samples treated as
+independent; the error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an
+acceleration that the tilt does not explain is noticed one picture later. Smaller: the error of the
+estimate moves the vehicle."""
 MAX_AGE_OF_NEWEST_PICTURE_S = 0.5
-"""Longest time from picture to picture, and from the newest picture to a prediction, s. Larger: a
-gust moves the vehicle unnoticed. Smaller: the last centimetres are flown by the state estimate."""
+"""Longest time between two pictures, and from the newest picture to a prediction, s. Larger: a gust
+moves the vehicle unnoticed. Smaller: the vehicle flies the last centimetres with the state estimate
+instead."""
 MIN_NIS_TO_RESTART_FILTER = 20.0
-"""Normalized innovation squared, two degrees of freedom, with which a picture restarts the filter:
-exceeded by chance once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
+"""Normalized innovation squared (two degrees of freedom) above which a picture restarts the filter;
+chance exceeds it once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
 wrong."""
 MAX_VELOCITY_SIGMA_TO_PREDICT_MPS = 0.03
-"""Largest standard deviation of the filter's velocity with which the filter is used, m/s; with a
-larger one, `predict` returns None. Larger: the vehicle is steered by the first pictures' noise."""
+"""Largest standard deviation of the filter's velocity at which the filter is used, m/s; above it,
+`predict` returns None. Larger: the noise of the first pictures steers the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class LateralState:
 
 class MotionSample(NamedTuple):
     """Lateral motion of the vehicle at `t_s`, the time of a telemetry sample: the acceleration that
-    its lean causes and its estimated velocity, both (x, y) in world axes."""
+    its tilt causes and its estimated velocity, both (x, y) in world axes."""
 
     t_s: float
     acceleration_from_tilt_world_xy_mps2: LateralVector
@@ -72,8 +74,8 @@ class MotionSample(NamedTuple):
 
 
 class OffsetVelocityCovariance(NamedTuple):
-    """Covariance matrix of lateral offset and lateral velocity along one axis. It is the same for x
-    and y."""
+    """Covariance matrix of lateral offset and lateral velocity along one axis. The matrix is the
+    same for x and y."""
 
     offset_variance_m2: float = 0.0  # variance of the offset
     offset_velocity_covariance_m2ps: float = 0.0  # covariance of offset and velocity
@@ -87,11 +89,11 @@ UNSET_COVARIANCE = OffsetVelocityCovariance()
 @dataclass(frozen=True)
 class LateralOffsetFilter:
     """Kalman filter of the horizontal vector from gear to target and of the vehicle's horizontal
-    velocity, both (x, y) in world axes. Pictures measure the offset, and the lean of the vehicle
-    gives its acceleration.
+    velocity, both (x, y) in world axes. Pictures measure the offset, and the vehicle's tilt
+    determines its acceleration.
 
-    The state is valid at `t_s`, the exposure time of the newest picture; -inf before the first one.
-    `samples` holds the telemetry since then and a few earlier samples.
+    The state is valid at `t_s`, the exposure time of the newest picture, which is -inf before the
+    first picture. `samples` holds the telemetry since then and a few earlier samples.
     """
 
     t_s: float = -math.inf

@@ -1,4 +1,4 @@
-"""Describe the maneuver that the planner flies: the context in which the belief reads its
+"""Describe the maneuver that the planner flies: the context in which the belief interprets its
 evidence."""
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from perchctl.vehicle import PositionSetpoint
 
 @dataclass(frozen=True, kw_only=True)
 class Maneuver:
-    """The purpose of the flight in this phase, as far as the evidence depends on it.
+    """The purpose of the flight in a phase, as far as the interpretation of evidence depends on it.
 
     The same reading has different meanings in different maneuvers: a motionless vehicle at low
     thrust hangs after a press, but stands on the floor in a descent. Each phase declares its
-    maneuver; the belief knows no phases.
+    maneuver, so the belief does not need to know the phase.
 
     Attributes:
         is_in_free_air: nothing but air should touch the vehicle. The belief learns the velocity
@@ -29,14 +29,14 @@ class Maneuver:
         learns_hover_thrust: the vehicle flies quietly, so that its thrust measures hover thrust.
         climbs_to_target: the vehicle climbs to the target. Close to the target, hover thrust is not
             learned because the ground effect of the ceiling supports part of the weight.
-        presses_against_target: the vehicle is meant to touch the target. With the target alone, the
-            position of the last sighting may prove a contact. Such a maneuver is neither in free
-            air nor guided by the camera, so that no hold applies: it would leave the vehicle
-            pressed.
+        presses_against_target: the vehicle is meant to touch the target. With the target as the
+            only position source, the position of the last sighting may prove a contact. Such a
+            maneuver is neither in free air nor guided by the camera, so no hold applies: a hold
+            would leave the vehicle pressed.
         retreats_after_attempt: the vehicle leaves the position where an attempt ended. If something
-            still holds it there, its offset from the target is that of the last touch.
-        descends_to_floor: the vehicle descends. If something supports it, it hangs if it is still
-            where the descent began, and stands on the floor if it has come down.
+            still holds it there, its offset from the target is the offset of the last touch.
+        descends_to_floor: the vehicle descends. A supported vehicle hangs if it is still where the
+            descent began, and stands on the floor if it has come down.
     """
 
     is_in_free_air: bool = False
@@ -61,8 +61,8 @@ class CommandHistory:
     maneuver_start_position_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
     raw_thrust: int | None = None  # last command; None in position mode
-    weight_transfer_began_at_s: float | None = None  # start of the release by raw thrust
-    motor_stop_commanded_at_s: float | None = None  # first order to stop the motors
+    weight_transfer_began_at_s: float | None = None  # start of the transfer by raw thrust
+    motor_stop_commanded_at_s: float | None = None  # first command to stop the motors
     # time at which a descent by raw thrust detected the floor
     floor_detected_at_s: float | None = None
 

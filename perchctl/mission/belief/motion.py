@@ -37,37 +37,39 @@ Vector = tuple[float, float, float]
 ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 MAX_TELEMETRY_GAP_S = 0.2
-"""Time without telemetry that counts as a gap, s. In this time a vehicle falls 20 cm, more than
-is possible for one that still hangs. Larger: a gap can hide a fall. Smaller: two lost packets
-count as a gap."""
+"""Time without telemetry that counts as a gap, s. In this time a vehicle falls 20 cm, further than
+a vehicle that still hangs can move. Larger: a gap can hide a fall. Smaller: two lost packets count
+as a gap."""
 MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
-"""Largest speed that noise of the estimate can add to a hanging vehicle across a gap, m/s.
-Larger: a short fall goes undetected."""
+"""Largest change of a hanging vehicle's vertical speed across a gap due to noise of the estimate,
+m/s. Larger: a short fall goes undetected."""
 MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
-"""Largest distance across a gap that the speed before it does not explain, m. Larger: a short
-fall goes undetected."""
+"""Largest vertical movement across a gap that the speed before the gap does not explain, m. Larger:
+a short fall goes undetected."""
 MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS = -0.3
-"""Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging one
-never reaches it, a fall reaches it after 5 cm. Closer to 0: noise counts as a fall."""
+"""Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging
+vehicle never reaches it, and a falling one reaches it after 5 cm. Closer to 0: noise counts as a
+fall."""
 MAX_FROZEN_READING_S = 0.2
-"""Time of identical readings that counts as a gap, s. Smaller: coarse readings freeze by
-chance."""
+"""Time of identical readings that counts as a gap, s. Smaller: readings with a coarse resolution
+repeat by chance."""
 MAX_ACCELEROMETER_READING_IN_FREE_FALL_G = 0.6
-"""Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
+"""Specific force below which a vehicle counts as falling, g. Larger: the end of a press counts as a
 fall."""
 MIN_FREE_FALL_DURATION_S = 0.1
 """Time for which a falling vehicle reads less than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`, s; a
 rebound is shorter. Larger: a fall is detected 5 cm later."""
 MAX_CLIMB_RATE_GAINED_IN_FALL_MPS = -0.25
-"""Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle falls
-whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
+"""Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle
+counts as falling, whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a
+fall."""
 MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS = 0.5
 """Largest upward speed, gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S`, that a vehicle
-must lose before it falls, m/s. Larger: a fall just after a climb is detected later. Smaller: a
-climb that is braked counts as a fall."""
+must lose before it counts as falling, m/s. Larger: a fall just after a climb is detected later.
+Smaller: a climb that is braked counts as a fall."""
 FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained vertical speed is forgotten, s. Larger: an offset accumulates
-to a fall."""
+until it looks like a fall."""
 UP_ACCELERATION_OFFSET_TIME_CONSTANT_S = 3.0
 """Time constant with which the offset of the vertical acceleration is learned, s. Smaller: a slow
 fall is learned as an offset."""
@@ -76,15 +78,15 @@ MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G = -0.3
 not a fall, g. Closer to 0: the first samples of a fall are cut off."""
 MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
 """Upward speed gained within `IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S` that only the floor can
-cause, m/s. Smaller: an increase of thrust counts as the floor."""
+cause, m/s. Smaller: an increase in thrust is mistaken for the floor."""
 IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S = 0.1
-"""Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to an
-impact."""
+"""Time constant with which a gained upward speed is forgotten, s. Larger: the effect of thrust
+accumulates until it looks like an impact."""
 MAX_IMPACT_DETECTION_DELAY_S = 0.05
 """Longest delay between the start of an impact and its detection, s; the speed before the impact is
 taken from this far back."""
 MAX_BOUNCE_TIME_AFTER_IMPACT_S = 0.5
-"""Time after an impact within which a further one is a bounce, s."""
+"""Time after an impact within which a further impact is a bounce, s."""
 MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
 counts as standing still."""
@@ -98,31 +100,34 @@ ACCELEROMETER_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
 of the floor is learned."""
 MIN_LATERAL_PUSH_G = 0.06
-"""Lateral specific force that only a push causes, g. Smaller: drag in flight counts as a push."""
-MAX_DELAY_OF_PUSH_IN_ESTIMATE_S = 1.5
-"""Longest delay with which a push shows in the state estimate, s."""
-LATERAL_PUSH_TIME_CONSTANT_S = 0.05
-"""Time constant of the mean lateral force, s: running motors shake single samples as hard as a
+"""Lateral specific force that only a push can cause, g. Smaller: drag in flight counts as a
 push."""
+MAX_DELAY_OF_PUSH_IN_ESTIMATE_S = 1.5
+"""Longest time until a push shows in the state estimate, s."""
+LATERAL_PUSH_TIME_CONSTANT_S = 0.05
+"""Time constant of the mean lateral force, s: the vibration of running motors affects single
+samples as much as a push."""
 MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
-"""Lateral speed gained between two samples above which the gain is a correction of the estimate and
-not a motion, m/s."""
+"""Lateral speed gained between two samples above which it is a correction of the estimate and not a
+motion, m/s."""
 ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 = 5.0
-"""Increase of that threshold for each second between the two samples, m/s^2."""
+"""Increase of `MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS` for each second between the two
+samples, m/s^2."""
 TILT_ERROR_TIME_CONSTANT_S = 6.0
-"""Time constant with which the firmware's own filter removes a wrong tilt, s."""
+"""Time constant with which the firmware's own filter removes an error of its tilt, s."""
 MEAN_HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
 MIN_HOVER_FRACTION_OF_FULL_THRUST = 0.4
-"""Share of full thrust below which no vehicle hovers."""
+"""Fraction of full thrust below which no vehicle can hover."""
 MAX_UNSATURATED_FRACTION_OF_FULL_THRUST = 0.95
-"""Share of full thrust above which the motors are saturated and the thrust for 1 g is unknown."""
+"""Fraction of full thrust above which the motors are saturated and the thrust for 1 g is
+unknown."""
 MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S = 5e-4
-"""Least growth of the variance of the vertical speed that shows a missing correction, (m/s)^2 per
-second: half of its growth without any corrections."""
+"""Smallest growth of the vertical speed's variance that shows that corrections are missing, (m/s)^2
+per second: half of its growth without any corrections."""
 NO_FUSION_TIMEOUT_S = 0.45
-"""Time of uninterrupted growth after which corrections have certainly stopped, s. Smaller: a pause
-between two range measurements counts."""
+"""Time of uninterrupted growth of the variance after which corrections have certainly stopped, s.
+Smaller: a pause between two range measurements counts as a stop."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +137,7 @@ class FusionAge:
 
     climb_variance_m2ps2: float | None = None  # newest variance
     variance_changed_at_s: float = -math.inf  # time at which that variance arrived
-    no_fusion_since_s: float = math.inf  # time since which the variance has only grown
+    no_fusion_since_s: float = math.inf  # time from which the variance has only grown
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
@@ -167,18 +172,21 @@ class Impact:
     world_z_m: float = 0.0  # height in the state estimate at the impact
 
 
-# --- Detectors: small values with one law each (tests/mission/test_detectors.py) ---
+# --- Detectors, each with one rule (tests/mission/test_detectors.py) ---
 
 
 @dataclass(frozen=True)
 class FreezeDetector:
-    """Detector of frozen readings: the times for which they have not changed. A vehicle in the air
-    never reads identical values twice."""
+    """Detector of frozen readings: the times for which they have not changed. In the air, two
+    successive readings are never identical."""
 
-    acceleration_frozen_for_s: float = 0.0  # time of identical accelerometer readings
-    # time of identical attitude readings; -inf before the first change
+    # time for which the accelerometer readings have been identical
+    acceleration_frozen_for_s: float = 0.0
+    # time for which the attitude readings have been identical; -inf before the first change
     attitude_frozen_for_s: float = -math.inf
-    position_frozen_for_s: float = -math.inf  # time of identical position and velocity readings
+    # time for which the position and velocity readings have been identical; -inf before the first
+    # change
+    position_frozen_for_s: float = -math.inf
 
     @property
     def only_attitude_frozen_for_s(self) -> float:
@@ -191,8 +199,8 @@ class FreezeDetector:
         return max(0.0, self.position_frozen_for_s - self.acceleration_frozen_for_s)
 
     def update_freeze(self, last: Telemetry | None, new: Telemetry) -> Self:
-        """Return the detector after one more sample; the first sample has no predecessor to
-        compare."""
+        """Return the detector after one more sample. `last` is None for the first sample, which has
+        no predecessor."""
         return replace(
             self,
             acceleration_frozen_for_s=_update_frozen_time_s(
@@ -211,9 +219,9 @@ class FreezeDetector:
 class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
-    Let a be the vertical acceleration minus its slowly learned offset, positive up, without
-    decelerations harder than `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`. The climb rate v gained
-    recently is
+    Let a be the vertical acceleration (positive up, limited to at least
+    `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`) minus its slowly learned offset. The climb rate v
+    gained recently is
 
         v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
                  v + a dt - v dt / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
@@ -225,7 +233,7 @@ class FallDetector:
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
-    # time since which the accelerometer has read less than
+    # time from which the accelerometer has read less than
     # `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`
     low_g_since_s: float = math.inf
     climb_rate_gained_mps: float = 0.0
@@ -270,7 +278,8 @@ class FallDetector:
 @dataclass(frozen=True)
 class ImpactDetector:
     """Detector of impacts from below, for example at a touchdown. An impact adds more upward speed
-    in a short time than any thrust can. Its peak force includes that of its bounces."""
+    in a short time than any thrust can. The peak force of an impact includes that of its
+    bounces."""
 
     upward_speed_gained_mps: float = 0.0
     last_impact_or_bounce_at_s: float = -math.inf
@@ -322,9 +331,9 @@ def _update_newest_impact(
     """Return the newest impact after one more sample.
 
     An impact begins when the upward speed gained in it exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`.
-    The speeds before it are the lowest of `recent_samples`, since the onboard estimate often
-    includes the whole impact before it is detected. A bounce only adds a lower speed or a harder
-    peak to the old impact.
+    The speeds before the impact are the lowest of `recent_samples`, since the onboard estimate
+    often includes the whole impact before it is detected. A bounce can only lower the speeds or
+    raise the peak of the old impact.
     """
     follows = newest_sample.t_s - old.t_s <= MAX_BOUNCE_TIME_AFTER_IMPACT_S
     if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
@@ -359,10 +368,10 @@ class SteadySpeedDetector:
     """Loop times at which the vertical speed became constant, and at which the lateral velocity
     came close to its mean."""
 
-    # time since which the vertical speed has been constant
+    # time from which the vertical speed has been constant
     climb_rate_steady_since_s: float = math.inf
     steady_climb_mps: float = 0.0
-    # time since which the lateral velocity has been constant
+    # time from which the lateral velocity has been constant
     lateral_steady_since_s: float = math.inf
     # mean over `LATERAL_VELOCITY_TIME_CONSTANT_S`
     mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
@@ -429,8 +438,8 @@ class LateralPushDetector:
 class ImuMotion(
     FreezeDetector, FallDetector, ImpactDetector, SteadySpeedDetector, LateralPushDetector
 ):
-    """The vehicle's motion from accelerometer and attitude alone; a loop time of -inf means
-    never."""
+    """The vehicle's motion from accelerometer and attitude alone; a time of -inf means that the
+    event has not happened."""
 
     t_s: float = -math.inf  # time of the newest sample
     velocity_gained_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
@@ -445,9 +454,9 @@ class ImuMotion(
     # errors of roll and pitch due to corrections
     roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
     body_roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
-    # corrections of the state estimate, which this motion does not use
+    # age of the last correction of the state estimate, which this motion does not use
     fusion_age: FusionAge = FusionAge()
-    # time since which the motors have been off; inf while they turn
+    # time at which the motors went off; inf while they turn
     motors_off_since_s: float = math.inf
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -515,8 +524,8 @@ class ImuMotion(
 
 def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """Return the motion after its first sample, or after a gap in the telemetry. The detectors
-    restart, and the learned offsets of the accelerometer are kept. The end of the gap is recorded,
-    and whether the vehicle may have fallen during it."""
+    restart, and the learned offsets of the accelerometer are kept. The motion records the end of
+    the gap, and whether the vehicle may have fallen during it."""
     motion = replace(
         motion,
         climb_rate_steady_since_s=new.t_s,
@@ -607,8 +616,8 @@ def _estimate_tilt_error(
     """Return the error of the estimated roll and pitch after one more sample.
 
     If the lateral velocity steps within one sample, the estimate has been corrected, and its
-    attitude with it. The rotation in that sample beyond the previous body rates is then added to
-    the error, which decays as the firmware's filter removes it.
+    attitude with it. The rotation in that sample that the previous body rates do not explain is
+    then added to the error, which decays as the firmware's filter removes it.
     """
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)

@@ -1,9 +1,9 @@
 """Verify that the camera is mounted as the profile says: the target must stand still in the world.
 
-If `camera.mount` is wrong by a rotation about the vehicle's upward axis, the target moves by (1 -
-M) times the motion of the point where that axis meets the target's plane; M is the rotation as a
-complex number. A least-squares fit over a decimetre of motion determines M (docs/mission.md, "The
-mounting").
+If `camera.mount` is wrong by a rotation about the vehicle's upward axis, the target seems to move
+by (1 - M) times the motion of the point where that axis meets the target's plane; M is the rotation
+as a complex number. A least-squares fit over a decimetre of motion determines M (docs/mission.md,
+"The mounting").
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from perchctl.vehicle import Telemetry
 
 CAMERA_MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
 MIN_SIGHTINGS_TO_JUDGE_CAMERA_MOUNTING = 10
-"""Number of sightings that a judgement requires."""
+"""Number of sightings required to judge the mounting."""
 MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
-"""Motion of the axis, m, above which the mounting is judged and above which it is proven."""
+"""Motion of the vehicle's upward axis, m, above which the mounting is judged, and above which it is
+proven."""
 MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
-"""Share of the vehicle's motion by which the target moves: below the first it stands still, above
-the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
+"""Ratio of the target's apparent motion to the vehicle's motion: below the first value, the target
+stands still; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
+camera rotated by a quarter turn shows 1.4."""
 MIN_TARGET_POSITION_SPREAD_RMS_M = 0.05
-"""Least RMS distance of the target's estimated world positions from their mean that shows a motion
-of the target, m."""
-MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # share of the target's spread
+"""Smallest RMS distance of the target's estimated world positions from their mean that shows that
+the target moves, m."""
+MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # fraction of the target's spread
 MIN_FITTED_ROTATION_MODULUS = 0.5  # modulus of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 MIN_DETECTED_CAMERA_YAW_ERROR_RAD = math.radians(65.0)
@@ -36,15 +38,15 @@ MIN_CONTRADICTING_SIGHTINGS = 4
 poses end the flight."""
 TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 """`TARGET_JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the
-distance plus twice the vehicle's motion within the time was moved. `JUMP_PAUSE_S` is the pause
-after a move, s."""
+distance plus twice the vehicle's motion within that time has been moved. `JUMP_PAUSE_S` is the
+pause of the check after a jump, s."""
 MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
-"""Motion of the vehicle's estimated position between two sightings, m, beyond
-`ESTIMATE_JUMP_DISTANCE_GROWTH_MPS`, above which the state estimate has jumped. Larger: sightings
-from before and after a jump are compared."""
+"""Motion of the vehicle's estimated position between two sightings above which the state estimate
+has jumped, m; `ESTIMATE_JUMP_DISTANCE_GROWTH_MPS` times the time between them is added. Larger:
+sightings from before and after a jump are compared."""
 ESTIMATE_JUMP_DISTANCE_GROWTH_MPS = 1.5
-"""Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
-fast vehicle are dropped."""
+"""Increase of `MIN_ESTIMATE_JUMP_DISTANCE_M` for each second between the sightings, m/s. Smaller:
+the sightings of a fast vehicle are dropped."""
 _MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 
 
@@ -95,7 +97,7 @@ class CameraMountingMonitor:
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
-    # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
+    # the target stood still while the vehicle moved `MIN_PROVEN_MOTION_M`: the check is complete
     is_camera_mounting_confirmed: bool = False
     is_target_stationary: bool = False  # the target has stood still so far
     contradicting_sighting_count: int = 0  # successive sightings that contradict the mounting

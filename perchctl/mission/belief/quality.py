@@ -1,4 +1,4 @@
-"""Decide whether the belief is good enough to fly by, and define the conditions that say it is
+"""Decide whether the belief is good enough to fly by, and define the conditions under which it is
 not."""
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
 MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
-"""Lateral speed that no draught causes, m/s. Larger: an impact during the press is noticed late."""
+"""Lateral speed that no draught can cause, m/s. Larger: an impact during the press is noticed
+late."""
 MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS = 0.15
-"""Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
-most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
+"""Largest velocity that the estimate may gain without the accelerometer, m/s; correct positions
+cause at most 0.07. Larger: positions in wrong axes displace the vehicle further before they are
+noticed."""
 MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
-"""Distance below the vehicle that excludes a target on the ceiling, m."""
+"""Distance of the target below the vehicle beyond which it cannot be on the ceiling, m."""
 NO_ESTIMATE_CORRECTION_TEXT = (
     "the estimate's variance keeps growing; the positioning system may have failed"
 )
@@ -52,7 +54,7 @@ LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT = Condition[Belief](
         b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
     ),
 )
-"""The vehicle moves laterally faster than any draught moves it."""
+"""The vehicle moves laterally faster than any draught can move it."""
 ESTIMATE_VARIANCE_TOO_LARGE = Condition[Belief](
     "variance too large", lambda b: b.is_estimate_variance_too_large, persists_across_phases=True
 )
@@ -78,7 +80,7 @@ QUALITY_CONDITIONS = (
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
 )
-"""All conditions of this module."""
+"""All conditions defined in this module."""
 
 
 def hold_reason(b: Belief, maneuver: Maneuver) -> str:

@@ -1,6 +1,6 @@
 """Dead reckoning: integrate the accelerometer from the last good position.
 
-While positions correct the state estimate, the reckoned velocity v is drawn to the estimated
+While positions correct the state estimate, the reckoned velocity v is pulled towards the estimated
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                                            each sample
@@ -9,10 +9,9 @@ velocity e, and the bias b (the error of accelerometer and attitude) is learned 
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
-distance flown. All results are wrong by the change of the bias since the position was lost: 0.1
-m/s^2 becomes 0.45 m after 3 s. The gains are fixed. A Kalman filter of velocity, bias and the
-positions from pictures is no better (`benchmarks/reckoning.py`) because the same change limits
-both.
+distance flown. A change of the bias after the position is lost makes all results wrong: 0.1 m/s^2
+becomes 0.45 m after 3 s. The gains are fixed. A Kalman filter of velocity, bias and the positions
+from pictures is no better (`benchmarks/reckoning.py`) because the same change limits both.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
-"""Time constant with which the bias is learned, s. Larger: a change of the wind is followed late.
-Smaller: a gust is learned as a bias."""
+"""Time constant with which the bias is learned, s. Larger: the bias adapts late to a change of the
+wind. Smaller: a gust is learned as a bias."""
 MAX_ACCELERATION_BIAS_MPS2 = 1.5
-"""Largest bias, m/s^2; a wind of 4 m/s, which the firmware takes for a tilt, causes 1.2. Larger:
-wrong positions can add a bias that no attitude error has."""
+"""Largest bias, m/s^2; a wind of 4 m/s, which the firmware mistakes for a tilt, causes 1.2. Larger:
+wrong positions can cause a bias larger than any attitude error."""
 MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
-"""Largest difference in one sample from which the bias is learned, m/s^2; a larger one is an impact
-or a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not
-learned."""
+"""Largest difference in one sample from which the bias is learned, m/s^2; a larger difference is
+due to an impact or a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a
+gust is not learned."""
 CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
-"""Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
-in reach too early."""
+"""Margin by which the vehicle may climb faster than dead reckoning says, m/s. Larger: the magnet
+seems to be in reach too early."""
 MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
 """Largest climb rate during a gap in the telemetry, m/s: the limit of the position mode."""
 MAGNET_REACH_BELOW_TARGET_M = 0.04
@@ -56,16 +55,16 @@ MAGNET_REACH_BELOW_TARGET_M = 0.04
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
 MAX_BOUNCE_DISTANCE_BELOW_TARGET_M = 0.1
 """Distance below the target within which the reckoned vertical speed follows the estimate, m: a
-bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
-Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
-to 0.3 m/s."""
+bounce off the ceiling happens between two telemetry samples, but the firmware integrates it at 1
+kHz. Larger: errors of the estimate due to late pictures are adopted. Smaller: after a bounce, the
+reckoned speed is wrong by up to 0.3 m/s."""
 VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
 just before the last sighting is forgotten."""
 MAX_ESTIMATED_VELOCITY_BIAS_MPS = 0.6
 """Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
-counts as still while its position creeps. Smaller: the vehicle is never steady in wind."""
+counts as still while its position creeps. Smaller: in wind, the vehicle never counts as steady."""
 ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
@@ -73,29 +72,29 @@ bias."""
 VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
 MIN_UNEXPLAINED_POSITION_STEP_M = 0.005
-"""Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
-counts as a step."""
+"""Smallest motion of the estimated position, beyond what its velocity explains, that counts as a
+step, m. Smaller: noise counts as a step."""
 UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS = 0.2
-"""Increase of that threshold for each second between two samples, m/s."""
+"""Increase of `MIN_UNEXPLAINED_POSITION_STEP_M` for each second between two samples, m/s."""
 MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S = 0.15
-"""Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
-motion."""
+"""Longest time between two samples within which a step is detected, s; over a longer time, the step
+may be the vehicle's motion."""
 MAX_NEGLIGIBLE_POSITION_LAG_S = 0.05
 """Longest time for which the position in a sample is regarded as current, s."""
 ACCELERATION_BIAS_SIGMA_MPS2 = 0.06
-"""Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
-is claimed too precisely."""
+"""Standard deviation of the acceleration bias in a dead-reckoned position, m/s^2. Smaller: the
+offset of a contact is reported as more precise than it is."""
 VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
-"""Standard deviation of the reckoned velocity at the last sighting, m/s. Smaller: the offset of a
-contact is claimed too precisely."""
+"""Standard deviation of the dead-reckoned velocity at the last sighting, m/s. Smaller: the offset
+of a contact is reported as more precise than it is."""
 POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
-"""Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
-position."""
+"""Fraction of the distance flown without a sighting that is added to the standard deviation of a
+dead-reckoned position."""
 VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
 `lateral_velocity_missed_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
-"""Longest integration step of the reckoned height, s; a longer one is a gap."""
+"""Longest integration step of the dead-reckoned height, s; a longer step is a gap."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class DeadReckoning:
     """Velocity of the vehicle and offset of its gear from the target, world axes, integrated from
     the accelerometer since the last good position or sighting."""
 
-    imu: ImuMotion | None = None  # motion up to which this value is integrated
+    imu: ImuMotion | None = None  # IMU motion up to which this value is integrated
     velocity_mps: Vector = ZERO_VECTOR
     acceleration_bias_world_mps2: Vector = ZERO_VECTOR  # error of accelerometer and attitude
     # mean lateral reading of the accelerometer
@@ -113,18 +112,18 @@ class DeadReckoning:
     lateral_velocity_missed_by_imu_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
     lateral_velocity_missed_by_estimate_mps: tuple[float, float] = (0.0, 0.0)
-    # distance of the gear below the target; inf if unseen or fallen
+    # distance of the gear below the target; inf if it is unseen or the vehicle has fallen
     gear_below_target_m: float = math.inf
-    # lower bound of `gear_below_target_m`: allows for climbs in silences, and falls only add to it
+    # lower bound of `gear_below_target_m`: it allows for climbs in telemetry gaps, and falls only
+    # increase it
     min_gear_below_target_m: float = math.inf
     # end of the newest gap after which the magnet may hold the vehicle
     last_gap_in_which_magnet_may_attach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
     gear_to_target_world_xy_m: tuple[float, float] = (0.0, 0.0)
-    gear_to_target_sigma_m: float = (
-        math.inf
-    )  # standard deviation of `gear_to_target_world_xy_m`; inf if unknown
-    # exposure of the sighting from which the offset is integrated
+    # standard deviation of `gear_to_target_world_xy_m`; inf if unknown
+    gear_to_target_sigma_m: float = math.inf
+    # exposure time of the sighting from which the offset is integrated
     last_sighting_at_s: float = -math.inf
     # sum of the steps of the estimated position since that sighting
     unexplained_position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
@@ -132,9 +131,9 @@ class DeadReckoning:
     climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
     # lateral bias of the estimated velocity
     estimated_velocity_bias_world_xy_mps: tuple[float, float] = (0.0, 0.0)
-    # low-passed estimated velocity
+    # estimated velocity after a low-pass filter
     mean_estimated_velocity_world_xy_mps: tuple[float, float] = (0.0, 0.0)
-    # low-passed estimated position
+    # estimated position after a low-pass filter
     mean_estimated_position_world_xy_m: tuple[float, float] | None = None
     time_under_position_control_s: float = 0.0  # total time in free air under position control
 
@@ -155,10 +154,10 @@ def advance_dead_reckoning(
       the acceleration, which is due to accelerometer and attitude.
     - `is_estimated_velocity_being_corrected`: positions have corrected the estimated velocity
       recently.
-    - `ignores_lateral_estimate`: of the estimated velocity, adopt only the vertical part, because
+    - `ignores_lateral_estimate`: adopt only the vertical part of the estimated velocity, because
       the firmware's estimator does not see a lateral push until a position corrects it.
-    - `is_position_diverged`: the estimated velocity may be in wrong axes, so keep the reckoned one,
-      even after a gap in the telemetry.
+    - `is_position_diverged`: the estimated velocity may be in wrong axes, so keep the reckoned
+      velocity, even after a gap in the telemetry.
     """
     estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
     if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
@@ -205,8 +204,9 @@ def _restart(
     """Return the dead reckoning at the first sample, after a gap in the telemetry, or while the
     attitude is frozen.
 
-    If the state estimate is trusted, its velocity is adopted. If not, the velocity changes by as
-    much as the estimated one did during the gap. With diverged positions, the estimate is not used.
+    If the state estimate is trusted, its velocity is adopted. Otherwise, the velocity changes by as
+    much as the estimated velocity did during the gap. With diverged positions, the estimate is not
+    used.
     """
     velocity_mps = estimated_velocity_mps if is_estimate_trusted else ZERO_VECTOR
     if is_position_diverged:
@@ -233,8 +233,8 @@ def _restart(
     if old.imu is None:
         return unknown
     if imu.last_telemetry_gap_ended_at_s > old.imu.t_s:
-        # Motors that were off on both sides of the gap, or a restarted vehicle, cannot have
-        # climbed under power.
+        # A vehicle whose motors were off before and after the gap, or that has restarted, cannot
+        # have climbed under power.
         off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
         flew = not (off or imu.vehicle_restarted_at_s > old.imu.t_s)
         climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
@@ -368,8 +368,8 @@ def learn_estimated_velocity_bias(
 
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
-    velocity of the estimated position, both through the same low-pass filter. It is wrong for about
-    `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
+    velocity of the estimated position, both passed through the same low-pass filter. The learned
+    bias is wrong for about `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
     """
     dt_s = new.t_s - last.t_s
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
@@ -439,8 +439,8 @@ def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
 
 def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """Return the dead reckoning with its acceleration bias corrected after positions in wrong axes.
-    They have given the state estimate a velocity that the accelerometer has not measured and, in
-    proportion to it, a wrong tilt, which was learned as a bias."""
+    Such positions have given the state estimate a velocity that the accelerometer has not measured
+    and, in proportion to it, a wrong tilt, which was learned as a bias."""
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_world_mps2,
         old.lateral_velocity_missed_by_imu_mps,
@@ -484,8 +484,8 @@ def accumulate_unexplained_position_step(
 
 
 def _position_timestamp_s(sample: Telemetry) -> float:
-    """Return the time, s, at which the sample's position was valid. It is older than the attitude
-    by the sample's `behind_s`; a difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` is
+    """Return the time, s, at which the sample's position was valid. The position is older than the
+    attitude by the sample's `behind_s`; a difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` is
     ignored."""
     return sample.t_s - max(0.0, sample.behind_s - MAX_NEGLIGIBLE_POSITION_LAG_S)
 

@@ -16,8 +16,9 @@ MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M = 0.5
 has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
 hold."""
 CAMERA_VELOCITY_TIME_CONSTANT_S = 0.1
-"""Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent with
-that velocity oscillates. Smaller: the noise of single detections moves the vehicle."""
+"""Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent
+controlled with this velocity oscillates. Smaller: the noise of single detections moves the
+vehicle."""
 MAX_DETECTION_GAP_S = 1.0
 """Longest time between two detections from which a velocity is computed, s. Larger: a motion that
 has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
@@ -45,8 +46,10 @@ class TargetBelief:
         age_s: time since the exposure of the last frame that measured the target.
         is_tracked: the target is visible, or the filter has predicted it without a measurement for
             at most n_max frames.
-        is_fresh: it is tracked, and `age_s` is at most `ascend.fresh_s` plus the camera's latency.
-        is_small_marker_fresh: the last measurement of the small marker is no older than that.
+        is_fresh: the target is tracked, and `age_s` is at most `ascend.fresh_s` plus the camera's
+            latency.
+        is_small_marker_fresh: the last measurement of the small marker is no older than
+            `ascend.fresh_s` plus the camera's latency.
     """
 
     world_position_m: Array | None = None
@@ -101,14 +104,14 @@ class VisualMotion:
     """The vehicle's velocity from pictures of a stationary target, for use without telemetry.
 
     The vehicle moves by -de/dt, where e is the target's position from the gear in the level frame;
-    a first-order low-pass filter smooths it. Only roll and pitch, which level e, come from the
-    telemetry: old ones add e_z dphi/dt to the lateral velocity while the vehicle tilts, and little
-    to the vertical one. The velocity is wrong if the target moves; its lateral part is wrong if the
-    camera's mounting differs from the profile.
+    a first-order low-pass filter smooths it. Only roll and pitch, which are used to level e, come
+    from the telemetry. If they are old, they add e_z dphi/dt to the lateral velocity while the
+    vehicle tilts, and little to the vertical velocity. The velocity is wrong if the target moves;
+    its lateral part is wrong if the camera's mounting differs from the profile.
 
     Attributes:
-        t_s: exposure of the newest detection.
-        detected_since_s: exposure of the first detection after the last gap.
+        t_s: exposure time of the newest detection.
+        detected_since_s: exposure time of the first detection after the last gap.
         gear_to_target_level_m: newest position of the target from the gear (ahead, left, up), m.
         vehicle_velocity_level_mps: velocity of the vehicle (ahead, left, up), m/s.
     """

@@ -1,7 +1,7 @@
 """A scalar Kalman filter for hover thrust; `perchctl.mission.belief.hover` supplies measurements.
 
 Hover thrust T is the thrust, 0..65535, at which the vehicle neither rises nor sinks. With the
-variance P as a squared share of the thrust, and a measurement z that stands for a time dt,
+relative variance P (of the error divided by T) and a measurement z, the mean over a time dt,
 
     P += d^2 dt                       d: random walk of T, from battery and wind
     K = P / (P + r^2 / dt)            r: standard deviation of a measurement over one second
@@ -18,18 +18,21 @@ from perchctl.values import replace
 MIN_FIRMWARE_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
 ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION = 0.02
-"""Standard deviation of a hover-thrust measurement averaged over one second, as a share of the
-thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter follows
-a sagging battery late. Smaller: the filter learns these variations."""
+"""Standard deviation of a hover-thrust measurement averaged over one second, as a fraction of the
+thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter adapts
+late to a sagging battery. Smaller: the filter learns these variations."""
 HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT = 0.01
-"""Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
-the filter learns a lasting push. Smaller: it follows a sagging battery late."""
+"""Random walk of the hover thrust in quiet flight, as a fraction of the thrust per square root of a
+second. Larger: the filter learns a lasting push. Smaller: the filter adapts late to a sagging
+battery."""
 ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION = 0.03
-"""Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
-error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
+"""Relative standard deviation of a hover thrust estimated from the accelerometer in flight, due to
+the accelerometer's scale error. Larger: quiet flight just after take-off has more weight. Smaller:
+it has less weight."""
 MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION = 0.05
-"""Standard deviation, as a share, above which the estimate is too rough for a descent without
-telemetry. Larger: the vehicle descends too fast. Smaller: it waits in the air for longer."""
+"""Relative standard deviation above which the hover thrust is too rough for a descent without
+telemetry. Larger: the vehicle descends too fast. Smaller: the vehicle waits in the air for
+longer."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class HoverThrust:
 
     Attributes:
         thrust: 0..65535; 0 while unknown.
-        sigma_fraction: standard deviation, as a share of `thrust`.
+        sigma_fraction: standard deviation, as a fraction of `thrust`.
         estimate_before_descent: the estimate at the start of a descent by raw thrust; None before
             one.
     """
@@ -54,15 +57,16 @@ class HoverThrust:
 
     def propagate(self, dt_s: float, drift_fraction_per_sqrt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later; its standard deviation has grown by a random walk of
-        `drift_fraction_per_sqrt_s`, a share of the thrust per square root of a second."""
+        `drift_fraction_per_sqrt_s`, a fraction of the thrust per square root of a second."""
         return replace(
             self,
             sigma_fraction=math.sqrt(self.sigma_fraction**2 + drift_fraction_per_sqrt_s**2 * dt_s),
         )
 
     def propagate_without_measurement(self, dt_s: float) -> HoverThrust:
-        """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
-        most to that of the accelerometer's estimate, which is always available in flight."""
+        """Return the estimate `dt_s` later without a measurement. Its standard deviation does not
+        grow beyond that of an estimate from the accelerometer, which is always available in
+        flight."""
         sigma = self.propagate(
             dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT
         ).sigma_fraction
@@ -75,7 +79,7 @@ class HoverThrust:
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
         """Return the estimate after a measurement: the mean thrust over `dt_s`. A longer time gives
-        it more weight; with 0, nothing changes."""
+        the measurement more weight; if `dt_s` is 0, nothing changes."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma_fraction):

@@ -1,4 +1,5 @@
-"""Compute the belief one tick later: `update_belief(belief, observation, sent, profile)`.
+"""Compute the belief one tick later: `update_belief(belief, observation, command_history,
+profile)`.
 
     observation ──> target, gaps, jumps, heading, thrust
                                     │
@@ -65,25 +66,26 @@ from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawThrust
 
 BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
-"""All conditions of the belief."""
+"""All conditions that are evaluated on the belief."""
 MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M = 0.3
-"""Distance of the gear below the target within which whatever holds the vehicle is the target,
-m."""
+"""Distance of the gear below the target within which it must be the target that supports the
+vehicle, m."""
 STILL_AT_CONTACT_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
 MAX_FILTER_STEP_S = 0.1
-"""Largest weight of one sample in the filters of hover thrust and lean, s. Larger: after a gap, a
-single sample has the weight of many."""
+"""Longest time that a single sample may stand for in the filters of hover thrust and tilt, s.
+Larger: after a gap, a single sample has the weight of many."""
 MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
-"""Difference between commanded and reported thrust that no ramp causes, as a share of full
+"""Difference between commanded and reported thrust that no ramp can cause, as a fraction of full
 thrust."""
 KEEPALIVE_RAW_THRUST = 1000
 """Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
 MEAN_THRUST_DIRECTION_TIME_CONSTANT_S = 0.5
-"""Time constant of the mean lean, s. Larger: a gust, or a changing error of the estimated attitude,
-moves the vehicle off its axis. Smaller: the damping by the lean is lost."""
+"""Time constant of the mean tilt, s. Larger: a gust, or a changing error of the estimated attitude,
+moves the vehicle off the target's axis. Smaller: feedback of the tilt no longer damps the
+motion."""
 TARGET_SCATTER_FRACTION_KEPT_PER_FRAME = 0.9
-"""Share of the target's spread that remains after each frame."""
+"""Fraction of the target's scatter that remains after each frame."""
 
 
 def update_belief(
@@ -208,9 +210,9 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
 
 def _shift_remembered_positions(b: Belief) -> Belief:
     """Return the belief after a jump of the estimate's world frame, which has not moved the
-    vehicle. Ground, contact and all other remembered positions move with the frame. They stay if
-    samples are missing before the jump, since the vehicle may have moved, or if external positions
-    have just returned and the jump ends a drift."""
+    vehicle. Ground, contact and all other remembered positions move with the frame. They stay
+    unchanged if samples are missing before the jump, since the vehicle may have moved, or if
+    external positions have just returned and the jump ends a drift."""
     obs, last = b.obs, b.last_telemetry
     first_estimate_jump_at_s = (
         obs.t_s if b.first_estimate_jump_at_s is None else b.first_estimate_jump_at_s
@@ -416,8 +418,8 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
     """Correct the reckoned height of a supported vehicle, with the target as the only position
     source.
 
-    Late pictures make the vehicle seem lower than it is. If it is supported just below the target,
-    it touches the target, so its distance below becomes 0.
+    Late pictures make the vehicle seem lower than it is. A vehicle that is supported just below the
+    target must be touching it, so its distance below the target becomes 0.
     """
     near = (
         b.is_target_position_source
@@ -435,10 +437,10 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
 
 
 def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
-    """Return the loop time since which the magnet may have held the vehicle; None if it cannot hold
+    """Return the loop time from which the magnet may have held the vehicle; None if it cannot hold
     it."""
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
-    # a released or stopped vehicle does not move into or out of reach
+    # once the weight transfer or the motor stop has begun, it does not move into or out of reach
     if not b.command_history.is_before_weight_transfer_and_motor_stop:
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
@@ -458,8 +460,8 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
 
 
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
-    """Return the climb since the previous tick of a vehicle without a position, m; 0 with a
-    position."""
+    """Return how far a vehicle without a position has climbed since the previous tick, m; 0 for a
+    vehicle with a position."""
     obs, before, last = b.obs, b.dead_reckoning.imu, b.last_telemetry
     if b.dead_reckoning_since_s is None or before is None:
         return 0.0
@@ -521,7 +523,7 @@ def _update_estimators(b: Belief) -> Belief:
 
 
 def _filter_thrust_direction(b: Belief, sample_dt_s: float) -> tuple[float, float]:
-    """Return the mean lean after a sample that covers `sample_dt_s`."""
+    """Return the mean thrust direction, world x and y, after a sample that covers `sample_dt_s`."""
     gain = 1.0 - math.exp(-sample_dt_s / MEAN_THRUST_DIRECTION_TIME_CONSTANT_S)
     (x, y), (mean_x, mean_y) = b.thrust_direction_world_xy, b.mean_thrust_direction_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)

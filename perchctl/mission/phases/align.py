@@ -25,10 +25,10 @@ from perchctl.mission.setpoints import (
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
 MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
-"""Longest wait for permission to climb, s, from the entry into the phase or the end of a
-hold; `planner.perching_time_s` limits the total. Larger: the battery of a vehicle without
-permission runs down. Smaller: a neighbour that bars the climb only for a while, because it lands or
-until the parent has ended a process that does not respond, ends this flight, too."""
+"""Longest wait for permission to climb, s, from the entry into the phase or the end of a hold;
+`planner.perching_time_s` limits the total. Larger: the battery of a vehicle without permission runs
+down. Smaller: a neighbour that blocks the climb only for a while, because it lands or until the
+parent has ended a process that does not respond, also ends this flight."""
 
 ALIGNED = Condition[Context](
     "aligned",
@@ -38,7 +38,7 @@ ALIGNED = Condition[Context](
         and abs(c.belief.target.vehicle_to_target_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
     ),
 )
-"""The vehicle is below a fresh target, with its heading."""
+"""The vehicle is below a fresh target and has the target's heading."""
 CLIMB_WITHHELD = Condition[Context](
     "climb withheld", lambda c: c.obs.climb_withheld_reason is not None
 )

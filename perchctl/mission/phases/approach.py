@@ -16,13 +16,13 @@ MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
 stands jumps up."""
 MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
-"""Share of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
+"""Fraction of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
 MIN_REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8
-"""Share of the take-off height that counts as reached."""
+"""Fraction of the take-off height that counts as reached."""
 MAX_TAKEOFF_END_SPEED_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
 TAKEOFF_END_DWELL_S = 0.3
-"""Time for which the vehicle must hover, s."""
+"""Time for which the vehicle must hover to end the take-off, s."""
 
 TAKEOFF_HEIGHT_REACHED = Condition[Context](
     "at take-off height",

@@ -1,5 +1,5 @@
-"""Phase 5, ASCEND: climb inside a cone below the target, and settle at the stand-off, or where the
-mission hovers."""
+"""Phase 5, ASCEND: climb inside a cone below the target, and settle at the stand-off or at the
+hover position."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
 MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB = 0.7
-"""Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
-returns to ALIGN."""
+"""Fraction of the cone's radius within which the vehicle climbs. Larger: the vehicle leaves the
+cone and returns to ALIGN."""
 MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M = 0.15
 """Largest height of the setpoint above the vehicle during the climb, m. Larger: the setpoint runs
 far ahead of a weak vehicle."""
 MIN_ASCENT_SETPOINT_CLIMB_RATE_MPS = 0.02
-"""Speed with which the setpoint approaches the stand-off, m/s."""
+"""Lowest speed at which the setpoint approaches the stand-off, m/s."""
 HOVER_HEIGHT_TOLERANCE_M = 0.05
-"""Largest vertical distance from the hover's place at which the vehicle has reached it, m. Larger:
-the hover begins during the climb. Smaller: an error of the height keeps it from beginning."""
+"""Largest vertical distance from the hover position at which the vehicle has reached it, m. Larger:
+the hover begins during the climb. Smaller: an error of the height keeps the hover from
+beginning."""
 HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
-"""The same distance of the setpoint, m, which stays at this height during the hover. Larger: the
-vehicle hovers too low. Smaller: noise of the target's height keeps the hover from beginning."""
+"""Largest vertical distance of the setpoint from the hover position at which the hover can begin,
+m; the setpoint stays at its height during the hover. Larger: the vehicle hovers too low. Smaller:
+noise of the target's height keeps the hover from beginning."""
 MAX_TIME_WITHOUT_TARGET_S = 1.5
 """Time since the last sighting of the target after which an ascent or a hover is given up, s, if a
 positioning system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that
@@ -109,7 +111,7 @@ def is_returning_to_hover_height(state: PlannerState) -> bool:
 
 def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
-    system, every moment without it is too long, since the position drifts."""
+    system, any time without it is too long, since the position drifts."""
     b = c.belief
     patience_s = 0.0 if b.is_target_position_source else MAX_TIME_WITHOUT_TARGET_S
     return not b.target.is_tracked and b.target.age_s > patience_s
@@ -124,7 +126,7 @@ SETTLED_AT_STANDOFF = Condition[Context]("settled", _is_settled_at_standoff)
 AT_HOVER_POSITION = Condition[Context](
     "at the hover's place", lambda c: c.planner.hover is not None and _is_at_hover_position(c)
 )
-"""The mission hovers, and the vehicle is slow and aligned where it does."""
+"""The mission hovers, and the vehicle is slow and aligned at the hover position."""
 
 
 def enter_ascend(state: PlannerState, previous_context: Context) -> PlannerState:

@@ -26,7 +26,8 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
 MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S = 10.0
-"""Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
+"""Time after the end of the monitoring at which the flight ends although telemetry still shows
+thrust, s."""
 
 
 def enter_complete(state: PlannerState, previous_context: Context) -> PlannerState:

@@ -1,11 +1,11 @@
 """HOVER: hold below the target for a time, then land; the mission of `perchctl hover`.
 
-The mission is that of a perch up to ASCEND, which ends at the hover's place instead of the
-stand-off. HOVER itself never climbs. A vehicle that sinks below its place, for example because the
-estimated height drifts, climbs back in ASCEND; its time goes on if that takes at most
-`MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its place returns to ALIGN, and its
-time starts anew. So a completed hover has kept its place for the whole time, apart from such
-climbs.
+Up to ASCEND, the mission is the same as for a perch, but ASCEND ends at the hover position instead
+of the stand-off. HOVER itself never climbs. A vehicle that sinks below its hover position, for
+example because the estimated height drifts, climbs back in ASCEND; the hover timer continues if
+that takes at most `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its hover position
+returns to ALIGN, and the timer restarts. In a completed hover, the vehicle has therefore kept its
+position for the whole time, apart from such climbs.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from perchctl.profile import HoverConfig
 from perchctl.values import replace
 
 MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M = 0.02
-"""Height of the setpoint above the hover's place from which it sinks, m. Larger: a drift of the
-estimated height brings the vehicle closer to the ceiling. Smaller: the noise of the target's height
-lowers it step by step."""
+"""Height of the setpoint above the hover position beyond which it is lowered, m. Larger: a drift of
+the estimated height brings the vehicle closer to the ceiling. Smaller: the noise of the target's
+height lowers it step by step."""
 MAX_SINK_BELOW_HOVER_HEIGHT_M = 0.06
-"""Distance below the hover's place from which the vehicle climbs back, m. Larger: a drift of the
+"""Distance below the hover position beyond which the vehicle climbs back, m. Larger: a drift of the
 estimated height moves the vehicle further. Smaller: the noise of the target's height makes it climb
 back needlessly."""
 SUNK_BELOW_HOVER_HEIGHT_DWELL_S = 0.3
-"""Time for which the vehicle must be so low, s."""
+"""Time for which the vehicle must be too low before it climbs back, s."""
 MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S = 5.0
-"""Longest time of a climb back after which the hover's time goes on, s. Larger: a weak vehicle
-counts as hovering although it is too low. Smaller: a windy climb starts the time anew."""
+"""Longest duration of a climb back after which the hover timer continues, s. Larger: a weak vehicle
+counts as hovering although it is too low. Smaller: a climb in wind restarts the timer."""
 MAX_HOVER_HEIGHT_ERROR_M = 0.15
-"""Vertical distance from its place at which the vehicle has left it, m. Larger: a hover that sinks
-or rises still counts. Smaller: a gust starts the time anew."""
+"""Vertical distance from the hover position beyond which the vehicle has left it, m. Larger: a
+hover that sinks or rises still counts. Smaller: a gust restarts the timer."""
 
 SUNK_BELOW_HOVER_HEIGHT = Condition[Context](
     "sunk", lambda c: distance_below_hover_height_m(c) > MAX_SINK_BELOW_HOVER_HEIGHT_M
@@ -90,7 +90,7 @@ def distance_below_hover_height_m(c: Context) -> float:
 
 def has_left_hover_position(c: Context) -> bool:
     """True if the gear's offset from the target's axis exceeds the radius of the approach cone
-    (`ascent_cone_radius_m`), or its height differs from that of the hover by more than
+    (`ascent_cone_radius_m`), or its height differs from the hover height by more than
     `MAX_HOVER_HEIGHT_ERROR_M`."""
     lateral_m = c.belief.target.gear_to_target_distance_xy_m
     return (

@@ -15,7 +15,7 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
 TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S = 2.0
-"""Time after the motors are off in which the camera may still show the target far above, s."""
+"""Time after the motors are off during which the camera may still show the target far above, s."""
 
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
@@ -41,13 +41,13 @@ def enter_landing(state: PlannerState, previous_context: Context) -> PlannerStat
     ):
         # no evidence of a support at that position
         b = replace(b, gear_to_target_at_last_contact=None)
-    # With a wrong mounting, the setpoint leads in a wrong direction.
+    # With a wrong mounting, the setpoint leads the vehicle in a wrong direction.
     setpoint = None if VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis else state.setpoint
     return enter_descent(replace(state, belief=b, setpoint=setpoint), previous_context.state)
 
 
 def make_rest_state_predicate(rest_state: RestState) -> Predicate:
-    """Return the predicate that the motors are off and the vehicle is in the rest state
+    """Return a predicate that is true once the motors are off and the vehicle is in the rest state
     `rest_state`."""
     return lambda c: (
         c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= MOTORS_OFF_DWELL_S
@@ -74,8 +74,8 @@ def unconfirmed_landing_reason(c: Context) -> str:
 
 def _outcome_after_hanging(previous_outcome: Outcome | None) -> Outcome | None:
     """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
-    ATTEMPTS_USED_UP, since it hangs on a target; HOVERED becomes SAFETY, since a hover must not end
-    on the magnet; others stay."""
+    ATTEMPTS_USED_UP, since the vehicle hangs on a target; HOVERED becomes SAFETY, since a hover
+    must not end on the magnet; other outcomes are kept."""
     if previous_outcome is Outcome.HOVERED:
         return Outcome.SAFETY
     return (

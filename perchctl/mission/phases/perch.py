@@ -4,10 +4,10 @@ ASCEND ends with the vehicle settled at the stand-off; PERCH has no entry action
 setpoint rises through the target, or raw thrust presses (`planner.perch` in the profile,
 `PerchConfig`). Position, acceleration and thrust together prove a contact (`TARGET_CONTACT` in
 `belief/contact.py`). A contact within the magnet's radius leads to COMPLETE. A contact outside it
-leads to RECOVER, and so does a push from the side, a press without contact, and with the target
-alone a press that lasts too long without a new position; each of these is a failed attempt. The
-rows in `safety.py` come first, among them those for a magnet that catches early and for an
-obstacle. No hold applies in this phase because a hold would leave the vehicle pressed
+leads to RECOVER. So does a push from the side, a press without contact, and, with the target as the
+only position source, a press that lasts too long without a new position. Each of these is a failed
+attempt. The rows in `safety.py` come first, including those for a magnet that catches early and for
+an obstacle. No hold applies in this phase because a hold would leave the vehicle pressed
 (`hold_reason`).
 """
 
@@ -32,9 +32,10 @@ from perchctl.vehicle import RawThrust
 LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
 MAX_PRESS_DURATION_WITHOUT_SIGHTING_S = 1.25
-"""Longest press after the last sighting, s, since the last centimetres are flown without the target
-in view; with the target alone, by dead reckoning. Larger: the vehicle presses outside the magnet's
-radius. Smaller: a covered marker ends attempts that would succeed."""
+"""Longest press after the last sighting, s. The vehicle flies the last centimetres without the
+target in view; with the target as the only position source, it flies them by dead reckoning.
+Larger: the vehicle presses outside the magnet's radius. Smaller: a covered marker ends attempts
+that would succeed."""
 
 
 def act_in_perch(c: Context) -> Action:

@@ -35,10 +35,11 @@ from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
 MIN_THRUST_TO_HOVER_RATIO_WITHOUT_FALL_CATCH = 0.85
-"""Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
+"""Fraction of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
 MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
-"""Distance below the contact at which the vehicle has left it, m; at most half of the descent."""
+"""Distance below the contact beyond which the vehicle has left it, m; at most half of the descent
+is used."""
 MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
@@ -65,7 +66,7 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
     belief = replace(
         state.belief,
         gear_to_target_at_last_contact=_find_gear_to_target_at_touch(previous_context, diagnosis),
-        # The vehicle counts as within the magnet's reach until its position is below.
+        # The vehicle counts as within the magnet's reach until its position is below this contact.
         vehicle_world_z_at_last_contact_m=z_m if touched else b.vehicle_world_z_at_last_contact_m,
     )
     return replace(

@@ -24,7 +24,7 @@ from perchctl.vehicle import PositionSetpoint
 MIN_CLEARANCE_BELOW_OBSTACLE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
 MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M = 0.2
-"""Largest lateral distance flown to a target seen before, while the camera's mounting is
+"""Largest lateral distance flown to a previously seen target while the camera's mounting is
 unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
 
