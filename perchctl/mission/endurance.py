@@ -75,7 +75,12 @@ def predict_hover_time_s(
     battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
 ) -> float | None:
     """Return the hover time, s, at `hover_thrust_fraction` (fraction of full thrust) until the row
-    `battery-low` applies; None if unknown."""
+    `battery-low` applies; None if unknown.
+
+    The row applies to the earlier of two events. The firmware reports low power
+    `LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the voltage
+    falls below `safety.min_load_v`, in hover or during a press.
+    """
     if (
         battery_fit.rest_v is None
         or battery_fit.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S

@@ -88,6 +88,9 @@ MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
 """Smallest load, as a fraction of full thrust, at which a reading contributes to the fitted sag."""
 MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
 """Total time of readings under load that an estimate requires, s."""
+LOW_POWER_REPORT_DELAY_S = 5.0
+"""Time below the low-power voltage after which the firmware reports low power, s (source: power
+management). Larger: perchctl starts attempts that the battery cannot finish."""
 MAX_BATTERY_READING_AGE_S = 1.0
 """Age beyond which a voltage reading is no longer used, s."""
 
