@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import latex2mathml.converter
 import mermaidx
 from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
@@ -23,6 +24,7 @@ myst_heading_anchors = 4
 myst_fence_as_directive = ["mermaid", "math"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+html_math_renderer = "mathml"
 html_copy_source = False  # the sources of two pages are not what they show
 html_theme = "furo"
 html_title = f"perchctl {release}"
@@ -53,6 +55,19 @@ class Diagram(SphinxDirective):
         # Two diagrams on a page must not share the names that their styles and arrowheads have.
         svg = svg.replace("my-svg", f"diagram-{Diagram.drawn}")
         return [nodes.raw("", f'<div class="diagram">{svg}</div>', format="html")]
+
+
+def write_inline_equation(translator: Any, node: nodes.math) -> None:
+    """Write an equation in a sentence as MathML, which browsers draw without a script or a
+    network."""
+    translator.body.append(latex2mathml.converter.convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def write_display_equation(translator: Any, node: nodes.math_block) -> None:
+    """Write an equation on its own line as MathML."""
+    translator.body.append(latex2mathml.converter.convert(node.astext(), display="block"))
+    raise nodes.SkipNode
 
 
 def adapt(app: Any, name: str, source: list[str]) -> None:
@@ -95,4 +110,6 @@ def sidebar() -> str:
 def setup(app: Any) -> None:
     """Register the parts above; Sphinx calls this."""
     app.add_directive("mermaid", Diagram)
+    inline, display = (write_inline_equation, None), (write_display_equation, None)
+    app.add_html_math_renderer("mathml", inline, display)
     app.connect("source-read", adapt)
