@@ -4,7 +4,7 @@
 // showOrders(orders); and HANGS, what it means that perchctl answers with old numbers.
 const by = (id) => document.getElementById(id);
 const token = new URLSearchParams(location.search).get("token") || "";
-const TERMINAL = "On the terminal: Press Ctrl-C to land. Press it again to cut the motors.";
+const TERMINAL = "On the terminal, press Ctrl-C to land. Press it again to cut the motors.";
 // Older browsers have no such bound: better no bound than a button that throws.
 const within = (ms) => AbortSignal.timeout ? { signal: AbortSignal.timeout(ms) } : {};
 const OLD_S = 2, TIMEOUT_MS = 1500, ORDER_TIMEOUT_MS = 3000;
@@ -20,8 +20,8 @@ function watch() {
   document.body.classList.toggle("old", old);
   by("old").hidden = !old;
   if (!old) return;
-  by("old").textContent = `no news for ${Math.floor(quiet)} s: ` + (silent || !up
-    ? "perchctl does not answer. What is shown is old." : HANGS);
+  by("old").textContent = `no update for ${Math.floor(quiet)} s: ` + (silent || !up
+    ? "perchctl does not answer, so these values are old." : HANGS);
 }
 
 function showCard(card) {
@@ -34,7 +34,7 @@ function showCard(card) {
   by("outcome").textContent = card.outcome;
   by("why").textContent = card.reason;
   fill("facts", card.rows);
-  link("the flight is over: this is its last picture", "");
+  link("the flight is over: this is its last image", "");
   scrollTo(0, 0);
 }
 
@@ -91,7 +91,7 @@ async function poll() {
   } catch (error) {
     silent = error.name === "TimeoutError";
     link(silent ? "perchctl does not answer"
-      : "perchctl has ended or cannot be reached: these are its last values", "down");
+      : "perchctl has stopped or cannot be reached; these are its last values", "down");
     // One that is late may still hear an order, also one that was gone before.
     if (orders !== "none" && orders !== "over") showOrders(silent ? known : "gone");
     up = false;

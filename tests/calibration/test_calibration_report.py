@@ -45,7 +45,7 @@ def test_a_page_says_the_verdict_in_millimetres(good: Calibration) -> None:
     assert f"{far.axis_mm95:.2g} mm at 1 m (95 %). camera.yaml" in page.words
     assert f"1 m {far.axis_mm95:.2f} mm 10.0 mm {far.mm95:.2f} mm" in page.words
     assert "2026-11-30 10:20 UTC" in page.words
-    assert "What to do better Nothing." in page.words
+    assert "What to improve Nothing." in page.words
     assert "Rejected views None: every view was used." in page.words
 
 
