@@ -26,7 +26,7 @@ class PhaseDefinition:
     """A phase of the mission.
 
     Attributes:
-        maneuver: maneuver flown in this phase, as far as the evidence depends on it.
+        maneuver: maneuver flown in this phase, which determines how the belief interprets evidence.
         enter: function that prepares the phase. It takes the state that has just entered the phase
             and the context of the tick before the transition, and returns the new state.
             `state.entry.diagnosis` holds what the transition asserts about the vehicle

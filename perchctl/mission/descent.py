@@ -203,7 +203,9 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
 
 
 def act_in_landing(c: Context) -> Action:
-    """Return the landing's new state and command: catch a fall, stop on the floor, or descend."""
+    """Return the landing's new state and command. The first action that applies is taken: catch a
+    fall, stop the motors, transfer the weight to the magnet, continue the firmware's own landing,
+    or descend."""
     state = c.state
     if _is_falling_free(c):
         return _restart_landing_by_catching_fall(c)
@@ -271,9 +273,10 @@ def descend(c: Context) -> Action:
 
 
 def has_landing_command_reached_end(c: Context) -> bool:
-    """True if a landing has come to its end: the raw thrust is at its minimum, or the setpoint is
-    at the floor. The motors must then be stopped, or the firmware's supervisor locks the vehicle
-    when the setpoints end."""
+    """True if a landing has reached its end: the raw thrust is at its minimum or, if the end of the
+    landing could not be confirmed in time (`LANDING_UNCONFIRMED`), the setpoint is at most
+    `landing.handover_m` above the take-off position. The motors must then be stopped, or the
+    firmware's supervisor locks the vehicle when the setpoints end."""
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m

@@ -7,8 +7,8 @@ setpoint. Then
     T = T_h (1 - k (v + u + s)) / cos(tilt)
 
 is a proportional rate controller. The gain k falls with the age of v; otherwise, the vehicle would
-oscillate. With old telemetry and the target in view, v is the climb rate from pictures. A vehicle
-that does not sink gets less and less thrust until it sinks, the magnet lets go, or the floor is
+oscillate. With old telemetry and the target in view, v is the climb rate from pictures. While the
+vehicle does not sink, the thrust is reduced until it sinks, the magnet lets go, or the floor is
 detected. Laterally, the vehicle leans against the wind and brakes
 (`_compute_braking_roll_pitch_rad`).
 """
@@ -30,9 +30,9 @@ from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
 SINK_RATE_SETPOINT_MPS = 0.7
-"""Sink rate setpoint, m/s. The gyroscope's offset moves the vehicle 2 m laterally in 4 s. Larger:
-the vehicle lands harder if the floor is not detected. Smaller: the vehicle lands further from the
-target's axis."""
+"""Sink rate setpoint, m/s. Without a position, the gyroscope's offset moves the vehicle 2 m
+laterally in 4 s. Larger: the vehicle lands harder if the floor is not detected. Smaller: the
+vehicle lands further from the target's axis."""
 NEAR_FLOOR_SINK_RATE_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
 MAX_NEAR_FLOOR_HEIGHT_M = 0.6
@@ -83,7 +83,7 @@ MAX_BRAKE_TILT_RAD = 0.22
 """Largest tilt that brakes the lateral speed, rad; it costs 2.5 % of the thrust."""
 MAX_WIND_COMPENSATION_TILT_RAD = 0.2
 """Largest tilt against the wind, rad; it balances a wind of 6 m/s. Larger: an impact or a wrong
-bias moves the vehicle far off."""
+bias moves the vehicle far off course."""
 MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S = 0.2
 """Age of the lateral speed above which the vehicle brakes less, s; otherwise it would oscillate."""
 INITIAL_LATERAL_VELOCITY_SIGMA_MPS = 0.05
@@ -201,7 +201,8 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S,
     )
-    if _visual_motion_if_telemetry_old(c) is not None:  # a vehicle on the floor ignores commands
+    # Pictures must show the sinking: a vehicle on the floor does not respond to commands.
+    if _visual_motion_if_telemetry_old(c) is not None:
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
             THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S,
@@ -216,7 +217,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         c, hover_thrust, height_m, is_sinking=is_sinking
     )
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
-    # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
+    # In the air, the accelerometer reading is proportional to the thrust; on the floor, it is 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
     if touched_s >= TOUCHDOWN_THRUST_DURATION_S and falls:
         floor_detected_at_s = None  # the vehicle falls at low thrust, so it did not touch the floor
@@ -308,7 +309,9 @@ def _find_floor_detection_time_s(
 def _compute_sink_rate_thrust(
     c: Context, hover_thrust: float, climb_mps: float, height_m: float
 ) -> float:
-    """Return the rate controller's thrust, by the equation in the module docstring."""
+    """Return the rate controller's thrust, 0..65535, by the equation in the module docstring:
+    `hover_thrust` is T_h, and `climb_mps` is v + u. Near the floor, the sink rate setpoint is
+    smaller; `height_m` is the height above the ground."""
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
     is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
@@ -373,8 +376,8 @@ def _is_touchdown_overdue(c: Context) -> bool:
 
 
 def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
-    """Return roll and pitch that balance the wind and brake the lateral speed; level without a
-    heading.
+    """Return roll and pitch, rad, that balance the wind and brake the lateral speed; both are 0
+    without a heading, or while the magnet may hold the vehicle.
 
     The lateral reading of the accelerometer is the air's force per mass w, m/s^2, because the
     thrust acts along the body's z axis. To balance this force, the thrust needs the lateral part
@@ -439,7 +442,8 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
 
 
 def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
-    """Return a world vector (x, y) in the axes of a vehicle with this heading: ahead and left."""
+    """Rotate a world vector (x, y) into the axes, ahead and left, of a vehicle with the heading
+    `yaw_rad`."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 

@@ -19,7 +19,8 @@ def observe(
     of a falling vehicle is cancelled. After a jump of the estimate, the remembered positions move
     with it."""
     if has_tick_gap(state.belief, obs, profile):
-        # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press.
+        # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press
+        # against the ceiling.
         setpoint = state.setpoint if state.catch_setpoint_height_above_vehicle_m is None else None
         state = replace(
             state,
@@ -35,7 +36,8 @@ def observe(
 
 def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
-    trajectory in the old frame, so the vehicle is caught and the landing is commanded again."""
+    trajectory in the old frame, so position control first catches the vehicle, and then the landing
+    is commanded again."""
     b, obstacle_blocked_at_z_m = state.belief, state.obstacle_blocked_at_z_m
     if (
         state.phase is Phase.LANDING

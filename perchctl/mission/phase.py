@@ -17,7 +17,7 @@ class Phase(Enum):
     """The seven phases of the published method, recovery, hover, landing, and the three final
     phases."""
 
-    __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks phases up
+    __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks up phases
 
     APPROACH = "APPROACH"
     SEARCH = "SEARCH"

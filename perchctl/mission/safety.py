@@ -82,9 +82,9 @@ ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
 MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS = 0.35
-"""Excess of the climb rate over that of the setpoint in the ascent which only an oscillation of
-position control reaches, m/s; in flights with prompt positions, the excess is 0.1. Larger: the
-vehicle strikes the target. Smaller: a gust ends the flight."""
+"""If the climb rate exceeds `ascend.speed_mps`, the setpoint's climb rate in an ascent, by more
+than this value, m/s, position control must be oscillating; in flights with prompt positions, the
+difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends the flight."""
 TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
 THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S = 2.0
@@ -333,7 +333,8 @@ def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
 
 
 def has_time_for_all_attempts_run_out(c: Context) -> bool:
-    """True if the time for all attempts has run out; a hover has its own duration in addition."""
+    """True if the time for all attempts, plus the duration of the hover in a mission that hovers,
+    has run out."""
     hover = c.planner.hover
     allowed_s = c.planner.perching_time_s + (0.0 if hover is None else hover.duration_s)
     return c.t_s - c.state.flight_started_at_s > allowed_s

@@ -12,9 +12,9 @@ the acceleration a due to its tilt:
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
 on the whole chain from setpoint to position: a setpoint acts through the attitude, so the present
 tilt becomes velocity a tenth of a second later. Feedback of the tilt permits higher gains without
-oscillation, but only while the telemetry is prompt. So `gain` is the smaller of two factors: one
-grows from 0 to 1 as the target comes closer, and one falls from 1 to 0 as the telemetry ages. At 0,
-the vehicle is left to its onboard controllers, which act without that delay.
+oscillation, but only while the telemetry is prompt. Therefore, `gain` is the smaller of two
+factors: one grows from 0 to 1 as the target comes closer, and one falls from 1 to 0 as the
+telemetry ages. At 0, the vehicle is left to its onboard controllers, which act without that delay.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
 """Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: late
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
 MAX_TELEMETRY_AGE_FOR_FEEDBACK_S = 0.16
-"""Age of the telemetry from which the onboard controllers are left alone, s."""
+"""Age of the telemetry at which the gain of the lateral feedback has fallen to zero, s."""
 LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_FADE_IN_DISTANCE_M = 0.4
@@ -68,8 +68,8 @@ MAX_SPEED_HOVERING_IN_PLACE_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
 MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS = 0.25
-"""Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
-vehicle further off."""
+"""Largest lateral speed of the setpoint while the camera's mounting is unconfirmed, m/s. Larger: a
+rotated camera leads the vehicle further off course."""
 HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
 """Sink rate commanded during a hold while the camera does not see the target, m/s."""
 MIN_HELD_SETPOINT_HEIGHT_M = 0.3

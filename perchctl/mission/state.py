@@ -131,7 +131,7 @@ class PlannerState:
     waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
     total_wait_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
-    hover_errors: HoverErrors = HoverErrors()  #: of the newest hover
+    hover_errors: HoverErrors = HoverErrors()  #: position errors in the newest hover
 
     @property
     def transition_name(self) -> str:

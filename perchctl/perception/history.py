@@ -32,8 +32,8 @@ class History:
     """Telemetry of the last `KEEP_S`, oldest first, plus one earlier sample, so that the samples
     cover all of that time at any sample rate.
 
-    `jumped`: True if the state estimate jumped within the newest samples. `turned_rad`: by how
-    much, at most, a heading change within the newest samples exceeds any possible rotation.
+    `jumped`: True if the state estimate jumped within the newest samples. `turned_rad`: largest
+    angle by which a heading change within the newest samples exceeds any possible rotation.
     `battery_changed_s`: time at which the battery's reading first arrived or last changed. `imu`:
     motion from the accelerometer over the whole flight.
     """
@@ -121,8 +121,8 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """Return the velocity, in world axes, of the first sample at or after `t_s` or, if there is
-    none, of the newest sample; zero if there are no samples."""
+    """Return the velocity (x, y, z), m/s, in world axes, of the first sample at or after `t_s` or,
+    if there is none, of the newest sample; zero if there are no samples."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)

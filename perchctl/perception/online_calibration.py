@@ -29,8 +29,8 @@ USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
 oscillate."""
 SLEW = 0.02
-"""Rate at which the applied latency changes, s/s. At 0.4 m/s, the target then appears to move at 8
-mm/s, like a drift."""
+"""Rate at which the applied latency changes, s/s. If the vehicle flies at 0.4 m/s, the target then
+appears to drift at 8 mm/s."""
 FAST_SLEW = 0.5
 """Rate at which the applied latency changes, s/s, while images and accelerometer agree on a very
 different latency. This rate is below 1 because the images' times would otherwise run backwards.
@@ -217,10 +217,12 @@ def consistency_rows(
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
     """Return three values for a frame: its rows (3, 8) for x, y and heading, with the columns
-    `PLACE` to `DRIFT_Y`; the variance (3,) of each row's noise; and the target's range, m.
+    `PLACE` to `DRIFT_Y`; the variance (3,) of each row's noise; and the target's distance from the
+    camera along the body's z axis, m.
 
     `before` and `after` are the vehicle's attitudes `ATTITUDE_STEP_S` before and after the frame's
-    time minus `delay_s`, the probable delay. `velocity_mps` is the vehicle's velocity at that time.
+    time minus `delay_s`, the probable delay. `velocity_mps` is the vehicle's velocity at that time,
+    in world axes.
     """
     assert pose.xyz_yaw_cov is not None
     T_body_cam = setup.T_body_cam
@@ -256,7 +258,9 @@ def consistency_rows(
 
 
 def _above(size: float, noise: float) -> float:
-    """Return the part of a motion that exceeds the noise; 0 if noise alone may explain it."""
+    """Return a weight, 0 to 1, for a motion of the magnitude `size` with the standard deviation
+    `noise`, both in the same unit: 0 if noise alone may explain the motion, close to 1 if the
+    motion is much larger than the noise."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 

@@ -1,8 +1,8 @@
 """Estimate the target from the frames of one stream and the vehicle's telemetry.
 
-Flying, tracking, measuring the mounting and replaying all use a `Perception`. It decides whether a
-frame can be used as a measurement, separates the fields of an interlaced frame, runs each image
-through the pipeline of `perchctl.vision`, and remembers what later frames need.
+A `Perception` is used in flight, for tracking, for measuring the mounting, and for replays. It
+decides whether a frame can be used as a measurement, separates the fields of an interlaced frame,
+runs each image through the pipeline of `perchctl.vision`, and remembers what later frames need.
 """
 
 from __future__ import annotations

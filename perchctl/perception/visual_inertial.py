@@ -180,7 +180,7 @@ def estimate_motion(
     Args:
         t_s: arrival time of the sighting minus the profile's latency.
         samples: telemetry of the last 2 s, oldest first.
-        offset_g: offset of the accelerometer.
+        offset_g: offset of the accelerometer at rest, g, body axes.
         measured: the latency in use with `camera.latency_s: measured`. If None, the latency is the
             profile's, and a mismatch persists once it is found.
     """
@@ -258,8 +258,8 @@ def _found(
     If the latency is measured in flight, the usable latencies are tried first: just after lift-off,
     any delay explains a target that has not moved relative to the camera. A usable latency does not
     explain the images if it leaves more motion than their noise, and hardly less than the latency
-    in use does. It is then only the usable value closest to a true latency that is too long to be
-    used.
+    in use does. Such a latency is merely the usable value closest to the true latency, which is too
+    long to be used.
     """
     in_use_s, least_later_s = 0.0, LEAST_LATER_S
     if measured is not None:

@@ -1,8 +1,8 @@
 """The paper's Kalman filter (section II-A.1), a constant-velocity model with eight states.
 
 The state order is the paper's: yaw, yaw rate, then position and velocity of x, y, z. The time step
-is the actual time between frames: with 15 % late frames, the error was 0.63 cm RMS with a fixed
-step and 0.19 cm with the actual one.
+is the actual time between frames: with 15 % of the frames late, the error was 0.63 cm RMS with a
+fixed step and 0.19 cm with the actual one.
 
 The biases (the vehicle's roll and pitch, the print's size and curl) are consider states: they
 increase the reported covariance but do not change the gain.

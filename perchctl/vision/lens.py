@@ -12,8 +12,8 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
-# OpenCV's default stops after five iterations, with errors of up to 0.12 px in the image's
-# corners. The tolerance is in pixels.
+# OpenCV's default stops after five iterations, with errors of up to 0.12 px in the image's corners.
+# The tolerance, the last element, is in pixels.
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
 _ZERO_VECTOR = np.zeros(3)
 

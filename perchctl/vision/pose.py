@@ -246,7 +246,7 @@ _MAX_GAUSS_NEWTON_STEPS = 8
 # freedom.
 _CORNER_SIGMA_PRIOR_DOF = 8.0
 
-_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # The step is in rad and m.
+_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # The pose step is in rad and m.
 # The nonlinearity is about the squared motion divided by the distance between corners, which is
 # 20 px or more.
 _MAX_LINEARISED_MOTION_PX = 0.3

@@ -192,7 +192,7 @@ _MAX_SAME_RANGE_SIGMAS = 4.0
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
 _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
 _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-# The message mentions a larger rotation.
+# The message about a rival mentions the rival's rotation if it is larger than this angle.
 _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
@@ -313,7 +313,8 @@ def predict_rival_state(
     filter_setup: FilterSetup,
 ) -> Array | None:
     """Return the rival's state (8,) at `t_s` if the rival was seen more recently than the locked
-    target; otherwise None.
+    target. Return None otherwise, or if lock and rival are not both in the frame of the tracks: the
+    world frame (if `is_in_world_frame`) or the level frame.
 
     Until one of the two is confirmed, the target may be at either position, so the estimate must
     cover both.

@@ -89,8 +89,9 @@ MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
 MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
 """Total time of readings under load that an estimate requires, s."""
 LOW_POWER_REPORT_DELAY_S = 5.0
-"""Time below the low-power voltage after which the firmware reports low power, s (source: power
-management). Larger: perchctl starts attempts that the battery cannot finish."""
+"""Time below the low-power voltage after which the firmware reports low power, s (from the power
+management in the firmware source). Larger: perchctl starts attempts that the battery cannot
+finish."""
 MAX_BATTERY_READING_AGE_S = 1.0
 """Age beyond which a voltage reading is no longer used, s."""
 
@@ -150,7 +151,7 @@ class BatteryFit:
 
 @dataclass(frozen=True)
 class PowerTrain:
-    """Motor type and its power supply.
+    """Electrical parameters of one motor type, brushed or brushless.
 
     Attributes:
         full_thrust_current_a: current of the four motors at full thrust, A; at lower thrust, the

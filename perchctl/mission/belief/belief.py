@@ -33,15 +33,15 @@ estimate is trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """Largest age of the newest external position, in addition to the camera's latency, at which it
 still corrects the estimated velocity, s: three pictures at 30 per second. Larger:
-`has_uncorrected_gust` reacts to an impact later."""
+`has_uncorrected_gust` detects an impact later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
 """Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
 flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
 counts as an impact."""
 GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
 """Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
-deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
-uncertain latency, impacts go unnoticed."""
+deviation; the increase is necessary because the vehicle oscillates if pictures are 0.1 s later than
+assumed. Larger: with an uncertain latency, impacts go unnoticed."""
 MAX_THRUST_REPORT_DELAY_S = 0.2
 """Time within which the telemetry reports a commanded raw thrust, s. Smaller: with late telemetry,
 the vehicle seems to ignore the commanded thrust."""
@@ -136,7 +136,7 @@ class Belief:
 
     def with_observation(self, obs: Observation, profile: Profile) -> Belief:
         """Return a copy with a newer observation. Properties that read the observation, such as
-        telemetry and ages, are new at once; the filtered fields keep their values until
+        telemetry and ages, change immediately; the filtered fields keep their values until
         `update_belief`."""
         return replace(self, obs=obs, profile=profile)
 
@@ -170,7 +170,7 @@ class Belief:
     @cached_property
     def telemetry_age_s(self) -> float:
         """Age of the oldest part of the telemetry, s. Real readings never repeat exactly, so the
-        age of a repeated reading counts from its first sample."""
+        age of a repeated reading is measured from its first sample."""
         tel, imu = self.obs.telemetry, self.obs.imu
         oldest_s = max(tel.behind_s, imu.only_attitude_frozen_for_s, imu.only_position_frozen_for_s)
         return self.obs.t_s - tel.t_s + oldest_s

@@ -1,20 +1,21 @@
 """Evidence that something supports, presses or holds the vehicle.
 
 The vehicle has no force sensor, so a contact is inferred from thrust, accelerometer and motion
-together. In the air, thrust minus weight accelerates the vehicle. A supported or pressed vehicle
-reads 1 g and does not move, whatever its thrust. A vehicle at rest that reads 1 g is therefore in
-contact if its thrust is far from hover thrust: with more thrust it presses, with less something
-supports it. The vehicle's position and its maneuver then distinguish the magnet from the floor, and
-both from another object.
+together. In the air, thrust minus weight accelerates the vehicle. If the vehicle is supported or
+pressed, its accelerometer reads 1 g and it does not move, whatever its thrust. A vehicle at rest
+whose accelerometer reads 1 g is therefore in contact with something if its thrust is far from hover
+thrust: with more thrust, the vehicle presses; with less thrust, something supports the vehicle. The
+vehicle's position and its maneuver then distinguish the magnet from the floor, and both from
+another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`TARGET_CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and
-against an unknown object without a position (`IMU_SHOWS_SUPPORT`). `IMU_SHOWS_SUPPORT` also covers
-too little thrust; that threshold is as far below hover thrust as the first one is above it. A
-change of `MIN_PRESS_TO_HOVER_THRUST_RATIO` therefore affects all of these conditions, and
-`Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to
-support the vehicle (`is_thrust_too_low_to_fly`).
+against an unknown object without a position (`IMU_SHOWS_SUPPORT`). `IMU_SHOWS_SUPPORT` also applies
+if the thrust is too small; its lower threshold is as far below hover thrust as the threshold for a
+press is above it. A change of `MIN_PRESS_TO_HOVER_THRUST_RATIO` therefore affects all of these
+conditions, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too
+small to support the vehicle (`is_thrust_too_low_to_fly`).
 
 `find_support` combines these conditions into one result: the vehicle flies, presses, hangs on the
 magnet, hangs on something else or stands, or its support is unknown. `true_for_s` returns how long
@@ -86,7 +87,7 @@ DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
 MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M = 0.02
-"""Largest upward drift of the estimated height with which a slip is still detected, m."""
+"""Largest upward drift of the estimated height despite which a slip is still detected, m."""
 MIN_DESCENT_TO_ACCEPT_FLOOR_M = 0.1
 """Height loss beyond which a descending vehicle counts as having come down, m."""
 MAX_DESCENT_IF_HELD_AT_START_M = 0.1
@@ -158,7 +159,8 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
-    # If the climb is so slow that the speed does not show its end, the image still shows the gap.
+    # In a very slow climb, the speed does not show when the climb ends, but the image still shows
+    # the gap between gear and target.
     before_touch_s = max(before_touch_s, z_m / perch.climb_mps)
     sigma_m = math.hypot(
         target.measured_gear_to_target_sigma_m,
@@ -337,7 +339,7 @@ def _is_in_contact_with_target(b: Belief) -> bool:
     """True if position, acceleration and thrust together show a contact.
 
     The gear has stopped at the target's height, the accelerometer reads 1 g, and the thrust exceeds
-    hover thrust, so the ceiling must take the difference.
+    hover thrust, so the ceiling must be pushing back.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
@@ -427,8 +429,8 @@ def _are_motors_off_despite_thrust_command(b: Belief) -> bool:
 
 def _is_on_floor(b: Belief) -> bool:
     """True if the vehicle is motionless, at a thrust too small to support it, and is near the
-    ground or has descended. The height alone does not decide, because the estimate may have
-    drifted."""
+    ground or has descended. The height alone is not sufficient evidence, because the estimate may
+    have drifted."""
     near_target = (
         b.obs.target is not None
         and abs(b.target.gear_to_target_z_m) <= MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M
@@ -567,7 +569,7 @@ def find_support(b: Belief) -> Support:
     on another object only if the gear is certainly outside that radius or certainly below the
     target. (The gear cannot be above the target, because the ceiling is there: such an estimate is
     wrong and proves nothing.) In all other cases, the support is UNKNOWN, and a row of the
-    transition table must assume the more dangerous of the two supports.
+    transition table must assume the more dangerous of the possible supports.
 
     The support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates,
     and in the first tick of a maneuver.
@@ -600,11 +602,12 @@ def _find_what_vehicle_hangs_on(b: Belief) -> Support:
 def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     """True if the data that the condition requires is fresh in this tick.
 
-    There are two exceptions. With the target as the only position source, `TARGET_CONTACT` needs no
-    valid position during a press, because the last sighting is accurate enough for a while. During
-    a descent, `HANGING` needs no position and accepts telemetry as old as
-    `safety.telemetry_hold_s`. Otherwise, a vehicle with poor telemetry would hang on the magnet
-    with its motors running. The weight transfer that then begins still needs fresh telemetry.
+    Two conditions are accepted without all of the data that they require. With the target as the
+    only position source, `TARGET_CONTACT` needs no valid position during a press, because the last
+    sighting is accurate enough for a while. During a descent, `HANGING` needs no position and
+    accepts telemetry as old as `safety.telemetry_hold_s`. Without this exception, a vehicle that
+    hangs on the magnet would keep its motors running while its telemetry is poor. The weight
+    transfer that then begins still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s

@@ -46,7 +46,7 @@ moves the vehicle unnoticed. Smaller: the vehicle flies the last centimetres wit
 instead."""
 MIN_NIS_TO_RESTART_FILTER = 20.0
 """Normalized innovation squared (two degrees of freedom) above which a picture restarts the filter;
-chance exceeds it once in 20,000 pictures. Larger: after a jump of the pose, the velocity is
+by chance, one in 20,000 pictures exceeds it. Larger: after a jump of the pose, the velocity is
 wrong."""
 MAX_VELOCITY_SIGMA_TO_PREDICT_MPS = 0.03
 """Largest standard deviation of the filter's velocity at which the filter is used, m/s; above it,
@@ -83,7 +83,7 @@ class OffsetVelocityCovariance(NamedTuple):
 
 
 UNSET_COVARIANCE = OffsetVelocityCovariance()
-"""Covariance before the first picture; not used."""
+"""Placeholder for the covariance before the first picture; its values are never used."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from perchctl.vehicle import PositionSetpoint
 
 @dataclass(frozen=True, kw_only=True)
 class Maneuver:
-    """The purpose of the flight in a phase, as far as the interpretation of evidence depends on it.
+    """What the vehicle is meant to do in a phase, as far as this affects how evidence is
+    interpreted.
 
     The same reading has different meanings in different maneuvers: a motionless vehicle at low
     thrust hangs after a press, but stands on the floor in a descent. Each phase declares its

@@ -28,7 +28,7 @@ battery."""
 ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION = 0.03
 """Relative standard deviation of a hover thrust estimated from the accelerometer in flight, due to
 the accelerometer's scale error. Larger: quiet flight just after take-off has more weight. Smaller:
-it has less weight."""
+quiet flight just after take-off has less weight."""
 MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION = 0.05
 """Relative standard deviation above which the hover thrust is too rough for a descent without
 telemetry. Larger: the vehicle descends too fast. Smaller: the vehicle waits in the air for

@@ -73,7 +73,7 @@ vehicle, m."""
 STILL_AT_CONTACT_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
 MAX_FILTER_STEP_S = 0.1
-"""Longest time that a single sample may stand for in the filters of hover thrust and tilt, s.
+"""Longest time that a single sample may represent in the filters of hover thrust and tilt, s.
 Larger: after a gap, a single sample has the weight of many."""
 MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
 """Difference between commanded and reported thrust that no ramp can cause, as a fraction of full
@@ -371,7 +371,7 @@ def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
-    # Late pictures make the estimated height diverge, too.
+    # Late pictures also make the estimated height diverge.
     climb_mps = motion.climb_mps if b.camera_imu_mismatch.camera_latency_error_s != 0.0 else None
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
@@ -440,7 +440,8 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
     """Return the loop time from which the magnet may have held the vehicle; None if it cannot hold
     it."""
     in_magnet_reach_since_s = b.in_magnet_reach_since_s
-    # once the weight transfer or the motor stop has begun, it does not move into or out of reach
+    # once the weight transfer or the motor stop has begun, the vehicle does not move into or out of
+    # the magnet's reach
     if not b.command_history.is_before_weight_transfer_and_motor_stop:
         return in_magnet_reach_since_s
     # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
@@ -523,7 +524,9 @@ def _update_estimators(b: Belief) -> Belief:
 
 
 def _filter_thrust_direction(b: Belief, sample_dt_s: float) -> tuple[float, float]:
-    """Return the mean thrust direction, world x and y, after a sample that covers `sample_dt_s`."""
+    """Return the low-pass filtered horizontal part (x, y) of the unit vector along the thrust, in
+    world axes, after a sample that covers `sample_dt_s`; the time constant is
+    `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`."""
     gain = 1.0 - math.exp(-sample_dt_s / MEAN_THRUST_DIRECTION_TIME_CONSTANT_S)
     (x, y), (mean_x, mean_y) = b.thrust_direction_world_xy, b.mean_thrust_direction_world_xy
     return mean_x + gain * (x - mean_x), mean_y + gain * (y - mean_y)

@@ -1,7 +1,7 @@
 """Phase 4, ALIGN: move under the target at constant height, and turn to its heading.
 
-In a fleet, the vehicle waits here, below its target, until the parent permits the climb. A
-permission that is withdrawn later does not end an ascent.
+In a fleet, the vehicle waits here, below its target, until the parent permits the climb. The ascent
+continues even if the permission is withdrawn later.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
 """Longest wait for permission to climb, s, from the entry into the phase or the end of a hold;
 `planner.perching_time_s` limits the total. Larger: the battery of a vehicle without permission runs
-down. Smaller: a neighbour that blocks the climb only for a while, because it lands or until the
-parent has ended a process that does not respond, also ends this flight."""
+down. Smaller: a neighbour also ends this flight if it blocks the climb only briefly, while it lands
+or until the parent has ended its unresponsive process."""
 
 ALIGNED = Condition[Context](
     "aligned",

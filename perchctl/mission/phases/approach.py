@@ -13,8 +13,8 @@ from perchctl.vehicle import PositionSetpoint
 
 MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
-there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
-stands jumps up."""
+there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on
+the ground jumps up."""
 MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
 """Fraction of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
 MIN_REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8

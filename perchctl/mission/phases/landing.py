@@ -15,13 +15,14 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
 TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S = 2.0
-"""Time after the motors are off during which the camera may still show the target far above, s."""
+"""Time after the motors stop during which a picture may still show that the target is far above the
+vehicle, s."""
 
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the descent. If the row that started it asserts that external positions or the mounting
-    are wrong, the descent does not use them. Unless the row asserts that the vehicle hangs, the
-    last contact is forgotten."""
+    """Start the descent. If the row that started the landing asserts that external positions or the
+    mounting are wrong, the descent does not use them. Unless the row asserts that the vehicle
+    hangs, the last contact is forgotten."""
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.

@@ -4,11 +4,11 @@ ASCEND ends with the vehicle settled at the stand-off; PERCH has no entry action
 setpoint rises through the target, or raw thrust presses (`planner.perch` in the profile,
 `PerchConfig`). Position, acceleration and thrust together prove a contact (`TARGET_CONTACT` in
 `belief/contact.py`). A contact within the magnet's radius leads to COMPLETE. A contact outside it
-leads to RECOVER. So does a push from the side, a press without contact, and, with the target as the
-only position source, a press that lasts too long without a new position. Each of these is a failed
-attempt. The rows in `safety.py` come first, including those for a magnet that catches early and for
-an obstacle. No hold applies in this phase because a hold would leave the vehicle pressed
-(`hold_reason`).
+leads to RECOVER. A push from the side, a press without contact and, with the target as the only
+position source, a press that lasts too long without a new position also lead to RECOVER. Each of
+these four cases is a failed attempt. The rows in `safety.py` come first, including those for a
+magnet that catches early and for an obstacle. No hold applies in this phase because a hold would
+leave the vehicle pressed (`hold_reason`).
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ PERCH = PhaseDefinition(
             "pushed sideways under the target",
         ),
         back_off_row(
-            # The timeout includes the loop's lateness, since the next tick may be as late as this
-            # one.
+            # The delay of this tick counts towards the timeout because the next tick may be just as
+            # late.
             "no-contact",
             {Phase.PERCH},
             lambda c: c.time_in_phase_s + c.obs.tick_start_delay_s > c.planner.perch.timeout_s,

@@ -45,7 +45,7 @@ MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time that the vehicle recovers before the last failed attempt ends the flight, s."""
 UNLIMITED_SETPOINT_DESCENT_RATE_MPS = 10.0
-"""Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
+"""Downward speed of the setpoint, m/s: so high that the setpoint reaches its goal at once."""
 
 STEADY_AFTER_ATTEMPT = Condition[Context](
     "steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps
@@ -101,7 +101,7 @@ def _find_gear_to_target_at_touch(
             else None
         )
     proven = b.true_for_s(TARGET_CONTACT) >= previous_context.planner.perch.contact_dwell_s
-    # `IMU_SHOWS_SUPPORT` includes that dwell time
+    # the predicate of `IMU_SHOWS_SUPPORT` already requires this dwell time
     carried = proven or b.true_for_s(IMU_SHOWS_SUPPORT) >= 0.0
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
         return current_gear_to_target(b)
@@ -151,8 +151,8 @@ def has_recovered(c: Context) -> bool:
 
 
 def unsteady_reason(c: Context) -> str:
-    """Return a text that lists the measurements by which the vehicle was judged unsteady. It says
-    what was observed, not why."""
+    """Return a text that lists the measurements by which the vehicle was judged unsteady. The text
+    gives no causes."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:

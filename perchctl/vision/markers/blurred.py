@@ -212,7 +212,8 @@ _MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
 _MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
 _ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
-_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # mean side after the fit over the one at its start
+# Limits of the mean side after the fit, divided by the mean side at its start.
+_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6
 _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6
 
 

@@ -137,8 +137,8 @@ def sample_profiles(
     repeated.
 
     The image is converted to float because OpenCV 5 interpolates float images at the exact
-    position. For 8-bit images, OpenCV rounds positions to 1/32 px. This would be as large as the
-    intended standard deviation of the edge positions.
+    position. For 8-bit images, OpenCV rounds positions to 1/32 px. The rounding error would be as
+    large as the intended standard deviation of the edge positions.
     """
     h, w = image.shape
     reach = float(profile_half_length_px.max()) + 2.0
@@ -391,7 +391,7 @@ def _measure_edge_shift(
 
     A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. On a
     scale whose unit is the measured outer edge, an inner edge at r then appears at r + d (1 + r).
-    This is solved for d.
+    The function solves this equation for d.
     """
     if inner_edges is None:
         return None

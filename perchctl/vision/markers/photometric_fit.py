@@ -59,7 +59,7 @@ _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 _CONVERGED_STEP_PX = 0.05  # After a step this small, the next one is usually a tenth of it.
 # After a larger motion, the lens distortion is computed again.
 _MAX_DISTORTION_REUSE_MOTION_PX = 0.3
-_MAX_HOMOGRAPHY_INCREMENT = 0.5  # If an iteration exceeds it, the fit has diverged.
+_MAX_HOMOGRAPHY_INCREMENT = 0.5  # With a larger increment, the fit has diverged.
 # Standard deviations of the change of shape since the start, in half sides: of rotations and
 # scales, and of the perspective.
 _SHAPE_SIGMA, _PERSPECTIVE_SIGMA = 0.2, 0.03
@@ -90,7 +90,7 @@ _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
         ]
     )
     ** -2.0
-)  # One value per element of the increment. The position is practically free.
+)  # One value per element of the increment; the position is practically unconstrained.
 
 
 @dataclass(frozen=True, eq=False)
