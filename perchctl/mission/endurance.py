@@ -77,7 +77,7 @@ def predict_hover_time_s(
     """Return the hover time, s, at `hover_thrust_fraction` (fraction of full thrust) until the row
     `battery-low` applies; None if unknown.
 
-    The row applies to the earlier of two events. The firmware reports low power
+    The row `battery-low` applies at the earlier of two events. The firmware reports low power
     `LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the voltage
     falls below `safety.min_load_v`, in hover or during a press.
     """

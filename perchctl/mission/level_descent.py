@@ -387,8 +387,8 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     Both b and w are means over the time with a known position, so an offset of the accelerometer
     cancels. Means over less than `ACCELERATION_BIAS_TIME_CONSTANT_S` have less weight. Means from
     wrong positions have no weight, and the bias that pictures have shown recently is used instead.
-    The present reading is not used, since most of it is the drag of the vehicle's own motion, which
-    brakes it.
+    The present reading is not used, since most of it is drag due to the vehicle's own motion, and
+    this drag brakes the vehicle.
     """
     b = c.belief
     if b.is_heading_lost or b.is_possibly_in_magnet_reach:

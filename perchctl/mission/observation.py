@@ -22,7 +22,8 @@ class CameraImuMismatch:
 
 @dataclass(frozen=True)
 class VisualInertialMotion:
-    """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are world x and y."""
+    """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are (x, y) in world
+    axes."""
 
     t_s: float
     velocity_world_xy_mps: tuple[float, float]

@@ -101,7 +101,7 @@ def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) ->
 def _enter_phase(c: Context, row: Transition) -> PlannerState:
     """Return the state after the transition of `row` into the next phase."""
     state = c.state
-    # A commanded press has wound up the integrators, whatever thrust is reported. A vehicle whose
+    # A commanded press has wound up the integrators, whatever the reported thrust. A vehicle whose
     # fall is being caught runs at full thrust without pressing.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
     presses_against_target = state.phase is Phase.PERCH or is_pressing(c.belief)

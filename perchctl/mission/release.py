@@ -1,7 +1,7 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
 In position mode, the onboard controller never goes below `MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw
-thrust can be reduced until the motors stand still (docs/firmware.md, "Release in raw mode"): the
+thrust can be reduced until the motors stop turning (docs/firmware.md, "Release in raw mode"): the
 whole weight is transferred to the magnet and monitored before the motors are stopped.
 """
 
@@ -53,7 +53,7 @@ STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 
 # --- catch ---
 CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
-"""Height of the setpoint above a falling vehicle whose motors stand still, m."""
+"""Height of the setpoint above a falling vehicle whose motors have stopped, m."""
 CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""

@@ -51,8 +51,9 @@ OFFSET_MPS2, SIGMA_M = 0.2, 0.003
 # flight
 LEAST_LATER_S = 0.1
 BEYOND_S = 0.03
-"""By how much a measured latency may be outside the usable range, s: the step of the grid plus the
-jitter of an image's time. Larger: an error that cannot be corrected counts as correctable."""
+"""Largest amount by which a measured latency may be outside the usable range, s: the step of the
+grid plus the jitter of an image's time. Larger: an error that cannot be corrected counts as
+correctable."""
 MEASURED_LATER_S = 0.03
 """Smallest error of a measured latency that is corrected here, s; a smaller one is left to the more
 accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment

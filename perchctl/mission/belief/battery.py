@@ -57,8 +57,8 @@ TYPICAL_FULL_THRUST_SAG_V = 0.63
 """Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
 battery could finish."""
 FULL_THRUST_SAG_SIGMA_V = 0.3
-"""Standard deviation of the sag between batteries, V. Smaller: the fit recognizes a worn battery
-late."""
+"""Standard deviation of the sag between batteries, V. Smaller: the fit takes longer to recognize a
+worn battery."""
 MIN_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
 TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.1
@@ -72,8 +72,8 @@ MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO = 3.0
 ONE_SECOND_MEAN_VOLTAGE_SIGMA_V = 0.02
 """Standard deviation of the mean of the voltage readings over one second, V."""
 BATTERY_FIT_TIME_CONSTANT_S = 40.0
-"""Time constant with which the fit forgets old readings, s. Larger: the fit adapts late to a change
-in temperature."""
+"""Time constant with which the fit forgets old readings, s. Larger: the fit adapts too slowly to a
+change in temperature."""
 REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
 THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3

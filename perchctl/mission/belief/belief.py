@@ -386,7 +386,7 @@ class Belief:
         """Lateral acceleration (x, y) in world axes, m/s^2, from the tilt minus its mean (a
         low-pass filter with the time constant `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`). The mean
         tilt is assumed not to accelerate the vehicle: it balances the wind, an uneven mass
-        distribution, or an error of the estimated attitude. The result is wrong after a change of
+        distribution, or an error of the estimated attitude. The result is wrong after a change in
         the wind, until the mean has settled."""
         (x, y), (mean_x, mean_y) = (
             self.thrust_direction_world_xy,

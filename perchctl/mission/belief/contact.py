@@ -55,7 +55,7 @@ MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
 """Fraction of hover thrust up to which thrust cannot hold the vehicle in the air. With more thrust,
 the ground effect of the ceiling may hold it."""
 MAX_MOTORS_STOPPED_THRUST = 5000
-"""Largest raw thrust, 0..65535, at which the motors stand still."""
+"""Largest raw thrust, 0..65535, at which the motors do not turn."""
 MIN_POSSIBLE_HOVER_THRUST = 1000
 """Smallest reported thrust, 0..65535, that may be hover thrust; the hover thrust of any vehicle is
 far larger."""
@@ -502,7 +502,8 @@ SLIPPING = Condition("slipping", is_slipping)
 HANGING_WITH_MOTORS_STOPPED = Condition(
     "the whole weight hangs", _is_hanging_with_motors_stopped, required_data=RequiredData.TELEMETRY
 )
-"""The vehicle hangs with its whole weight: the motors stand still, and it does not slip."""
+"""The vehicle hangs with its motors stopped: its support carries the whole weight, and the vehicle
+does not slip."""
 HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
 """Something holds the vehicle up, off the floor."""
 MOTORS_OFF_AS_COMMANDED = Condition(

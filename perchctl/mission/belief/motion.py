@@ -51,8 +51,8 @@ MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS = -0.3
 vehicle never reaches it, and a falling one reaches it after 5 cm. Closer to 0: noise counts as a
 fall."""
 MAX_FROZEN_READING_S = 0.2
-"""Time of identical readings that counts as a gap, s. Smaller: readings with a coarse resolution
-repeat by chance."""
+"""Duration of a series of identical readings that counts as a gap, s. Smaller: readings with a
+coarse resolution repeat by chance."""
 MAX_ACCELEROMETER_READING_IN_FREE_FALL_G = 0.6
 """Specific force below which a vehicle counts as falling, g. Larger: the end of a press counts as a
 fall."""
@@ -75,7 +75,7 @@ UP_ACCELERATION_OFFSET_TIME_CONSTANT_S = 3.0
 fall is learned as an offset."""
 MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G = -0.3
 """Acceleration along the world's upward axis below which a reading is an impact on the ceiling and
-not a fall, g. Closer to 0: the first samples of a fall are cut off."""
+not a fall, g. Closer to 0: the first samples of a fall are clipped."""
 MIN_FLOOR_IMPACT_SPEED_GAIN_MPS = 0.22
 """Upward speed gained within `IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S` that only the floor can
 cause, m/s. Smaller: an increase in thrust is mistaken for the floor."""

@@ -36,15 +36,15 @@ DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
-"""Time constant with which the bias is learned, s. Larger: the bias adapts late to a change of the
-wind. Smaller: a gust is learned as a bias."""
+"""Time constant with which the bias is learned, s. Larger: the bias adapts too slowly to a change
+in the wind. Smaller: a gust is learned as a bias."""
 MAX_ACCELERATION_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware mistakes for a tilt, causes 1.2. Larger:
 wrong positions can cause a bias larger than any attitude error."""
 MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
 """Largest difference in one sample from which the bias is learned, m/s^2; a larger difference is
-due to an impact or a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a
-gust is not learned."""
+due to an impact or a correction of the estimate. Larger: the effect of a 40 ms kick is learned.
+Smaller: a gust is not learned."""
 CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
 """Margin by which the vehicle may climb faster than dead reckoning says, m/s. Larger: the magnet
 seems to be in reach too early."""
@@ -67,7 +67,7 @@ MAX_ESTIMATED_VELOCITY_BIAS_MPS = 0.6
 counts as still while its position creeps. Smaller: in wind, the vehicle never counts as steady."""
 ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
-of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
+in the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
 VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
@@ -369,7 +369,7 @@ def learn_estimated_velocity_bias(
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both passed through the same low-pass filter. The learned
-    bias is wrong for about `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
+    bias is wrong for about `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change in the wind.
     """
     dt_s = new.t_s - last.t_s
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:

@@ -20,10 +20,10 @@ MIN_FIRMWARE_POSITION_MODE_THRUST = 20000
 ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION = 0.02
 """Standard deviation of a hover-thrust measurement averaged over one second, as a fraction of the
 thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter adapts
-late to a sagging battery. Smaller: the filter learns these variations."""
+too slowly to a sagging battery. Smaller: the filter learns these variations."""
 HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT = 0.01
 """Random walk of the hover thrust in quiet flight, as a fraction of the thrust per square root of a
-second. Larger: the filter learns a lasting push. Smaller: the filter adapts late to a sagging
+second. Larger: the filter learns a lasting push. Smaller: the filter adapts too slowly to a sagging
 battery."""
 ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION = 0.03
 """Relative standard deviation of a hover thrust estimated from the accelerometer in flight, due to

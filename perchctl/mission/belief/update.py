@@ -79,7 +79,7 @@ MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
 """Difference between commanded and reported thrust that no ramp can cause, as a fraction of full
 thrust."""
 KEEPALIVE_RAW_THRUST = 1000
-"""Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
+"""Raw thrust, 0..65535, that does not turn the motors but still satisfies the setpoint watchdog."""
 MEAN_THRUST_DIRECTION_TIME_CONSTANT_S = 0.5
 """Time constant of the mean tilt, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off the target's axis. Smaller: feedback of the tilt no longer damps the

@@ -30,12 +30,11 @@ MIN_ASCENT_SETPOINT_CLIMB_RATE_MPS = 0.02
 """Lowest speed at which the setpoint approaches the stand-off, m/s."""
 HOVER_HEIGHT_TOLERANCE_M = 0.05
 """Largest vertical distance from the hover position at which the vehicle has reached it, m. Larger:
-the hover begins during the climb. Smaller: an error of the height keeps the hover from
-beginning."""
+the hover begins during the climb. Smaller: a height error prevents the hover from beginning."""
 HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
 """Largest vertical distance of the setpoint from the hover position at which the hover can begin,
 m; the setpoint stays at its height during the hover. Larger: the vehicle hovers too low. Smaller:
-noise of the target's height keeps the hover from beginning."""
+noise in the target's estimated height prevents the hover from beginning."""
 MAX_TIME_WITHOUT_TARGET_S = 1.5
 """Time since the last sighting of the target after which an ascent or a hover is given up, s, if a
 positioning system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that

@@ -20,7 +20,7 @@ def stay_idle(c: Context) -> Action:
 
 def act_in_aborted(c: Context) -> Action:
     """Stop the motors once. Without a stop command, the firmware would lock a hanging vehicle whose
-    motors stand still."""
+    motors have stopped."""
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (

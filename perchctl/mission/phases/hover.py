@@ -41,7 +41,7 @@ MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S = 5.0
 counts as hovering although it is too low. Smaller: a climb in wind restarts the timer."""
 MAX_HOVER_HEIGHT_ERROR_M = 0.15
 """Vertical distance from the hover position beyond which the vehicle has left it, m. Larger: a
-hover that sinks or rises still counts. Smaller: a gust restarts the timer."""
+vehicle that sinks or rises still counts as hovering. Smaller: a gust restarts the timer."""
 
 SUNK_BELOW_HOVER_HEIGHT = Condition[Context](
     "sunk", lambda c: distance_below_hover_height_m(c) > MAX_SINK_BELOW_HOVER_HEIGHT_M

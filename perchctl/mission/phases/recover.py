@@ -43,7 +43,7 @@ is used."""
 MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
-"""Time that the vehicle recovers before the last failed attempt ends the flight, s."""
+"""Time for which the vehicle recovers before the last failed attempt ends the flight, s."""
 UNLIMITED_SETPOINT_DESCENT_RATE_MPS = 10.0
 """Downward speed of the setpoint, m/s: so high that the setpoint reaches its goal at once."""
 

@@ -53,8 +53,8 @@ _START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # Initial guesses of the blur
 _MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_QUAD_CORRELATION = 0.5
-# Minimum correlation at an expected position. Textures seldom reach it; each one that does costs a
-# fit.
+# Minimum correlation at an expected position. Textures seldom reach this correlation; each texture
+# that does costs the time of a fit.
 _MIN_EXPECTED_MARKER_CORRELATION = 0.45
 _MAX_QUADS_TO_FIT = 3
 _CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # Grey of areas with unknown content.
