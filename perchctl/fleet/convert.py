@@ -39,8 +39,8 @@ class ConvertedVehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedFleet:
-    """Another program's list. `skipped`: the vehicles that are disabled in the list.
-    `in_room_axes`: True if, according to the list, a Lighthouse measures the positions."""
+    """A list of vehicles from another program. `skipped`: the vehicles that are disabled in the
+    list. `in_room_axes`: True if, according to the list, a Lighthouse measures the positions."""
 
     name: str
     vehicles: tuple[ConvertedVehicle, ...]

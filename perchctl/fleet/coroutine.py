@@ -21,8 +21,8 @@ R = TypeVar("R")
 
 
 class CoroutineClosed(BaseException):
-    """Ends a function whose owner has closed it. This is not an Exception, so that the function's
-    `except Exception` clauses do not catch it."""
+    """Raised inside a function to end it after its owner has closed the `ThreadCoroutine`. This is
+    not an Exception, so that the function's `except Exception` clauses do not catch it."""
 
 
 class ThreadCoroutine(Generic[R]):
@@ -43,7 +43,7 @@ class ThreadCoroutine(Generic[R]):
 
     def resume(self) -> bool:
         """Let the function run until it pauses or ends; return True if it has ended. An exception
-        in the function is raised here."""
+        that the function has raised is raised again here."""
         if not self._ended:
             self._baton.release()
             self._returned.acquire()
@@ -72,7 +72,7 @@ class ThreadCoroutine(Generic[R]):
                 self.result = self._function()
         except CoroutineClosed:
             pass
-        except BaseException as error:  # `resume` raises it in the owner's thread
+        except BaseException as error:  # `resume` raises this error in the owner's thread
             self._error = error
         self._ended = True
         self._returned.release()

@@ -1,11 +1,11 @@
 """Who may take off, who lands, and why: all decisions of the parent, as pure functions.
 
     nothing is permitted until all are ready at the same time and the operator has confirmed
-    groups fly in the order of the schedule, each once all of the group before have ended
-    no vehicle takes off if another one has ended in its corridor, or at an unknown place
+    groups fly in the order of the schedule, each after all flights of the previous one have ended
+    no vehicle takes off if another one's flight has ended in its corridor or at an unknown place
     a failure before the first take-off ends all flights; later, only with ``on_failure: land-all``
     two vehicles in the air that are known to be too close to each other land
-    no vehicle begins to climb while another one is near its climb, or may be
+    no vehicle begins to climb while another one is, or may be, near the column in which it climbs
 
 A vehicle's reported position is used only if it is measured in room axes (``frame: room``). For all
 other vehicles, the positions in the plan are used.

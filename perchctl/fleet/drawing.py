@@ -17,7 +17,7 @@ from perchctl.fleet.schedule import vehicle_corridor
 
 DRAWING_COLUMNS = 80
 DRAWING_ROWS = 34
-"""Rows of the map. With more, it does not fit on a screen together with its legend."""
+"""Rows of the map. With more rows, the map and its legend do not fit on a screen."""
 CELL_ASPECT = 2.0
 """Ratio of height to width of a character in a typical terminal."""
 MARGIN_M = 0.2
@@ -41,7 +41,7 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     low, high = _bounds(corridors)
     width_m, height_m = high[0] - low[0], high[1] - low[1]
     cell_m = max(width_m / DRAWING_COLUMNS, height_m / (DRAWING_ROWS * CELL_ASPECT))
-    label = len(f"{len(fleet.vehicles)}*")  # also fits a room that is long and narrow
+    label = len(f"{len(fleet.vehicles)}*")  # the smallest width, for a room that is long and narrow
     columns = min(DRAWING_COLUMNS, max(label, math.ceil(width_m / cell_m)))
     rows = min(DRAWING_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
     cells = [

@@ -18,7 +18,8 @@ Assign = Literal["fixed", "nearest"]
 ONE_AT_A_TIME = "one-at-a-time"
 TOGETHER = "together"
 MOST_VEHICLES = 32
-"""Largest number of vehicles in a fleet. With more, computing a plan would take too long."""
+"""Largest number of vehicles in a fleet. With more vehicles, computing a plan would take too
+long."""
 
 
 def vehicle_seed(fleet_seed: int, number: int) -> int:
@@ -66,8 +67,8 @@ class FleetVehicle:
 
     @property
     def address(self) -> str:
-        """A text that is the same for all URIs of a vehicle: its URI without dongle and options, in
-        one letter case."""
+        """A string that is the same for all URIs of a vehicle: its URI without dongle and options,
+        in one letter case."""
         return vehicle_uri(self.uri)
 
     @property
@@ -77,8 +78,9 @@ class FleetVehicle:
 
     @property
     def as_flown(self) -> FleetVehicle:
-        """The vehicle as its own process flies it. The axes of a simulated vehicle have their
-        origin where it stands, even if a simulated motion-capture system measures its position."""
+        """The vehicle with the axes that its own process uses. The axes of a simulated vehicle have
+        their origin where it stands, even if a simulated motion-capture system measures its
+        position."""
         if not self.simulated or self.frame == "home":
             return self
         return replace(self, frame="home").with_target(self.target_m)
@@ -132,7 +134,7 @@ class Fleet:
     motion-capture body, and with ``assign: nearest`` each vehicle already has its target.
 
     Attributes:
-        order: ``one-at-a-time``, ``together`` or ``N at a time``; `most_at_once` has the number.
+        order: ``one-at-a-time``, ``together`` or ``N at a time``; `most_at_once` gives the number.
         on_failure: whether the other vehicles continue or land after one has failed.
         separation_m: minimum distance between two corridors that are flown at the same time; None:
             the default (`perchctl.fleet.schedule`).

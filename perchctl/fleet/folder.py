@@ -33,8 +33,8 @@ class FleetFolder:
     lines: dict[str, str]
 
     def filmed(self) -> list[FilmedVehicle]:
-        """Return each vehicle that has a log, for `perchctl.analysis.write_fleet_film`. Errors:
-        those of reading a log, and InvalidValue if ``fleet.json`` does not contain the plan."""
+        """Return each vehicle that has a log, for `perchctl.analysis.write_fleet_film`. Raises the
+        errors of reading a log, and InvalidValue if ``fleet.json`` does not contain the plan."""
         from perchctl.analysis import FlightAnalysis
 
         flights = {}

@@ -22,7 +22,7 @@ def identify_fleet(
     """Yield the name and a row for each vehicle as soon as the row is known. Connects to one
     vehicle at a time, so vehicles that share a dongle need no radio hub.
 
-    Errors: those of `flight_options` and of `perchctl.check.check`.
+    Raises the errors of `flight_options` and of `perchctl.check.check`.
     """
     options = flight_options(plan, Path(plan.fleet.name), 0, False)
     for vehicle in plan.fleet.vehicles:

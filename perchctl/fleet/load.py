@@ -290,8 +290,8 @@ def _body(vehicle: FleetVehicle) -> str | None:
 def _split(
     where: str, model: type[Section], values: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the keys of `model` and those of the profile. Raises InvalidValue for any other
-    key."""
+    """Split `values` into the keys of `model` and those of the profile. Raises InvalidValue for any
+    other key."""
     own = {name: value for name, value in values.items() if name in model.model_fields}
     sections = {name: value for name, value in values.items() if name in _PROFILE_KEYS}
     for name in values:

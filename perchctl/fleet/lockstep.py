@@ -287,8 +287,9 @@ class FleetFlight:
         self._results[seat.name] = result
         body.rest()
         vehicle = self._plan.fleet.vehicle(seat.name)
-        # An estimate in room axes shows where the vehicle really started; it is simulated in axes
-        # that start there. For any other estimate, the parent assumes the start given in the file.
+        # An estimate in room axes shows where the vehicle really started; the axes of its
+        # simulation have their origin there. For any other estimate, the parent assumes the start
+        # given in the file.
         axes = self._placed[seat.name].true if vehicle.frame == "room" else vehicle
         hangs = result.outcome == "perched"
         self._known_m[seat.name] = vehicle.target_m if hangs else axes.to_room(seat.known_m)
@@ -327,8 +328,8 @@ class FleetFlight:
         return next(filter(None, (self._in_the_way(other, name) for other in self._known_m)), "")
 
     def _in_the_way(self, other: str, name: str) -> str:
-        """Return why a vehicle whose flight has ended is in the way of `name`; empty if it is not.
-        A vehicle at an unknown position (NaN) is always in the way."""
+        """Return why the vehicle `other`, whose flight has ended, is in the way of the vehicle
+        `name`; empty if it is not. A vehicle at an unknown position (NaN) is always in the way."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
         does = "hangs" if hangs else "lies"

@@ -67,7 +67,7 @@ class Order:
     Attributes:
         may_take_off: permission to take off; has no effect in the air.
         may_climb: permission to begin the climb to the target; has no effect once it has begun.
-        why_not_climb: reason why there is no such permission, to be shown.
+        why_not_climb: reason why the vehicle may not begin the climb, for display.
         sent_s: time of the decision by `time.monotonic`, a clock that all processes share.
         word: the operator's command; once a vehicle has received one, it stays in effect.
     """

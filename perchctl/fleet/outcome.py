@@ -45,7 +45,7 @@ _WORST_FIRST: tuple[type[PerchError], ...] = (
     UsageError,
     LogIncomplete,
     ReplayDiffers,
-    Interrupted,  # last: it also ends vehicles that land because another one has failed
+    Interrupted,  # last, because vehicles that land after another's failure also end with it
 )
 
 
@@ -54,7 +54,7 @@ _CODES_WORST_FIRST = (*(cls.exit_code for cls in _WORST_FIRST), 0)
 
 def worst_code(codes: Iterable[int]) -> int:
     """Return the most severe of these exit codes; 0 if there are none. A code that perchctl does
-    not use counts as that of `PerchError`."""
+    not use is treated as the exit code of `PerchError`."""
     known = (code if code in EXIT_CODES else PerchError.exit_code for code in codes)
     return min(known, key=_CODES_WORST_FIRST.index, default=0)
 

@@ -52,7 +52,7 @@ class Radios:
         return {name: replace(each, link_uri=ways.get(each.uri)) for name, each in options.items()}
 
     def slow_down(self, uri: str) -> None:
-        """Give the radio time of a vehicle whose flight has ended to those that are still
+        """Once a vehicle's flight has ended, give its radio time to the vehicles that are still
         flying."""
         for hub in self._hubs.values():
             if uri in hub.uris:
@@ -91,8 +91,8 @@ def flight_options(
     plan: FleetPlan, folder: Path, seed: int, record: bool | None
 ) -> dict[str, FlyOptions]:
     """Return the options for each vehicle's flight, with its corridor as a safety row (a row in the
-    transition table), after the same checks as in `perchctl fly`. Errors: those of `check_options`,
-    with the vehicle's name.
+    transition table), after the same checks as in `perchctl fly`. Raises the errors of
+    `check_options`, with the vehicle's name.
 
     `record`: keep the images; None: keep those of real vehicles only.
     """
@@ -119,8 +119,8 @@ def flight_options(
 
 def warnings_before_fleet(options: Mapping[str, FlyOptions]) -> list[str]:
     """The warnings from the offline checks, each with the names of the vehicles that it concerns.
-    Errors, with the vehicle's name: those of `warnings_before_flight`, and a missing lift
-    comparison with the motion-capture system."""
+    Raises, with the vehicle's name, the errors of `warnings_before_flight`, and an error if the
+    lift comparison with the motion-capture system is missing."""
     names: dict[str, list[str]] = {}
     for name, each in options.items():
         with naming(name):

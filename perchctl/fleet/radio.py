@@ -53,8 +53,8 @@ LEAST_APART = 2
 """Minimum number of channels between two dongles: at 2M, a signal is 2 MHz wide, which is the width
 of two channels (bitcraze/cfcli)."""
 SLOWEST_PERIOD_S = SafetyConfig.proof_age_s / 2
-"""Slowest telemetry period that is chosen, s. With a slower one, the telemetry could prove nothing
-after a single lost packet."""
+"""Slowest telemetry period that is chosen, s. With a slower period, a single lost packet would make
+the telemetry too old to prove anything."""
 LEAST_RATE_HZ = 10
 """Lowest rate at which `positioning.rate_hz` allows positions to be sent, Hz."""
 MEASURED_RATE = "2M"
@@ -95,7 +95,7 @@ def radio_place(vehicle: FleetVehicle) -> RadioPlace | None:
 
 
 def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
-    """Return the vehicles with a dongle in each ``radio:///`` URI.
+    """Return the vehicles after adding a dongle to each ``radio:///`` URI.
 
     Vehicles on one channel share a dongle, since two dongles on a channel disturb each other. A
     channel on which no vehicle names a dongle gets the next unused dongle number.
@@ -242,8 +242,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
 
 
 def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
-    """Return advice on a slower telemetry with which the flight would fit, ending in ``, or``;
-    empty if that is not enough."""
+    """Return advice on slower telemetry, or slower positions, with which the flight would fit,
+    ending in ``, or``; empty if that is not enough."""
     if fits:
         need = needed_per_s(profile, fits[0])
         return (

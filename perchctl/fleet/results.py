@@ -26,8 +26,8 @@ class FleetResult(CampaignFlight):
         collisions: number of pairs in `collided`, which came so close that they touched.
         least_distance_m: smallest horizontal distance between two vehicles while the motors of at
             least one turned.
-        least_distance_in_air_m: the same while the motors of both turned; None if that never
-            happened.
+        least_distance_in_air_m: smallest horizontal distance between two vehicles while the motors
+            of both turned; None if no two vehicles had their motors running at the same time.
         separation_m: the plan's separation between the corridors of two vehicles that fly together.
         time_s: time from the start of the first group to the end of the last one.
     """

@@ -187,7 +187,7 @@ class Room:
         least_m: smallest distance between the centres of two vehicles while the motors of at least
             one turn; infinite at first. Only the horizontal distance counts, since corridors are
             separated regardless of height.
-        least_both_m: the same while the motors of both turn.
+        least_both_m: the same distance while the motors of both vehicles turn.
     """
 
     def __init__(self, placed: Sequence[PlacedVehicle]) -> None:
@@ -197,7 +197,7 @@ class Room:
 
     def others_of(self, name: str) -> tuple[tuple[str, _Place], ...]:
         """Return the other vehicles with their positions, as a motion-capture system reports them,
-        in the axes of the vehicle `name`; empty if there are no others, and then the system
+        in the axes of the vehicle `name`; empty if there are no others, in which case the system
         keeps its own bodies."""
         own = self.bodies[name]
         return tuple(

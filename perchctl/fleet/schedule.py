@@ -162,7 +162,7 @@ class Schedule:
     precedences: tuple[Precedence, ...]
 
     def may_fly_together(self, first: str, second: str) -> bool:
-        """True if the corridors of both keep all separations.
+        """True if the corridors of the two vehicles keep all required separations.
 
         Two vehicles that must not fly together are also in each other's way on the floor: if one
         has landed away from its home, the other one must not take off.
@@ -212,8 +212,8 @@ def find_conflicts(
 
 
 def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
-    """Return which vehicle must fly before which other one, because one of them waits or hangs in
-    the other's corridor."""
+    """Return which of two vehicles must fly first, for each pair in which one waits or hangs in the
+    other's corridor."""
     found = []
     for (name, own), (other, corridor) in itertools.permutations(corridors.items(), 2):
         waits_m, hangs_m = (corridor.distance_to_m(p) for p in (own.home_m, own.target_m))
@@ -234,8 +234,8 @@ def _from(gap_m: float, other: str) -> str:
 
 
 def gap_text(gap_m: float) -> str:
-    """Return the distance of a position from a corridor's edge (negative inside), and the text for
-    it."""
+    """Return text such as "0.10 m from" or "0.10 m inside" for a position whose distance from a
+    corridor's edge is `gap_m` (negative inside)."""
     return f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
 
 
@@ -331,7 +331,7 @@ def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
 
 
 def have_common_marker(one: FleetVehicle, other: FleetVehicle) -> bool:
-    """True if both targets have a marker in common."""
+    """True if the targets of the two vehicles have a marker in common."""
     ours, theirs = one.profile.target, other.profile.target
     return not {_marker(ours.large), _marker(ours.small)}.isdisjoint(
         {_marker(theirs.large), _marker(theirs.small)}

@@ -63,7 +63,7 @@ def fly_vehicle(
     options: FlyOptions, switch: ParentSwitch, line: ParentLine, reporter: StatusReporter
 ) -> Result:
     """Fly once, and convert the outcome or any error to a `Result`. An error that occurs while
-    another one is being handled is raised; `reporter` then knows how far the flight had come."""
+    another one is being handled is raised; `reporter` then knows how far the flight got."""
     log: LogWatcher | None = None
     try:
         line.may_interrupt = True

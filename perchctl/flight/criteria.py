@@ -194,7 +194,7 @@ class GroundCriteria:
 
         The velocity's variance shows whether anything corrects the estimate. The position's
         variance shows whether the estimate has received a position since the estimator last
-        started. Of the position, a Flow deck measures only the height.
+        started. A Flow deck measures the height, but not the horizontal position.
         """
         telemetry, safety = self.telemetry, self.profile.safety
         is_placed = not self.profile.positioning.source.is_deck or {*self.decks} & {*ABSOLUTE_DECKS}
@@ -371,9 +371,9 @@ class GroundCriteria:
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
-        """Problem: the position `place` is in another unit, has another axis up, or is too far from
-        the expected target. If the target itself is the positioning system, only the distance is
-        checked."""
+        """Problem: the position `place` is in another unit, has a different axis pointing up, or is
+        too far from the expected target. If the target itself is the positioning system, only the
+        distance is checked."""
         x, y, z = place.position_m
         if self.profile.positioning.source.is_target:
             return self._unreachable(place)

@@ -121,7 +121,8 @@ class FlightInputs:
         """Read telemetry and at most one frame.
 
         Args:
-            search: search the frame for the target; otherwise it only shows that the camera works.
+            search: search the frame for the target; otherwise the frame only shows that the camera
+                works.
             sends_sights: send the positions measured from the target if it is the positioning
                 system; False once the vehicle descends without them.
             drops_sightings: discard the detections from which the vehicle's motion is estimated.

@@ -54,8 +54,8 @@ SAME_PRESS_S = 0.3
 missed."""
 LONGEST_DELAY_S = 1.0
 """Longest time for which a keyboard waits before it repeats a key, s. Within this time, a second
-press may be the first repeat of a held key. Larger: a held key takes longer until it does more than
-land, and evenly repeated presses stop the motors later."""
+press may be the first repeat of a held key. Larger: it takes longer until a held key does more than
+land the vehicle, and evenly repeated presses stop the motors later."""
 SHORTEST_DELAY_S = 0.25
 """Shortest time for which a keyboard waits before it repeats a key, s. Smaller: more presses by
 hand are mistaken for a held key."""

@@ -105,8 +105,8 @@ class GroundTurn:
 
     `waited_s` is the total waiting time, and `took_s` the duration of this turn so far. `samples`
     is the recent telemetry, oldest first; the newest sample is `telemetry_age_s` old.
-    `picture_problem` says why there is no good and fresh image, `unseen_s` after the last one.
-    `link_problem` says what is wrong with the link.
+    `picture_problem` says why there is no good and fresh image; `unseen_s` is the time since the
+    last good one. `link_problem` says what is wrong with the link.
     """
 
     profile: Profile

@@ -61,7 +61,7 @@ class FlyOptions:
     link_uri: str | None = None
     """URI that the link opens instead of `uri`, for a vehicle behind a radio hub."""
     serve_pictures: bool = False
-    """The process of a vehicle in a fleet provides its images for the fleet's page."""
+    """True for a vehicle in a fleet whose process serves its images for the fleet's page."""
 
     @property
     def simulated(self) -> bool:
@@ -119,7 +119,7 @@ def fly_session(
     may_take_off: Callable[[str], bool] = lambda waiting: True,
     climb_withheld: Callable[[], str | None] = lambda: None,
 ) -> tuple[FlightReport, float | None]:
-    """Fly once, in real time through cflib. Errors: any of `perchctl.errors`.
+    """Fly once, in real time through cflib. Raises any error of `perchctl.errors`.
 
     Returns the report and, if a simulator can measure it, the gear's distance from the target's
     centre, m.
@@ -247,7 +247,8 @@ def start_position_feed(
     `stack` closes. `stack` must close after the link, because a landing vehicle needs the
     positions. Returns None if the profile uses no motion capture.
 
-    Errors: those of `CflibLink.settle_estimator`, InvalidValue, UsageError, ConnectionFailed."""
+    Raises the errors of `CflibLink.settle_estimator`, InvalidValue, UsageError and
+    ConnectionFailed."""
     if config.source.is_target:
         link.settle_estimator(None, ground_z_m)
     if not config.source.is_mocap:

@@ -196,7 +196,7 @@ class Watchdog:
         new = [*waiting, *([] if newest is None else [newest])]
         self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
-        if self._profile.positioning.source.is_target:  # no positions without the loop
+        if self._profile.positioning.source.is_target:  # only the loop sends positions
             age_s = last.obs.external_position_age_s + now_s - last.obs.t_s
         return Observation(
             t_s=now_s,
@@ -220,7 +220,7 @@ class Watchdog:
         if self._held is None and known is not None:
             match last.command:
                 case RawThrust(thrust) if abs(known.velocity_mps[2]) < RESCUE_STILL_MPS:
-                    return RawThrust(thrust)  # another mode would stop pressing against the ceiling
+                    return RawThrust(thrust)  # other modes would not press against the ceiling
                 case PositionSetpoint(z_m=z_m):
                     if z_m > known.position_m[2] and known.velocity_mps[2] < RESCUE_SINK_MPS:
                         return last.command

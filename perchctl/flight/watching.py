@@ -148,12 +148,12 @@ class Watchers:
         sentence = f"{watcher_name(watcher)} raised {error_at(error)}"
         with self._lock:
             if all(other is not watcher for other in self._active):
-                return  # it was detached in the other thread
+                return  # the other thread has already detached this watcher
             self._active = tuple(other for other in self._active if other is not watcher)
             self.detached.append(f"{sentence}: it was detached, and perchctl continued without it")
             if takes_turns(watcher):  # the loop reports this like any other problem with the log
                 self._log_problem = self._log_problem or sentence
-                with suppress(Exception):  # it has raised one exception and may raise another
+                with suppress(Exception):  # the watcher may raise another exception
                     watcher.note_detached(sentence)
                 return
         self._report(f"{sentence}: it was detached, and the flight continues")
@@ -169,8 +169,8 @@ def takes_frames(watcher: Watcher) -> TypeGuard[FrameWatcher]:
 
 
 def takes_turns(watcher: Watcher) -> TypeGuard[TurnWatcher]:
-    """True for a `TurnWatcher`. Not by `isinstance`, which would read `problem` and could raise an
-    exception."""
+    """True for a `TurnWatcher`. `isinstance` is not used, because it would read `problem` and could
+    raise an exception."""
     return all(callable(getattr(watcher, name, None)) for name in ("turn", "sent"))
 
 

@@ -1,8 +1,8 @@
 """Disarm the vehicle at the end of a session. Every kind of link uses this module.
 
 A vehicle that does not arm itself spins its propellers while it is armed, even on the ground.
-`perchctl.flight` arms such a vehicle once everything else is ready. However the session ends on the
-ground, the link disarms the vehicle as it closes.
+`perchctl.flight` arms such a vehicle once everything else is ready. No matter how a session ends on
+the ground, the link disarms the vehicle as it closes.
 """
 
 from __future__ import annotations

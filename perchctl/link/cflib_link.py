@@ -3,8 +3,8 @@ this link.
 
 Every call that may block has a timeout, and cflib's callbacks make no blocking calls. The link is
 closed only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
-(docs/firmware.md, "When setpoints stop"). perchctl waits for a radio that falls silent, and reopens
-a driver that has ended.
+(docs/firmware.md, "When setpoints stop"). If the radio falls silent, perchctl waits; if a driver
+has ended, perchctl reopens it.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ SILENCE_S = 1.5
 DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
-"""A packet counts as lost with the link if it was sent later than this time before the vehicle was
-last heard, s."""
+"""A packet counts as lost with the link if it was sent less than this time before the vehicle was
+last heard, or after that, s."""
 FAREWELL = RawThrust(0)
 """The command that cflib's `close_link` sends."""
 
@@ -163,8 +163,7 @@ class CflibLink:
         return [] if self._sender is None else self._sender.new_notes()
 
     def close(self) -> None:
-        """Close the link. If the vehicle may still be flying, close it without cflib's farewell
-        packet.
+        """Close the link, without cflib's farewell packet if the vehicle may still be flying.
 
         On the ground, a vehicle that does not arm itself is disarmed. If the vehicle still reports
         flying after the wait, or if its state is unknown, the firmware's own landing or levelling

@@ -59,7 +59,7 @@ class Packet(NamedTuple):
 
     @staticmethod
     def decode(datagram: bytes) -> Packet | None:
-        """Return the datagram's packet; None if the datagram is empty or too long."""
+        """Return the packet in the datagram; None if the datagram is empty or too long."""
         if not 1 <= len(datagram) <= 1 + MAX_DATA:
             return None
         return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
@@ -67,14 +67,14 @@ class Packet(NamedTuple):
 
 LAND_TIMES = 3
 """Number of times that a landing command is sent."""
-# Port 7: channels, then types of setpoints.
+# Port 7: channels, then setpoint types.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
 _NOTIFY_SETPOINT_STOP = 0
 # Port 8.
 _LAND_2 = 8
 _ALL_GROUPS = 0
-# Port 6: channels, then types of the generic one.
+# Port 6: channels, then packet types of the generic channel.
 _EXTERNAL_POSITION, _LOCALISATION = 0, 1
 _EXTERNAL_POSE = 8
 # Port 9, channel 1.

@@ -36,8 +36,8 @@ class RadioHub:
 
     Raises InvalidValue for URIs that one dongle cannot serve, ConnectionFailed if the dongle cannot
     be opened or a vehicle is in use by another program, and TimedOut. If an error is raised, no
-    packet has been sent to any vehicle. A vehicle that does not answer is not an error here: its
-    flight fails to connect.
+    packet has been sent to any vehicle. A vehicle that does not answer causes no error here; its
+    flight fails to connect instead.
 
     If its parent process ends, the hub keeps running until the flights have ended, because they
     need it to land.

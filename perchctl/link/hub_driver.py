@@ -47,8 +47,8 @@ MOST_BYTES = 2048
 is used. Smaller: a report would be truncated and ignored."""
 WINDOW = 1
 """Number of packets that may wait in the hub before the flight's sender holds back the next one.
-cflib's radio driver also has a queue of one. Larger: a stop waits behind more packets. With 0,
-nothing could be sent."""
+The queue of cflib's radio driver also holds one packet. Larger: a stop waits behind more packets.
+With 0, nothing could be sent."""
 HELLO_TIMEOUT_S = 1.0
 """Timeout for the hub's first answer, s, which takes 1 ms on an idle computer. Longer: a dead hub
 is reported later. Shorter: connecting fails on a busy computer."""

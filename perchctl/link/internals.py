@@ -206,8 +206,8 @@ def renew_send_lock(cf: Any) -> None:
 
 
 def has_room(driver: Any) -> bool:
-    """True if the driver accepts a packet without waiting. Only a radio has a queue, of length
-    one."""
+    """True if the driver accepts a packet without waiting. Only a radio's driver has a queue, which
+    holds one packet."""
     queue = getattr(driver, "out_queue", None)
     return queue is None or not queue.full()
 
@@ -289,7 +289,8 @@ def count_answers(driver: Any, on_answer: Callable[[bool | None], None]) -> None
 
 
 def put_packet(driver: Any, packet: Any, wait_s: float) -> bool:
-    """Pass a packet to a radio's driver if it has room within `wait_s`; return True if it had.
+    """Pass a packet to a radio's driver if it has room within `wait_s`; return True if it was
+    passed on.
 
     cflib's `send_packet` would wait for 2 s, and then report an error.
     """

@@ -26,8 +26,8 @@ from perchctl.vehicle import (
 READ_PERIOD_S = 0.005
 """Time between two reads of your own link, s."""
 SAMPLE_AHEAD_S = 0.1
-"""Largest time by which a sample may be ahead of the loop's clock, s; otherwise it uses another
-clock."""
+"""Largest time by which a sample may be ahead of the loop's clock, s; a sample that is further
+ahead comes from another clock."""
 
 
 class GuardedLink:

@@ -33,7 +33,7 @@ class Link(Protocol):
     """A vehicle, either simulated in lockstep or connected through cflib.
 
     All methods but `send_external` are called from the flight loop's thread. These methods raise
-    ConnectionFailed, NotFound or TimedOut of `perchctl.errors`.
+    ConnectionFailed, NotFound or TimedOut from `perchctl.errors`.
     """
 
     def connect(self) -> None:
@@ -72,8 +72,8 @@ class Link(Protocol):
 
 
 class VehicleLink(Protocol):
-    """Your own link. Its class is called with the loop's clock, a function that returns seconds,
-    and the profile's section `link`.
+    """Your own link. perchctl calls its class with the loop's clock, a function that returns
+    seconds, and the profile's section `link`.
 
     `telemetry` and `problem` are called in one thread, 200 times a second, and `send` in another
     one (after a hang, in a new one). An exception in `telemetry` or `problem`, exceptions in `send`
@@ -102,9 +102,10 @@ class VehicleLink(Protocol):
 
     def send(self, command: Command) -> None:
         """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second. If no
-        further command comes, the vehicle must level out by itself after 0.5 s, and stop after 2 s.
+        further command arrives, the vehicle must level out by itself after 0.5 s, and stop after 2
+        s.
 
-        `Arm(True)` comes just before take-off, if the telemetry's bits are `CAN_ARM` without
+        `Arm(True)` is sent just before take-off, if the telemetry's bits are `CAN_ARM` without
         `AUTO_ARM` and `CAN_FLY`; `Arm(False)` after a session, on the ground, if they are `ARMED`
         without `AUTO_ARM`.
         """
@@ -113,7 +114,7 @@ class VehicleLink(Protocol):
         """Return None while the link works, otherwise one sentence with the cause."""
 
     def close(self) -> None:
-        """Disconnect; called when the vehicle no longer flies, at the latest after 6 s."""
+        """Disconnect; called when the vehicle no longer flies, after 6 s at the latest."""
 
 
 # --- The forms of a vehicle's URI ---
@@ -168,8 +169,8 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """Return a text that is the same for all URIs of a vehicle: the URI without dongle and options,
-    in one letter case."""
+    """Return a string that is the same for all URIs of a vehicle: the URI without dongle and
+    options, in one letter case."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

@@ -57,8 +57,8 @@ a working dongle reports even a lost packet within 2 ms. Counting ticks avoids a
 the computer was suspended. More: a dead dongle is reported later. Fewer: a slow USB call ends the
 flights."""
 REOPEN_PERIOD_S = 0.1
-"""Time between two attempts to open a dead dongle, s. Longer: the dongle is available again later.
-Shorter: the computer scans its USB ports all the time."""
+"""Time between two attempts to open a dead dongle, s. Longer: a dead dongle takes longer to become
+available again. Shorter: the computer scans its USB ports all the time."""
 SAFELINK_PACKETS = 10
 """Number of packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md,
 "Safelink")."""
@@ -91,9 +91,9 @@ FAREWELL_S = 0.5
 Longer: a vehicle that was out of range may execute an old command. Shorter: a landing command sent
 just before the end may get lost."""
 MOST_QUEUED_PACKETS = 64
-"""Largest number of a flight's packets that may wait for the radio; then the oldest one is dropped.
-A flight's sender waits after each packet, but cflib's own requests do not. Larger: more packets are
-out of date. Smaller: cflib's requests get lost."""
+"""Largest number of a flight's packets that may wait for the radio; beyond this number, the oldest
+one is dropped. A flight's sender waits after each packet, but cflib's own requests do not. Larger:
+more packets are out of date. Smaller: cflib's requests get lost."""
 NULL_PACKET = 0xF3
 """Header of the packet that a vehicle sends if it has no data. The signal strength may follow the
 header; cflib's statistics have already read it."""

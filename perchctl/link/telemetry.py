@@ -116,8 +116,8 @@ def _motor_duty(values: Mapping[str, float]) -> tuple[int, int, int, int] | None
 WRAP_MS = 1 << 24
 """Period of the log time stamps, which have three bytes (docs/firmware.md, "Link")."""
 CLOCK_SKEW = 1e-4
-"""Largest rate difference between the two clocks: far more than that of two crystals, far less than
-after a fault."""
+"""Largest rate difference between the two clocks: far larger than between two crystal oscillators,
+far smaller than after a fault."""
 REBOOTED_MS = 1000
 """Backward step of the stamps above which the vehicle has restarted, ms; reordered packets step
 back by far less."""
@@ -187,7 +187,7 @@ def telemetry_packets_per_s(period_s: float) -> float:
     blocks. `period_s` is the period of the fast blocks (`link.telemetry_period_s`), rounded as in
     `start_block`.
 
-    220 at 0.01 s, 120 at 0.02 s, 70 at 0.04 s.
+    The result is 220 at 0.01 s, 120 at 0.02 s, and 70 at 0.04 s.
     """
     slow = len(BLOCKS) - len(FAST_BLOCKS)
     return len(FAST_BLOCKS) / _rounded_ms(period_s) * 1000.0 + slow / SLOW_PERIOD_S

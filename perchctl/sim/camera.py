@@ -16,20 +16,22 @@ from perchctl.sim.renderer import Exposure, Renderer
 from perchctl.sim.scenario import Scenario
 
 SCHEDULE_STREAM = 411
-"""Number of the random stream of the schedule."""
+"""Number of the random stream for the frame schedule."""
 LIGHT_STREAM = 412
-"""Number of the random stream of light and receiver."""
+"""Number of the random stream for the light and the receiver."""
 
 JITTER_LIMIT_SIGMAS = 2.5
 
 
 PoseAt = Callable[[float], Array]
-"""A pose, of the body or of the camera in the world (4, 4), at a time."""
+"""Function that returns the pose (4, 4) of the body or of the camera in the world at a given time,
+s."""
 
 
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
-    """An arrived frame; `t_exposure_s`: middle of its exposure, or between interlaced fields."""
+    """A frame that has arrived; `t_exposure_s` is the middle of its exposure or, if it is
+    interlaced, the time midway between its two fields."""
 
     t_arrival_s: float
     t_exposure_s: float
@@ -48,7 +50,7 @@ class SimCamera:
     - lost: with `camera_drop_rate`, and `camera_burst` = (start, n): the n
       exposures from start on; these are not rendered;
     - late: a frame arrives after `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`,
-      cut at 2.5 sigma), but never before the end of its exposure or before an earlier frame;
+      clipped to +-2.5 sigma), but never before the end of its exposure or before an earlier frame;
     - frozen: exposures from `camera_freeze_at_s` on repeat the last image before that time.
     """
 

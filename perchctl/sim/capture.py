@@ -44,7 +44,7 @@ class CaptureFault:
         gone: no frame is sent.
         swapped: the vehicle's body has swapped names with another body: the one called
             `swapped_with`, or the first other one if that is None.
-        scale: factor on all positions; 1000 is millimetres.
+        scale: factor on all positions; 1000 corresponds to millimetres.
         mirrored: the sign of y is inverted, as by a program with left-handed axes.
         axes: rows (3, 3) of the rotation from the world's axes to the system's.
         late_s: delay in addition to `CaptureSettings.delay_s`.

@@ -33,7 +33,7 @@ MAX_DATA = 30
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.08"
 OK = 0
-"""The other answers are errno codes."""
+"""The answer for success; all other answers are errno codes."""
 
 
 # --- Packets that command the vehicle, turned into the firmware model's calls ---
@@ -45,8 +45,7 @@ _SETPOINTS = {
     9: (MODE_Z_DISTANCE, ("roll_deg", "pitch_deg", "yaw_rate_dps", "z_m")),
     10: (MODE_HOVER, ("vx_mps", "vy_mps", "yaw_rate_dps", "z_m")),
 }
-"""Port 7: the mode and the numbers of each type of setpoint, as cflib has sent them since protocol
-11."""
+"""Port 7: the mode and the fields of each setpoint type, as sent by cflib since protocol 11."""
 
 
 def execute_packet(firmware: Firmware, packet: Packet) -> bytes | None:
@@ -243,7 +242,7 @@ class _Block:
 class CrtpServer:
     """Serves one firmware to one peer. Before protocol 12, there is no supervisor port.
 
-    `device_type`: the name that it announces instead of its airframe's.
+    `device_type`: the name that the firmware announces instead of its airframe's.
     """
 
     def __init__(
@@ -274,8 +273,8 @@ class CrtpServer:
         self._param_toc = Toc(Port.PARAM, param_codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet, at most one. Like the firmware, it ignores a packet
-        that is too short for its command."""
+        """Return the answers to one packet, at most one. A packet that is too short for its command
+        is ignored, as in the real firmware."""
         try:
             answer = self._answer(packet)
         except struct.error:

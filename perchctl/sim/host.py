@@ -87,8 +87,8 @@ class VehicleHost:
         return self._steps * CONTROL_PERIOD_S
 
     def serve(self) -> None:
-        """Answer the packets that have arrived without advancing time. Log data waits for the next
-        step."""
+        """Answer the packets that have arrived, but do not advance time. Log data waits for the
+        next step."""
         while True:
             try:
                 datagram, address = self.socket.recvfrom(64)

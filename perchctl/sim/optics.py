@@ -84,7 +84,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
     """
     x, y = grid.xy[..., 0], grid.xy[..., 1]
     if to_plane.ndim == 2:
-        # The rise is linear over the rays, so its minimum is on the outline.
+        # The rise is linear in a ray's x and y, so its minimum is among the outermost rays.
         rise = to_plane[2].astype(np.float32)
         if grid.boundary_xy.dot(rise[:2]).min() + rise[2] >= LEAST_RISE:
             points = cv2.perspectiveTransform(grid.xy, to_plane)
@@ -146,7 +146,7 @@ def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
     fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
 
     def finer(nodes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Interpolate between the fine nodes (1e-4 px)."""
+        """Interpolate between the fine nodes, with an error of 1e-4 px."""
         pixels = cv2.resize(nodes, None, fx=FINE_PX, fy=FINE_PX)
         return np.asarray(pixels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX], np.float32)
 

@@ -3,8 +3,8 @@
 - A motor's voltage is its duty cycle times the battery voltage. The motor's speed follows that
   voltage with a lag, and its thrust is the value of the thrust curve at the voltage that
   corresponds to the speed (`thrust_n`).
-- The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is a w +
-  b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
+- The faster the motor turns, the shorter the lag. The voltage that keeps a motor at speed w is a w
+  + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
   rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md, "Catching a
   slip". At standstill it is `STANDING_LAG_S`, with which simulated slips lose as much height as the
   slips measured in docs/firmware.md.
@@ -77,9 +77,9 @@ def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
 
 
 motor_voltage, thrust_n = inverse_thrust(CRAZYFLIE_21.thrust), steady_thrust(CRAZYFLIE_21.thrust)
-"""The functions of the Crazyflie 2.1."""
+"""The thrust functions for the motors of a Crazyflie 2.1."""
 STANDSTILL_V = motor_voltage(0.0)
-"""Voltage at which the motor stands still, the dead band: 0.45 V."""
+"""Voltage up to which the motor stands still (its dead band): 0.45 V."""
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---

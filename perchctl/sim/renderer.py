@@ -286,7 +286,7 @@ class Renderer:
 
 
 def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
-    """A view of an image (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
+    """Return a view of an image (h, w, ...) as blocks (rows, columns, 8, 8, ...)."""
     height, width, *rest = pixels.shape
     shape = (height // COARSE_PX, COARSE_PX, width // COARSE_PX, COARSE_PX, *rest)
     return pixels.reshape(shape).swapaxes(1, 2)
@@ -369,7 +369,7 @@ def longest_path_px(motion_px: Array) -> float:
 
 
 def blur_sample_count(length_px: float) -> int:
-    """Return the number of poses needed for the blur of a path of that length; 1 for a sharp
+    """Return the number of poses needed for the motion blur of a path of `length_px`; 1 for a sharp
     frame."""
     if length_px < SHARP_MOTION_PX:
         return 1

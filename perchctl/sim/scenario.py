@@ -38,8 +38,8 @@ class Neighbour:
 class Scenario:
     """Everything that can differ between two simulated flights, in SI units and the world frame.
 
-    The world's origin is the floor under the vehicle's start, its x axis the vehicle's heading
-    there.
+    The world's origin is on the floor under the vehicle's start; its x axis points along the
+    vehicle's heading there.
 
     The defaults are those of the trials in docs/firmware.md, in which the vehicle had four equal
     motors and less drag than a real one. A field with the same name as a key of
@@ -67,8 +67,8 @@ class Scenario:
             flight, the strongest and the weakest motor of a recorded vehicle differ by 17 % of the
             mean (7 to 40).
         motors_brake: the motors slow down as fast as they speed up at any duty but 0, as recorded
-            take-offs show (30 to 50 ms both ways); else they coast whenever they get less, as the
-            trials do.
+            take-offs show (30 to 50 ms both ways); otherwise they coast whenever they slow down, as
+            in the trials.
         centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles were flown
             as if it were up to 2.4 mm off.
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
@@ -80,7 +80,8 @@ class Scenario:
             flight to the left, N.m for each m/s. In the same flights, the motors counteract 0.8e-3
             forward and 0.7e-3 sideways.
         ground_effect: share of thrust gained with the vehicle on the floor. Recorded take-offs of
-            three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, 0.965 with 3 to 7.
+            three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, and 0.965 with 3
+            to 7 cm.
         thrust_noise: standard deviation of each motor's thrust, as a share, with a memory of 20 ms.
             With 0.02 the body turns as much above 20 Hz as in 49 recorded flights (0.43 deg/s of
             roll and pitch, 0.31 to 0.66), and a regression finds the same delay.
@@ -164,7 +165,7 @@ class Scenario:
 # --- From a profile's ranges and a seed to a scenario ---
 
 
-# The random streams of the scenario alone.
+# Numbers of the random streams that are used only to draw a scenario.
 _SCENARIO_STREAM = 1
 _GROUPS_STREAM = 21
 _IMU_BIAS_STREAM = 22

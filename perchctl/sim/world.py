@@ -7,8 +7,8 @@ Assumptions of the model, each with its source:
 
 - Motors, their battery, and the curve between a motor's voltage and its thrust:
   `perchctl.sim.powertrain`.
-- Drag is linear in the airspeed, which R^2 = 0.98 confirms for 104 recorded flights; horizontally
-  it is `Scenario.drag_nspm`, vertically 0.008 N/(m/s) for four rotors that lift 42 g (identified by
+- Drag is linear in the airspeed, as 104 recorded flights confirm (R^2 = 0.98); horizontally it is
+  `Scenario.drag_nspm`, vertically 0.008 N/(m/s) for four rotors that lift 42 g (identified by
   Foerster, ETH Zurich, 2015) and 0.001 for camera, board and gear.
 - Airspeed tilts the vehicle away from its direction of flight, nose up in forward flight, by
   `Scenario.airspeed_moment_nmspm`.
@@ -16,9 +16,9 @@ Assumptions of the model, each with its source:
 - A draught has a steady part and smooth gusts, which together reach its nominal speed when the
   gusts are at two standard deviations (`Wind`).
 - The downwash of other vehicles in a fleet is `downwash_mps` (`perchctl.sim.downwash`).
-- Near the ceiling, suction pulls the rotors towards it: `Scenario.ceiling_suction` of their thrust
-  at the ceiling itself; with 0.1 as measured on test benches with rotors of this size (Hsiao and
-  Chirarattananon, arXiv 1905.04632).
+- Near the ceiling, suction pulls the rotors towards it: at the ceiling itself, the force is their
+  thrust times `Scenario.ceiling_suction`, which is 0.1 on test benches with rotors of this size
+  (Hsiao and Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place: dry friction, without creep under a steady
   push (MuJoCo's `noslip`).

@@ -115,7 +115,7 @@ class Pid:
 
 
 def wrap_deg(angle: float) -> float:
-    """Return the same angle within +-180 degrees."""
+    """Wrap an angle to +-180 degrees."""
     return math.remainder(angle, 360.0)
 
 
@@ -197,7 +197,7 @@ class Controller:
         r = 0.5 * _saturated(self.roll_rate.update(roll_dps, now.gyro_x_dps))
         p = 0.5 * _saturated(self.pitch_rate.update(pitch_dps, -now.gyro_y_dps))
         y = -_saturated(self.yaw_rate.update(yaw_dps, now.gyro_z_dps))
-        # Bounded neither above nor below (see `MotorDriver`).
+        # The total thrust has neither an upper nor a lower limit here (see `MotorDriver`).
         f = self.thrust
         return (f - r + p + y, f - r - p - y, f + r - p + y, f + r + p - y)
 

@@ -82,7 +82,7 @@ class Estimator:
         if scenario.extra.get("external_position"):
             self.outside, self._imu = ExternalFilter(parameters), Imu(scenario)
         self._reset_s = 0.0
-        self._rng.uniform()  # so that the flights of all seeds stay the same
+        self._rng.uniform()  # unused; without this draw, the flights of all seeds would change
         self.spoil: Callable[[Estimate], None] | None = None  # called by a fault on each estimate
 
     def reset(self, t_s: float) -> None:
@@ -109,8 +109,8 @@ class Estimator:
         """Return the variance of a position or velocity state, numbered as in `ExternalFilter`.
 
         While another estimator runs, the variance is zero, like memory that was never written. A
-        Flow deck does not measure the horizontal position, whose variance stays at its value after
-        a reset.
+        Flow deck does not measure the horizontal position, so the variance of that position keeps
+        the value set by a reset.
         """
         if self._parameters["stabilizer.estimator"] != KALMAN:
             return 0.0
@@ -118,7 +118,7 @@ class Estimator:
             return float(self.outside.covariance[state, state])
         if t_s - self._reset_s < _FIRST_DECK_S:
             return float(first_covariance()[state, state])
-        is_level = state % VELOCITY_STATE < 2  # of x and y
+        is_level = state % VELOCITY_STATE < 2  # x or y component
         if not any(self._parameters[f"deck.{name}"] for name in FLOW_DECKS):
             return _ABSOLUTE_M2PS2 if state >= VELOCITY_STATE else _ABSOLUTE_M2
         if state < VELOCITY_STATE:

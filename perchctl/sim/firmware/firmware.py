@@ -30,8 +30,8 @@ _NULL = Setpoint()
 
 
 class Firmware:
-    """A Crazyflie 2.1, or the scenario's airframe, as firmware release 2026.08 (CRTP protocol 12)
-    behaves.
+    """Behaves like a Crazyflie 2.1, or the scenario's airframe, with firmware release 2026.08 (CRTP
+    protocol 12).
 
     docs/firmware.md describes each behaviour and the evidence for it. `step` senses, estimates,
     supervises, controls, drives the motors and advances the world by `CONTROL_PERIOD_S`. Commands

@@ -153,7 +153,7 @@ class ExternalFilter:
         self.quaternion = self._initial
 
     def predict(self, reading: Reading, *, flying: bool) -> None:
-        """Advance by `IMU_PERIOD_S`. An estimate out of its bounds is reset."""
+        """Advance by `IMU_PERIOD_S`. An estimate that exceeds its bounds is reset."""
         t, half_s2 = IMU_PERIOD_S, 0.5 * IMU_PERIOD_S * IMU_PERIOD_S
         *acceleration, p, q, r = reading
         force = fx, fy, fz = self._force(acceleration, flying=flying)

@@ -100,7 +100,8 @@ class HighLevelPlanner:
         t_s: float,
         state: int = TRAJECTORY_FLYING,
     ) -> bool:
-        """Plan a vertical flight to a height; False if refused. `yaw_rad` None: same heading."""
+        """Plan a vertical flight to a height; False if refused. `yaw_rad`: None keeps the
+        heading."""
         if self.blocked or self.state not in (
             (TRAJECTORY_IDLE, TRAJECTORY_FLYING)
             if state == TRAJECTORY_LANDING
