@@ -76,8 +76,8 @@ def refused_vehicle(reason: str) -> FaultResult:
 
 
 def fleet_summary(results: Sequence[FleetResult]) -> dict[str, Any]:
-    """The figures of a campaign as a JSON object: those of the fleets, and those of `fault_summary`
-    over all their vehicles."""
+    """The figures of a campaign as a JSON object: figures for the fleets, and those of
+    `fault_summary` for all their vehicles."""
     figures = fault_summary([vehicle for fleet in results for vehicle in fleet.vehicles])
     del figures["worst_seeds"]
     return {

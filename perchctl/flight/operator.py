@@ -76,8 +76,9 @@ LONGER_THAN_REPEATS = 1.2
 """Lowest ratio of a key's initial delay to the mean interval of its repeats. Presses by hand have
 similar intervals throughout."""
 SURE_REPEATS, SURELY_LONGER = 4, 2.0
-"""Smallest number of even repeats, and smallest ratio of the first interval to their mean interval,
-with which the presses must come from a held key, even at a rate that a hand can reach."""
+"""If there are at least this many even repeats, and the first interval is at least this many times
+as long as their mean interval, the presses must come from a held key, even at a rate that a hand
+can reach."""
 STOP_HANG_S = 10.0
 """Time within which a stopped flight must end, s. After that, the flight counts as hanging."""
 _EPS_S = 1e-9

@@ -21,8 +21,8 @@ from perchctl.vision import Frame
 T = TypeVar("T")
 
 SLOW_WATCHER_S = 0.25
-"""Duration above which a call of a watcher is reported, s, because the loop does not steer during
-it."""
+"""Duration above which a call to a watcher is reported, s, because the loop does not control the
+flight during the call."""
 
 
 class FrameWatcher(Watcher, Protocol):

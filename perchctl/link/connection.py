@@ -28,7 +28,7 @@ LINK_CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
 """Number of successive lost packets after which cflib gives up on a radio link: about 200 s,
 instead of 0.2 s with cflib's default of 100. Waiting is better, because a link that cflib has given
-up must negotiate safelink again."""
+up on must negotiate safelink again."""
 REOPEN_PAUSE_S = 0.05
 """Time between two attempts to reopen a driver, s."""
 SAFELINK_S = 0.15

@@ -137,10 +137,10 @@ def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
 _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPOINT_STOP, 0))
 
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
-"""One zero-thrust packet after boot, on the ground, then the message that returns the priority.
-Without the zero-thrust packet, raw thrust stays 0; without the message, the firmware does not
-execute its own landing (docs/firmware.md, "Raw thrust"). The vehicle does not confirm these
-packets, and if they were lost, the first raw thrust in the air would cut the motors. The packets
-are therefore sent `UNLOCK_TIMES`."""
+"""One zero-thrust packet after boot, on the ground, then the notify message, which ends the
+priority of low-level setpoints. Without the zero-thrust packet, raw thrust stays 0; without the
+notify message, the firmware does not execute its own landing (docs/firmware.md, "Raw thrust"). The
+vehicle does not confirm these packets, and if they were lost, the first raw thrust in the air would
+cut the motors. The packets are therefore sent `UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
 """Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

@@ -101,9 +101,9 @@ class VehicleLink(Protocol):
         """
 
     def send(self, command: Command) -> None:
-        """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second. If no
-        further command arrives, the vehicle must level out by itself after 0.5 s, and stop after 2
-        s.
+        """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second.
+        If no further command arrives, the vehicle must level out by itself after 0.5 s and stop
+        after 2 s.
 
         `Arm(True)` is sent just before take-off, if the telemetry's bits are `CAN_ARM` without
         `AUTO_ARM` and `CAN_FLY`; `Arm(False)` after a session, on the ground, if they are `ARMED`

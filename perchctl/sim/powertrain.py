@@ -3,11 +3,11 @@
 - A motor's voltage is its duty cycle times the battery voltage. The motor's speed follows that
   voltage with a lag, and its thrust is the value of the thrust curve at the voltage that
   corresponds to the speed (`thrust_n`).
-- The faster the motor turns, the shorter the lag. The voltage that keeps a motor at speed w is a w
-  + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and its square
-  rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md, "Catching a
-  slip". At standstill it is `STANDING_LAG_S`, with which simulated slips lose as much height as the
-  slips measured in docs/firmware.md.
+- The faster the motor turns, the shorter the lag. To keep a motor at speed w, the voltage must be
+  a w + b w^2 (back EMF and the air's torque), so 1 / lag is proportional to a + 2 b w, and its
+  square rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md,
+  "Catching a slip". At standstill it is `STANDING_LAG_S`, with which simulated slips lose
+  as much height as the slips measured in docs/firmware.md.
 - Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within `MOTOR_COAST_S`,
   the value that best fits the falls, landings and take-offs measured in docs/firmware.md. At any
   other duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).

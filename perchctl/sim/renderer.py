@@ -56,7 +56,7 @@ _PLAIN_PX = 1.5
 """Blur of the lens above which the whole image is blurred, px. A smaller blur does not show on
 the bare ceiling, which is drawn at half the size or less."""
 _COVERING_SIGMA = 4.0
-"""Noise, grey levels, which hides that the ceiling is drawn at a quarter of the resolution."""
+"""Noise, in grey levels, that hides the quarter resolution at which the ceiling is drawn."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 

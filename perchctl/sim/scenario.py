@@ -47,7 +47,7 @@ class Scenario:
 
     Attributes:
         target_xy_m, target_yaw_rad: centre and heading of the target.
-        gear_body_m: tip of the magnet gear in body axes (its truth).
+        gear_body_m: true position of the magnet gear's tip in body axes.
         T_body_cam_true: rows of the camera's true pose, mounting error included.
         camera_mirrored: the camera flips its images left to right.
         drift_mps: drift of the state estimate, world axes.
@@ -198,7 +198,8 @@ _LEAST_GAP_S = 1.0
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """Return the seed's scenario. Values are drawn in a fixed order, so a new range at the end
-    leaves a seed's earlier values unchanged. Harder worlds draw from other random streams."""
+    leaves a seed's earlier values unchanged. `_imu_errors`, `_groups` and `_vehicle` draw from
+    separate random streams."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _SCENARIO_STREAM])
 

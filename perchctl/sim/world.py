@@ -17,7 +17,7 @@ Assumptions of the model, each with its source:
   gusts are at two standard deviations (`Wind`).
 - The downwash of other vehicles in a fleet is `downwash_mps` (`perchctl.sim.downwash`).
 - Near the ceiling, suction pulls the rotors towards it: at the ceiling itself, the force is their
-  thrust times `Scenario.ceiling_suction`, which is 0.1 on test benches with rotors of this size
+  thrust times `Scenario.ceiling_suction`; 0.1 was measured on test benches with rotors of this size
   (Hsiao and Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place: dry friction, without creep under a steady
@@ -357,7 +357,7 @@ class Magnet:
 
 _TERMS = 5
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
-_STEADY = 0.7  # share of the steady part in the draught's speed
+_STEADY = 0.7  # share of the draught's speed that is steady
 _SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts relative to that speed: x, y, z
 _WIND_STREAM = 1
 
