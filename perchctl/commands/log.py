@@ -90,7 +90,7 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     """Show, plot, compare, export, replay, film or summarise a flight from its log.
 
     All subcommands read logs of real and simulated flights, of flights that were killed, and of
-    older perchctl versions. Only replay needs complete tick records, which log versions 1 and 2 do
+    older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do
     not contain.
     """
     with _opened(_log_file(file)) as log:

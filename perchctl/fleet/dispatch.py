@@ -276,7 +276,7 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
         elif is_at_home(vehicle, result):
             place, where = vehicle.home_m, "stands"
         elif not plan.schedule.may_fly_together(name, other):
-            return f"{other} may be in the corridor: its flight ended away from its home"
+            return f"{other} may be in this vehicle's corridor: its flight ended away from its home"
         else:
             continue
         away_m = corridor.distance_to_m(place)

@@ -299,7 +299,7 @@ class FlightInputs:
         t_s = self.perception.exposure_s(frame)
         age_s = now_s - t_s
         if live and not age_s >= -PICTURE_AHEAD_S:
-            return f"the picture's exposure time, {t_s:.3f} s, is in the future"
+            return f"the picture's time of exposure, {t_s:.3f} s, is in the future"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s old" if is_late else None
 

@@ -219,7 +219,7 @@ def test_one_that_ended_somewhere_keeps_its_neighbour_on_the_floor() -> None:
     rig.fly("v0")
     rig.end("v0", ABORTED)
     assert rig["v1"].order == Order(may_take_off=False, word=OperatorRequest.LAND)
-    assert "v0 may be in the corridor" in rig.fleet.reasons["v1"]
+    assert "v0 may be in this vehicle's corridor" in rig.fleet.reasons["v1"]
 
 
 def test_one_that_hangs_or_stands_at_its_home_keeps_nobody() -> None:

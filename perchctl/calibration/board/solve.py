@@ -106,7 +106,7 @@ class Calibration:
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
             text += (
-                f", but only within {aside.mm95:.2g} mm away from the optical axis at "
+                f", but away from the optical axis only within {aside.mm95:.2g} mm at "
                 f"{aside.z_m * 100:.0f} cm"
             )
         return text
