@@ -185,8 +185,8 @@ class MarkerConfig(Section):
     id: int = key(..., "id of the marker in its dictionary", ge=0)
     side_m: float = key(
         ...,
-        "side of the printed black square; the small marker's must be less than half of the "
-        "large one's",
+        "side of the printed black square; the small marker's side must be less than half "
+        "of the large marker's",
         ge=0.004,
         le=2.0,
     )

@@ -44,7 +44,7 @@ def _axes(name: str, meaning: str) -> dict[str, str]:
 DUTY_FIELDS = tuple(f"duty_m{motor}" for motor in (1, 2, 3, 4))
 _DUTIES = (
     "duty cycles of the motors front right (M1), back right, back left and front left, 0..65535, "
-    "of the same age as the battery voltage"
+    "sampled together with the battery voltage"
 )
 FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",

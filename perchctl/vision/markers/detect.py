@@ -337,8 +337,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         name="Cut-view fit",
         requirements_text="a measurement at most 0.5 s old, and small-marker cells of 8 px",
         cost_text="7 ms",
-        run_condition_text="nothing was found, and each expected marker may be cut by the image "
-        "or hidden",
+        run_condition_text="nothing was found, and each expected marker may be cut off by the edge "
+        "of the image or hidden",
         should_run=_can_be_truncated,
         find=_fit_truncated_target,
     ),
@@ -346,8 +346,9 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         name="Search",
         requirements_text="a marker whose bits can be read",
         cost_text="4 to 9 ms, including the measurement of the markers found",
-        run_condition_text="nothing was found, unless the target was cut and still is; or an "
-        "expected marker with sides above 13 px is missing; after a loss, in three of four images",
+        run_condition_text="nothing was found, unless the target was cut off before and still is; "
+        "or an expected marker with sides above 13 px is missing; after a loss, in three of four "
+        "images",
         should_run=_should_search,
         find=_search,
     ),
