@@ -52,7 +52,7 @@ class PerchError(Exception):
 
 class UsageError(PerchError):
     exit_code = 2
-    meaning = "wrong usage of the command line"
+    meaning = "invalid command line"
 
 
 def _install(extra: str) -> str:
@@ -163,6 +163,6 @@ class ProfileNote(Note):
 
 
 _ALL: list[type[PerchError]] = [PerchError, *PerchError.__subclasses__()]
-EXIT_CODES: dict[int, str] = {
-    0: "perched, or hovered and landed (or the command did what was asked)"
-} | {cls.exit_code: cls.meaning for cls in _ALL}
+EXIT_CODES: dict[int, str] = {0: "perched, or hovered and landed (or the command succeeded)"} | {
+    cls.exit_code: cls.meaning for cls in _ALL
+}
