@@ -63,12 +63,13 @@ THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.25
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
 THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S = 0.1
-"""Rate at which the thrust is reduced in a descent by pictures, as a fraction of the hover thrust
-per second; pictures show only after a quarter of a second that the vehicle sinks. Larger: the
-vehicle falls at first. Smaller: the vehicle stands on the floor for longer with its motors
-running."""
+"""Rate at which the thrust of a vehicle that does not sink is reduced in a descent by pictures, as
+a fraction of the hover thrust per second; pictures show only after a quarter of a second that the
+vehicle sinks. Larger: the vehicle falls at first. Smaller: the vehicle stands on the floor for
+longer with its motors running."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
-"""Sink rate measured by telemetry below which the vehicle counts as not sinking, m/s."""
+"""Sink rate, from the telemetry and the commands since its newest sample, below which the vehicle
+counts as not sinking, m/s."""
 MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
 """Smallest commanded thrust, as a fraction of the hover thrust."""
 MIN_TILT_COSINE_TO_COMPENSATE_THRUST = 0.8

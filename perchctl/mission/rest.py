@@ -15,8 +15,8 @@ MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
 estimate."""
 MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
-"""Height, at the start of a descent or now, above which a vehicle cannot be standing on the floor,
-m."""
+"""Height above which hanging can be distinguished from standing on the floor, m; it is compared
+with the height at the start of a descent or with the present height."""
 MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
 """Height up to which a vehicle with its motors off stands on the floor, m."""
 MAX_DESCENT_IF_STILL_HANGING_M = 0.15

@@ -74,8 +74,8 @@ MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
-"""Distance of the setpoint above a motionless vehicle beyond which something must be blocking it,
-m. Larger: a blocked climb is detected late."""
+"""Distance of the setpoint above a motionless vehicle from which the vehicle presses against
+whatever blocks it, m. Larger: a blocked climb is detected late."""
 GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
 """Standard deviation of the distance by which the touch itself moves the gear, m."""
 LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
@@ -106,8 +106,8 @@ magnet."""
 MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
 """Smallest height difference between gear and target, m, of a vehicle that stands on the floor."""
 MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS = -0.05
-"""Climb rate below which a vehicle with a low specific force is falling during the weight transfer,
-m/s."""
+"""Climb rate below which a vehicle with a low specific force is falling, once the weight transfer
+by raw thrust has begun, m/s."""
 MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS = -0.15
 """Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
 falls."""
@@ -628,8 +628,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 def has_slipped(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: `is_slipping` has been true for
-    `complete.slip_dwell_s`. During the weight transfer by raw thrust, the first sign of free fall
-    is enough."""
+    `complete.slip_dwell_s`. Once the weight transfer by raw thrust has begun, the first sign of
+    free fall is enough."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = (
         b.command_history.weight_transfer_began_at_s is not None

@@ -78,8 +78,8 @@ class CommandHistory:
 
     @property
     def is_before_weight_transfer_and_motor_stop(self) -> bool:
-        """True until raw thrust begins to transfer the vehicle's weight to the magnet (the release)
-        or the motors are commanded to stop."""
+        """True until raw thrust begins to transfer the vehicle's weight to the magnet (the second
+        stage of the release) or the motors are commanded to stop."""
         return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def with_frame_shift(
