@@ -298,7 +298,7 @@ class FlightLog:
             bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
             return bits[: width * height].reshape(height, width).astype(bool)
         except (ValueError, TypeError, zlib.error) as error:
-            raise InvalidValue(f"the log's header contains no valid mask: mask: {error}") from None
+            raise InvalidValue(f"the log's header contains no valid mask: {error}") from None
 
     @property
     def computer_differences(self) -> str:

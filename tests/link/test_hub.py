@@ -518,7 +518,7 @@ def test_nothing_in_a_flight_waits_for_a_hub_that_hangs() -> None:
     driver.send_packet(CRTPPacket(COMMAND, b"x"))
     assert errors == [hub_driver.HUB_ENDED]
     driver.close()
-    with pytest.raises(ConnectionFailed, match="has ended"):
+    with pytest.raises(ConnectionFailed, match="has stopped"):
         HubDriver().connect(uri, None, lambda message: None)
 
 

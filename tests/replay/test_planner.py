@@ -220,7 +220,7 @@ def test_the_header_s_profile_and_mask_are_the_flown_ones_to_the_bit(tmp_path: P
     assert mask is not None
     assert np.array_equal(mask, covered > 0)
     log.header["mask"] = "AAAA"
-    with pytest.raises(InvalidValue, match="no mask"):
+    with pytest.raises(InvalidValue, match="no valid mask"):
         log.flown_mask(camera)
 
 
