@@ -120,7 +120,7 @@ def track(
     if calibration is None:
         calibration = find_calibration(profile.camera.calibration)
         if is_shipped_example(calibration) and source != "sim:":
-            what = f"{calibration.name} is the example calibration: pass that of your own camera"
+            what = f"{calibration.name} is the example calibration: pass your own camera's"
             warnings.warn(what, Note, stacklevel=2)
     require_type("calibration", calibration, CameraModel, Path, str)
     camera = calibration if isinstance(calibration, CameraModel) else load_calibration(calibration)

@@ -80,7 +80,7 @@ FIRST_WORDS = {
     "make-target measured -p mine.yaml --measured-large 149.6": "reading profile mine.yaml",
     "calibrate camera images:.": "looking for the board",
     "calibrate mount -p mine.yaml": "reading profile mine.yaml",
-    "calibrate mask images:.": "looking for what the vehicle covers",
+    "calibrate mask images:.": "looking for the parts that the vehicle covers",
     "calibrate check mine.yaml images:.": "reading mine.yaml",
     "calibrate convert mine.yaml": "reading mine.yaml",
     "profile show": "reading profile sim",

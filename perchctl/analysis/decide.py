@@ -61,8 +61,8 @@ def turns_and_gap_text(log: FlightLog) -> tuple[list[TickRecord], str]:
     problem = (log.summary or {}).get("problem")
     if problem:
         return log.turns, (
-            f"the log has lost records ({problem}): these may include ticks after the last one "
-            "in the log, which cannot be replayed"
+            f"records are missing from the log ({problem}): they may include ticks after the "
+            "last one in the log, which cannot be replayed"
         )
     return log.turns, ""
 

@@ -278,7 +278,9 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
     try:
         return make_pipeline(profile, camera, log.flown_mask(camera))
     except ValueError as error:
-        raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
+        raise InvalidValue(
+            f"{log.path}: the flown mask does not fit the calibration: {error}"
+        ) from None
 
 
 # --- Replay of the perception ---

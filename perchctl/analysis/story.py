@@ -132,7 +132,7 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
         height_m = flight.value_at(end_s, "z_m") - flight.value_at(0.0, "z_m")
         if phases and phases[-1].phase in FLYING | {"LANDING"} and math.isfinite(height_m):
             text += f" at {length_text(height_m)}"
-        text += ": how the flight ended is unknown, as the log has no summary"
+        text += ": it is unknown how the flight ended, as the log has no summary"
         yield Sentence(end_s, text, "bad")
     if end.locked:
         text = "The supervisor locked the vehicle: inspect and restart it"

@@ -518,7 +518,7 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
     if given.size in _OPENCV_LONG and model != "fisheye":
         raise InvalidValue(
             f"{key} has {given.size} numbers, which describe a thin prism or a tilted "
-            "sensor and are not supported: calibrate with 5 or 8"
+            "sensor and are not supported: calibrate with 5 or 8 coefficients"
         )
     raise InvalidValue(
         f"{model} needs {' or '.join(map(str, counts))} distortion coefficients, found {given.size}"

@@ -48,7 +48,7 @@ def learn_gear_mask(
         if count and soft.shape != total.shape:
             raise InvalidValue(
                 f"image {count + 1} is {soft.shape[1]}x{soft.shape[0]} px, but the first is "
-                f"{total.shape[1]}x{total.shape[0]} px: a mask needs images of one size"
+                f"{total.shape[1]}x{total.shape[0]} px: a mask needs images of the same size"
             )
         total, squares = (soft, soft**2) if not count else (total + soft, squares + soft**2)
         count += 1
@@ -68,7 +68,7 @@ def learn_gear_mask(
         )
     if share == 0.0:
         raise InvalidValue(
-            "nothing stays the same in the images, so the vehicle covers nothing: "
+            "no part of the image stays the same, so the vehicle covers none of it: "
             "camera.mask is not needed"
         )
     return covered

@@ -102,7 +102,7 @@ class DeviceSource(LiveSource):
                         continue
                 except Exception as error:  # whatever OpenCV raises for a damaged image
                     why = f"delivers pictures that cannot be decoded ({describe_error(error)})"
-                    self._drop(f"they cannot be decoded ({describe_error(error)})")
+                    self._drop(f"decoding failed ({describe_error(error)})")
                 failures += 1
                 if failures >= LOST_AFTER_FAILURES:
                     raise NotFound(

@@ -121,8 +121,8 @@ class MjpegSource(LiveSource):
             for picture, (width, height) in reversed(splitter.feed(data)):
                 if width * height > MOST_STREAM_PX:
                     self._drop(
-                        f"they have {width}x{height} px, but at most {MOST_STREAM_PX} px are "
-                        "allowed"
+                        f"the picture size is {width}x{height} px, but at most "
+                        f"{MOST_STREAM_PX} px are allowed"
                     )
                     continue
                 image = decode_grey(picture)
@@ -242,7 +242,7 @@ class RtspSource(LiveSource):
                 frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
             except (av.error.FFmpegError, ValueError):
                 damaged += 1
-                self._drop("they cannot be decoded")
+                self._drop("decoding failed")
                 if damaged >= MAX_DAMAGED:
                     return "the pictures cannot be decoded"
                 continue

@@ -95,8 +95,8 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
         )
     if difference := _differences[requirements.campaign_id]:
         raise InvalidValue(
-            f"worker {worker.address} on {platform.node()} has {difference}: make these "
-            "the same there, and restart the worker"
+            f"worker {worker.address} on {platform.node()} has {difference}: correct "
+            "this on the worker, and restart it"
         )
     fn, args, named = pickle.loads(pickled_call)
     return fn(*args, **named)

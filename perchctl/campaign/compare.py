@@ -232,7 +232,7 @@ class Sweep:
             rows.append((yaml_scalar(cell["value"]), rate, *misses, note))
         lines = [*align_columns(rows), "", f"best: {yaml_scalar(record['best'])}"]
         if record["best_against_own"] is not None:
-            lines += [f"selected from {len(rows) - 1} values, which the statistics account for:"]
+            lines += [f"selected from {len(rows) - 1} values; the statistics account for this:"]
             lines += [comparison_text(("own", "best"), record["best_against_own"])]
         return "\n".join(lines)
 

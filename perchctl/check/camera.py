@@ -215,13 +215,13 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
-            "the target is not in view, so fly would refuse to take off",
+            "the target is not in view, so perchctl fly would refuse to take off",
             f"put the vehicle under the target: {where}",
         )
     if rehearsal.target is None:
         return warned(
             "the target was no longer in view at the end",
-            "see lost frames and target, then check again",
+            "see the rows lost frames and target, then check again",
         )
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)

@@ -153,7 +153,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
-        advice = "real poses are noisy: check whether the capture is paused or the body is hidden"
+        advice = "real poses are noisy: check if motion capture is paused or the body is hidden"
         return failed("frozen: all its poses are identical", advice)
     sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
     times = [place.t_s for place in places]
@@ -171,9 +171,12 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
         "the body may be hidden at times or have too few markers: look at it in the capture "
         "software"
     )
-    slow = "raise the capture's rate, connect by cable, or close other programs on this computer"
+    slow = (
+        "raise the motion-capture rate, connect by cable, or close other programs on this computer"
+    )
     noisy = (
-        "keep the vehicle still; calibrate the capture, or raise positioning.position_sigma_m"
+        "keep the vehicle still; calibrate the motion-capture system, or raise "
+        "positioning.position_sigma_m"
         if sigma_m < WILD_M
         else "the positions appear to be in millimetres: set the unit of the stream to metres"
     )
@@ -401,14 +404,14 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
         found, axis = (
-            f"the capture's world is tilted by {off_deg:.0f} deg",
+            f"the motion-capture world frame is tilted by {off_deg:.0f} deg",
             nearest_axis(turns.vertical),
         )
         if axis is not None:
             found = f"swapped axes: up is {axis} in the motion-capture system"
         advice = (
-            "set the capture's world to z up, and define the rigid body again with the "
-            "vehicle level"
+            "set the motion-capture world frame to z up, and define the rigid body again with "
+            "the vehicle level"
         )
         return failed(found, advice)
     risen_m = _risen_m(turns, motion)
@@ -419,8 +422,8 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
     return failed(
         f"swapped or mirrored axes: when lifted, the body moves by x {x:.2f}, y "
         f"{y:.2f}, z {z:.2f} m",
-        "set the capture's world to z up, right-handed; if you moved the vehicle "
-        "sideways, lift it again, straight up",
+        "set the motion-capture world frame to z up, right-handed; if you moved the "
+        "vehicle sideways, lift it again, straight up",
     )
 
 
@@ -441,7 +444,7 @@ def _body_finding(
     risen_m = float(_risen_m(turns, motion) @ turns.vertical)
     if risen_m < LEAST_RISE_M:
         return warned(
-            f"{found}; the vehicle was not lifted along the capture's z axis", HOW_TO_TURN
+            f"{found}; the vehicle was not lifted along the motion-capture z axis", HOW_TO_TURN
         )
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
@@ -473,12 +476,18 @@ def save_comparison_row(
     if why is None:
         return _record_row(config, uri, now)
     if not passes and load_comparison(config, vehicle).objection_and_advice(now) is None:
-        found = f"this result could not be saved, so fly would rely on an older pass: {why}"
-        advice = "free some space or restore write permission, and do not fly until then"
+        found = (
+            "this result could not be saved, so perchctl fly would rely on an older check that "
+            f"passed: {why}"
+        )
+        advice = "free some space or restore write permission, and do not fly until this is done"
         return Row(COMPARED, *failed(found, advice))
     return Row(
         COMPARED,
-        *warned(f"the result could not be saved, so fly cannot use it: {why}", "then check again"),
+        *warned(
+            f"the result could not be saved, so perchctl fly cannot use it: {why}",
+            "then check again",
+        ),
     )
 
 
@@ -488,4 +497,4 @@ def _record_row(config: PositioningConfig, uri: str, now: datetime) -> Row:
     if objection is None:
         return Row(COMPARED, *passed(record.text(now)))
     found, advice = objection
-    return Row(COMPARED, *warned(f"{found}, so fly refuses to start", advice))
+    return Row(COMPARED, *warned(f"{found}, so perchctl fly refuses to start", advice))

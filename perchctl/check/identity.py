@@ -226,7 +226,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
     # Report a distance beyond the limit even if single images are within it.
     if away_m <= target.expected_within_m:
-        found = f"its camera sees its target {away_m:.2f} m from its expected position"
+        found = f"the camera sees the vehicle's target {away_m:.2f} m from its expected position"
         if ask is None or not stand.lookalikes:
             return passed(found)
         return _covered_finding(
@@ -236,7 +236,8 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))
     if other_m is not None:
         found = (
-            f"its camera sees a target {math.dist(other_m, expected_m):.2f} m from its own target"
+            f"the camera sees a target {math.dist(other_m, expected_m):.2f} m from the "
+            "vehicle's own target"
         )
         there = _nearest(other_m, stand.views, target.expected_within_m)
         if there is not None:
@@ -261,9 +262,9 @@ def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Findi
         return failed(f"{why}, and you have not covered the lens", "give each target its own ids")
     covered = view.rehearse()
     if _is_dark(covered) or (before.target_pictures and not covered.target_pictures):
-        return passed("its camera image went dark when you covered the lens")
+        return passed("the camera image went dark when you covered the lens")
     return failed(
-        "its camera image did not go dark when you covered the lens",
+        "the camera image did not go dark when you covered the lens",
         "the camera may be another vehicle's: correct source; if it is not, cover the whole lens",
     )
 

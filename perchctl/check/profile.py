@@ -124,7 +124,7 @@ def _standoff(plan: _Plan) -> Finding:
     if sees_small_marker(plan.camera, plan.profile, standoff_m):
         return passed(f"{shown} in view")
     return failed(
-        f"{shown} not wholly in view, so no ascent could settle",
+        f"{shown} not wholly in view, so the vehicle could not settle there",
         "measure camera.mount and vehicle.gear_body_m, or raise planner.ascend.standoff_m",
     )
 

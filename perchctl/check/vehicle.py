@@ -41,9 +41,9 @@ MOVED_WARN_M = 0.05
 flight."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
-BY_FLY = "fly sends the positions, and waits until the estimate agrees with them"
+BY_FLY = "perchctl fly sends the positions, and waits until the estimate agrees with them"
 """Finding for a vehicle that gets its positions from motion capture or from the target."""
-ARMED_BY_FLY = "fly arms it after you confirm"
+ARMED_BY_FLY = "perchctl fly arms it after you confirm"
 UNREPORTED = "according to link.unreported, this vehicle does not report it"
 
 Wait = Callable[[float], None]
@@ -218,8 +218,8 @@ def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     age_ms = 1e3 * vehicle.age_s
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"
     if vehicle.age_s > profile.safety.telemetry_hold_s:
-        return failed(found, "see packets above, then restart the vehicle")
-    advice = "see packets above, or raise link.telemetry_period_s"
+        return failed(found, "see the row packets above, then restart the vehicle")
+    advice = "see the row packets above, or raise link.telemetry_period_s"
     if vehicle.link_scheme == "radio":
         advice = "use a radio rate of 2M, or raise link.telemetry_period_s"
     return limits_finding(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)

@@ -151,7 +151,7 @@ def mask(
     size: SizeOption = None,
 ) -> None:
     """Find the parts of the image that the vehicle covers while you turn it in your hand."""
-    say_on_terminal("looking for what the vehicle covers")
+    say_on_terminal("looking for the parts that the vehicle covers")
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask")
     with contextlib.ExitStack() as stack:

@@ -154,8 +154,8 @@ def _live_sources(
         return name.spec, None
     if not name.live:
         raise UsageError(
-            f"{name} is a recording and does not share the vehicle's clock: the carry needs "
-            "a live camera; --part pivot needs no vehicle"
+            f"{name} is a recording and does not share the vehicle's clock: --part carry "
+            "needs a live camera; --part pivot needs no vehicle"
         )
     link_uri = profile.link.uri if uri is None else uri
     if links.check_uri(link_uri) == "sim":
@@ -272,7 +272,7 @@ def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
     """Connect to the vehicle, and yield two functions that return its samples and its problem.
     Raises SafetyAbort if its motors turn or may turn."""
     link = links.AttitudeLink(uri, profile.link, time.monotonic)
-    say(f"connecting to {uri}, only to read from it")
+    say(f"connecting to {uri} (read-only)")
     link.connect()
 
     def problem(now_s: float) -> str | None:

@@ -82,9 +82,9 @@ def check(
 ) -> int:
     """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
-    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl arms
-    nothing, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not
-    answer, 20 if the camera gives no image, and 52 if any other check fails.
+    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl does
+    not arm the vehicle, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle
+    does not answer, 20 if the camera gives no image, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")

@@ -209,7 +209,7 @@ PositioningOption = Annotated[
     str | None,
     typer.Option(
         "--positioning",
-        help="Source of the vehicle's position: deck, mocap or target. Default: the profile's.",
+        help="Source of the vehicle's position: deck, mocap or target. Default: as in the profile.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON to stdout.")]

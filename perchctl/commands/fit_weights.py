@@ -61,10 +61,11 @@ def fit(
 ) -> int:
     """Fit the merge weights to poses with known ground truth, and verify that they help.
 
-    Each CSV row describes one image. The columns are position (a number for each place), t_s, and
-    x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and actual_. The cells of a
-    marker that was not detected are empty. All three poses are in the same coordinate frame;
-    fit-weights collect writes the target's pose relative to the gear, in the level frame.
+    Each CSV row describes one image. The columns are position (a number that identifies the
+    place), t_s, and x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and
+    actual_. The cells of a marker that was not detected are empty. All three poses are in the same
+    coordinate frame; fit-weights collect writes the target's pose relative to the gear, in the
+    level frame.
     """
     if output is not None:
         if same_file(output, data):

@@ -94,7 +94,8 @@ def check(
     it, and states the reason in one sentence.
 
     With --identify, perchctl then connects to the vehicles one at a time and checks that each
-    one is at its home. It does not arm any vehicle. The exit codes are those of perchctl check.
+    one is at its home. It does not arm any vehicle. The exit codes are the same as for
+    perchctl check.
     """
     if output is not None:
         check_output(output, (".svg",), force, PICTURE)
@@ -228,7 +229,7 @@ def fly(
     print_result(add_problem(plan.record(), refused) if as_json else plan_text(plan))
     if refused is None:
         return 0
-    say(f"fly would refuse this: {refused}")
+    say(f"perchctl fleet fly would refuse this: {refused}")
     return refused.exit_code
 
 

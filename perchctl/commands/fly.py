@@ -390,7 +390,8 @@ def plan_text(options: flights.FlyOptions) -> str:
             f"camera at {_mm(camera.mount.position_m)}, rpy {turn} deg"
             f"{', mirrored' if camera.mirrored else ''}"
             + (
-                f": the picture's {edges[0]} is the front, its {edges[1]} the left side"
+                f": the front is at the picture's {edges[0]} edge, the left side at its "
+                f"{edges[1]} edge"
                 if edges
                 else ""
             ),

@@ -50,7 +50,7 @@ def hover(
             "--below",
             min=0.2,
             max=2.0,
-            help="Distance of the gear below the target, m. Default: the profile's, or 0.5.",
+            help="Distance of the gear below the target, m. Default: as in the profile, or 0.5.",
         ),
     ] = None,
     duration: Annotated[
@@ -59,7 +59,7 @@ def hover(
             "--time",
             min=1.0,
             max=300.0,
-            help="Duration of the hover, s. Default: the profile's, or 20.",
+            help="Duration of the hover, s. Default: as in the profile, or 20.",
         ),
     ] = None,
     uri: UriOption = None,
@@ -76,9 +76,9 @@ def hover(
     """Hover below the target for a set time, land, and report the position error.
 
     Hover before the first perch to check the camera, its mounting and the tuning: the vehicle
-    finds the target, aligns and climbs as it does for a perch, but stays away from the ceiling. The
-    exit code is 0 only if the vehicle hovered for the whole time and then landed. Ctrl-C and the
-    space bar work as in `perchctl fly`.
+    finds the target, aligns and climbs as in a perching flight, but stays away from the ceiling.
+    The exit code is 0 only if the vehicle hovered for the whole time and then landed. Ctrl-C and
+    the space bar work as in `perchctl fly`.
     """
     say_on_terminal(f"reading profile {profile}")
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)

@@ -32,7 +32,7 @@ MagnetOption = Annotated[
 
 
 CameraArgument = Annotated[
-    str | None, typer.Argument(help="Calibration file. Default: the profile's.")
+    str | None, typer.Argument(help="Calibration file. Default: the one in the profile.")
 ]
 CeilingOption = Annotated[
     float | None,
@@ -112,7 +112,10 @@ def board(
     check_output(output, (".pdf",), force, "a sheet to print")
     write_files({output: targets.board_pdf(printed, page)})
     print(f"wrote {output}")
-    print("print at 100 %, check that both rulers measure 100 mm, and glue it to something flat")
+    print(
+        "print at 100 %, check that both rulers measure 100 mm, and glue the board to "
+        "something flat"
+    )
 
 
 @command(

@@ -106,8 +106,8 @@ WORDS: dict[str, str] = {
     "or measured, to have each flight measure it",
     "front": "Move a hand over the front of the vehicle. At which edge of the image does it\n"
     "appear: top, right, bottom or left?",
-    "left": "Move a hand over its left side. At which edge does it appear? (If the camera\n"
-    "mirrors the image, it appears at the opposite edge.)",
+    "left": "Move a hand over the left side of the vehicle. At which edge of the image does\n"
+    "it appear? (In a mirrored image, it appears at the opposite edge.)",
     "camera.mount.position_m": "Position of the lens, from the vehicle's centre: forward, left, up",
     "vehicle.gear_body_m": "Position of the magnet gear's tip: forward, left, up",
     "target.large.side_m": "Side of the target's large black square as printed",

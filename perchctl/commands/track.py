@@ -57,7 +57,7 @@ def track(
         Path | None,
         typer.Option(
             "--calibration",
-            help="Camera calibration (ROS, OpenCV or Kalibr). Default: the profile's.",
+            help="Camera calibration (ROS, OpenCV or Kalibr). Default: the one in the profile.",
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -194,7 +194,7 @@ def poll_until_stopped(
             return
         problem = source.problem(now_s)
         if problem is not None and not is_silent:
-            say(f"{problem}; waiting for it (Ctrl-C stops)")
+            say(f"{problem}; still waiting (Ctrl-C stops)")
             is_silent = True
         stop.requested.wait(TRACK_POLL_S)
 

@@ -392,7 +392,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("external-scaled", "positions in millimetres", mocap_effect("millimetres")),
     Fault(
         "external-late",
-        "positions arrive 50 to 150 ms later than they claim",
+        "positions with 50 to 150 ms of unreported delay",
         effect(
             e.external_positions, how="late", late_s=log_uniform(0.05, 0.15), for_s=duration_s(1.0)
         ),

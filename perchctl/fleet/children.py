@@ -113,12 +113,12 @@ class VehicleProcess:
         except (EOFError, OSError):
             raise
         except Exception as error:  # any error that unpickling raises
-            self._fault = f"it sent an unreadable message ({error_at(error)})"
+            self._fault = f"its process sent an unreadable message ({error_at(error)})"
             return
         self._heard_s = time.monotonic()
         fault = None if message is None else find_fault(message)  # None: the process is running
         if fault is not None:
-            self._fault = f"it sent {fault}"
+            self._fault = f"its process sent {fault}"
         elif isinstance(message, Status):
             self._status = message
         elif isinstance(message, Result):

@@ -246,9 +246,9 @@ class Coordinator:
         problem = child.end_of_process()
         loop_age_s = 0.0 if status is None or status.loop_age_s is None else status.loop_age_s
         if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):
-            problem = f"its process has not answered for {silent_s:.0f} s and was ended"
+            problem = f"its process has not answered for {silent_s:.0f} s and was killed"
         elif problem is None and loop_age_s > LOOP_HUNG_S:
-            problem = f"its flight loop has hung for {loop_age_s:.0f} s and was ended"
+            problem = f"its flight loop has hung for {loop_age_s:.0f} s, so it was killed"
         if problem is None:
             return None
         child.kill()

@@ -205,7 +205,7 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
-        axes = "the room's axes" if only == "room" else "axes with their origin where it stands"
+        axes = "the room's axes" if only == "room" else "axes whose origin is where it stands"
         raise InvalidValue(
             f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
             f"estimate uses {axes}: write {only}, or leave it out"
@@ -329,7 +329,7 @@ def _in_words(key: str, reason: str) -> str:
     if reason.startswith("string should match"):
         return f"found {found}; allowed are at most 32 letters, digits, -, _ and ."
     if reason.startswith("field required"):
-        return f"is missing; {_NEEDED.get(key, 'give it')}"
+        return f"is missing; {_NEEDED.get(key, 'add it')}"
     return reason
 
 

@@ -336,7 +336,10 @@ class GroundCriteria:
         """
         if not samples:
             return None
-        newest, advice = samples[-1], "keep the vehicle still; if it was, check its positioning"
+        newest, advice = (
+            samples[-1],
+            "keep the vehicle still; if it was still, check its positioning",
+        )
         if profile.positioning.source.is_deck:
             advice += " (light, floor, base stations)"
         window = rest_window(samples)
@@ -440,7 +443,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
         found = f"swapped axes: up is {axis} in the motion-capture system"
     return Problem(
         found,
-        "set the capture's world to z up, define the rigid body with level axes, or set "
+        "set the motion-capture world frame to z up, define the rigid body with level axes, or set "
         "positioning.body_rpy_deg to the angles that perchctl check --lift reports",
     )
 

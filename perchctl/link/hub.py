@@ -66,7 +66,7 @@ class RadioHub:
         except (EOFError, OSError):
             why = last_line(self._output)
             self.stop()
-            raise ConnectionFailed(f"the radio hub ended while starting{why}") from None
+            raise ConnectionFailed(f"the radio hub stopped while starting{why}") from None
         except BaseException:
             self.stop()
             raise
@@ -80,7 +80,7 @@ class RadioHub:
                 self.reports = self._channel.recv()
                 self._heard_s = time.monotonic()
         except (EOFError, OSError):
-            return f"the radio hub has ended{last_line(self._output)}"
+            return f"the radio hub has stopped{last_line(self._output)}"
         silent_s = time.monotonic() - self._heard_s
         return (
             f"the radio hub has not reported for {silent_s:.1f} s" if silent_s > SILENT_S else None

@@ -214,12 +214,12 @@ class Tick:
 
     @property
     def observation(self) -> Observation:
-        assert self.record.observation is not None, "every turn in flight has an observation"
+        assert self.record.observation is not None, "every tick in flight has an observation"
         return self.record.observation
 
     @property
     def command(self) -> Command:
-        assert self.record.command is not None, "every turn in flight has a command"
+        assert self.record.command is not None, "every tick in flight has a command"
         return self.record.command
 
     @property

@@ -213,12 +213,12 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_MASKED_SHARE, 0)
         raise InvalidValue(
             f"camera.mask: {path} covers {covers} % of the image, but at most {allowed} % is "
-            "allowed: white marks what the vehicle covers, and black what is free"
+            "allowed: white marks the part that the vehicle covers, and black the rest"
         )
     if share == 0.0:
         raise InvalidValue(
-            f"camera.mask: {path} covers nothing: white marks what the vehicle covers; "
-            "remove the key if the vehicle covers nothing"
+            f"camera.mask: {path} covers nothing: white marks the part that the vehicle covers; "
+            "remove the key if the vehicle covers no part of the image"
         )
     return covered
 

@@ -117,5 +117,5 @@ class SimProcess:
             raise TimedOut(f"the simulated vehicle did not answer within {ANSWER_TIMEOUT_S:.0f} s")
         if isinstance(answer, str):
             self.stop()
-            raise ConnectionFailed(f"the simulated vehicle has ended: {answer}")
+            raise ConnectionFailed(f"the simulated vehicle has stopped: {answer}")
         return answer

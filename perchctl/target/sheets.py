@@ -108,8 +108,8 @@ def board_pdf(board: Board, page: str) -> bytes:
     texts = (
         f"perchctl {board.notation()}   Print at 100 %, not scaled: both rulers must "
         "measure 100 mm.",
-        f"Then measure the black area ({width:g} x {height:g} mm) and append its sides "
-        "to the board for perchctl calibrate: "
+        f"Then measure the black area ({width:g} x {height:g} mm), and pass its size "
+        "to perchctl calibrate: --board "
         f"{board.notation()}:measured=WIDTHxHEIGHTmm.",
     )
     left = max(UNPRINTABLE, pdf.cx - width / 2)

@@ -246,7 +246,7 @@ class BlindRange:
 
 def _blind_words(nearest_m: float | None) -> str:
     if nearest_m is None:
-        return f"blind over all of the last {1e2 * FROM_M:g} cm"
+        return f"blind throughout the last {1e2 * FROM_M:g} cm"
     return "never blind" if nearest_m == 0.0 else f"blind from {1e3 * nearest_m:.0f} mm to contact"
 
 

@@ -86,8 +86,9 @@ class SimulatedStand:
             if self._in_picture(place):
                 return place
         raise InvalidValue(
-            f"no place between z3 ({merge.z3_m:g} m) and z2 ({merge.z2_m:g} m) shows the whole "
-            f"large marker to this camera: correct merge.z3_m and z2_m in the profile"
+            "this camera does not see the whole large marker from any place between z3 "
+            f"({merge.z3_m:g} m) and z2 ({merge.z2_m:g} m): correct merge.z3_m and z2_m in the "
+            "profile"
         )
 
     def frames(self, position: int, place: CameraPlace, count: int) -> Iterator[Frame]:

@@ -107,7 +107,7 @@ def test_a_calibration_is_not_judged_by_its_own_pictures(
     render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
     passed = calibrate("check", file, f"images:{tmp_path}")
     assert passed.exit_code == 0, passed.output
-    assert "left out copy_3.png: the calibration was made from it" in passed.stderr
+    assert "left out copy_3.png: the calibration was made from this image" in passed.stderr
 
 
 def test_a_board_in_the_older_layout_is_calibrated_and_stored(tmp_path: Path) -> None:

@@ -164,8 +164,8 @@ def test_what_does_not_reach_the_edge_is_no_gear() -> None:
     [
         (turned_about(5), "5 images are too few"),
         (turned_about(contrast=2.0), "hardly change"),
-        (turned_about(covered=np.zeros(SIZE_PX[::-1], np.bool_)), "covers nothing"),
-        ([*turned_about(3), np.zeros((10, 10), np.uint8)], "needs images of one size"),
+        (turned_about(covered=np.zeros(SIZE_PX[::-1], np.bool_)), "the vehicle covers none of it"),
+        ([*turned_about(3), np.zeros((10, 10), np.uint8)], "needs images of the same size"),
     ],
 )
 def test_pictures_that_do_not_show_it_are_refused(

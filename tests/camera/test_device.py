@@ -213,7 +213,7 @@ def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> N
 
 @pytest.mark.parametrize(("read", "words"), [
     (lambda: (False, None), "connected, but it sends no data: for a receiver: check"),
-    (lambda: (True, "torn"), r"pictures arrive but are dropped \(\d+ so far\): they cannot be dec"),
+    (lambda: (True, "torn"), r"pictures arrive but are dropped \(\d+ so far\): decoding failed"),
 ])  # fmt: skip
 def test_a_camera_without_a_picture_says_what_came(
     read: Callable[[], Any], words: str, monkeypatch: pytest.MonkeyPatch

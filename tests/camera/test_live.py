@@ -158,7 +158,7 @@ HTML = b"<html>the camera's page</html>"
     pytest.param([part(jpeg(60)[:300]), threading.Event()],
                  "the server sends no content type, but no complete JPEG", marks=pytest.mark.long),
     pytest.param([part(resized(jpeg(60), 5000, 4000)), threading.Event()],
-                 "pictures arrive but are dropped (1 so far): they have 5000x4000 px",
+                 "pictures arrive but are dropped (1 so far): the picture size is 5000x4000 px",
                  marks=pytest.mark.long),
     ([part(NO_PIXELS), threading.Event()], "pictures arrive but are dropped (1 so far): the "
      "JPEG cannot be decoded"),

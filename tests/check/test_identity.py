@@ -108,7 +108,9 @@ def test_the_camera_of_another_vehicle_is_named(sim: SimProcess, relay: Relay) -
     rows = rows_of(relay.uri, sim, stand, profile=expecting(0.6, 0.0))
     assert rows["target"].verdict is Verdict.FAIL
     assert re.search(r"a target 0\.[56]\d m from its own", rows["target"].found)
-    assert rows["target"].found.endswith("from its own target, as the camera of east would")
+    assert rows["target"].found.endswith(
+        "from the vehicle's own target, as the camera of east would"
+    )
 
 
 @pytest.mark.parametrize(("covers", "verdict"), [(True, Verdict.PASS), (False, Verdict.FAIL)])

@@ -256,7 +256,7 @@ def test_a_healthy_brushless_fails_nothing(volts: float) -> None:
     vehicle = replace(GOOD, telemetry=at_rest, device_type="Crazyflie 2.1 Brushless")
     rows = rows_of(vehicle)
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
-    assert rows["supervisor"].found == "ready, fly arms it after you confirm (0x0201)"
+    assert rows["supervisor"].found == "ready, perchctl fly arms it after you confirm (0x0201)"
     assert rows["airframe"].found == "Crazyflie 2.1 Brushless"
 
 

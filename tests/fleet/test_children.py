@@ -43,14 +43,16 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 def test_what_cannot_be_used_is_told_and_the_next_message_is_heard(start: Start) -> None:
     child = start("channel.send_bytes(b'no pickle'); channel.send_bytes(ready); time.sleep(60)\n")
     until(lambda: child.newest()[0])
-    assert (child.fault() or "").startswith("it sent an unreadable message (UnpicklingError")
+    assert (child.fault() or "").startswith(
+        "its process sent an unreadable message (UnpicklingError"
+    )
     assert child.newest()[0] == Status(stage=Stage.READY)
     assert child.end_of_process() is None
 
 
 def test_a_status_with_wrong_parts_is_not_shown(start: Start) -> None:
     child = start("channel.send(Status(stage='flying')); time.sleep(60)\n")
-    assert until(child.fault) == "it sent Status with fields of the wrong type"
+    assert until(child.fault) == "its process sent Status with fields of the wrong type"
     assert child.newest()[0] is None
 
 

@@ -462,7 +462,7 @@ def test_a_vehicle_landed_by_key_has_not_failed_unless_it_has(
 def test_one_that_sends_nonsense_lands_and_says_why() -> None:
     rig = Rig().started()
     rig.fly("v0", "v1")
-    rig["v0"].garbled = "it sent str instead of its status"
+    rig["v0"].garbled = "its process sent str instead of its status"
     rig.pass_s()
     rig["v0"].garbled = None
     rig.pass_s()
@@ -470,7 +470,7 @@ def test_one_that_sends_nonsense_lands_and_says_why() -> None:
     rig.end("v0", replace(ABORTED, outcome=VehicleOutcome.LANDED, exit_code=130))
     result = rig.fleet.views[0].result
     assert result is not None
-    assert result.reason.startswith("it sent str instead of its status: ")
+    assert result.reason.startswith("its process sent str instead of its status: ")
     assert result.exit_code == 52, "no operator has landed it"
 
 

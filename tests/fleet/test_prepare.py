@@ -104,8 +104,8 @@ def test_a_problem_of_a_hub_or_of_its_dongle_is_named(made: list[FakeHub]) -> No
         assert radios.problems() == {}
         hub.reports = {uri: HubReport(problem="it is dead") for uri in hub.uris}
         assert radios.problems() == {"0": "it is dead"}
-        hub.problem = "the radio hub has ended"
-        assert radios.problems() == {"0": "the radio hub has ended"}
+        hub.problem = "the radio hub has stopped"
+        assert radios.problems() == {"0": "the radio hub has stopped"}
 
 
 def test_a_dongle_that_does_not_open_is_named_and_the_others_are_closed(

@@ -48,7 +48,7 @@ def problem(alter: Callable[[Telemetry], Telemetry], profile: Profile = PROFILE)
 def test_an_estimate_that_runs_away_at_rest_is_named(profile: Profile, mps: float) -> None:
     said = problem(lambda s: runs_away(s, mps), profile)
     assert f"moved {REST_S * mps:.2f} m in 1.9 s, but at most 0.07 m is allowed" in said
-    assert "keep the vehicle still; if it was, check its positioning" in said
+    assert "keep the vehicle still; if it was still, check its positioning" in said
     assert ("base stations" in said) is (profile is PROFILE)
     still = {"position_m": (0.0, 0.0, 0.0)}
     said = problem(lambda s: replace(runs_away(s, mps), **still), profile)  # type: ignore[arg-type]

@@ -651,7 +651,7 @@ def test_a_killed_hub_is_one_sentence_to_parent_and_flights(
         os.kill(shared._child.pid, signal.SIGKILL)
         assert flight.failed.wait(20.0)
         assert flight.errors == [hub_driver.HUB_ENDED]
-        assert until(shared.update) == "the radio hub has ended"
+        assert until(shared.update) == "the radio hub has stopped"
         flight.close()
 
 
@@ -711,11 +711,13 @@ def test_a_hub_that_fails_says_its_last_line(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(hub, "PROGRAM", program.replace("sharing.serve_parent()", fails))
     shared = RadioHub(FOUR[:1])
     shared.limit(FOUR[0], 10)
-    assert "the radio hub has ended: TypeError: can only concatenate tuple" in until(shared.update)
+    assert "the radio hub has stopped: TypeError: can only concatenate tuple" in until(
+        shared.update
+    )
     shared.stop()
 
 
 def test_a_hub_that_ends_at_its_start_says_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub, "PROGRAM", "raise SystemExit('no room')")
-    with pytest.raises(ConnectionFailed, match=r"^the radio hub ended while starting: no room$"):
+    with pytest.raises(ConnectionFailed, match=r"^the radio hub stopped while starting: no room$"):
         RadioHub(FOUR)

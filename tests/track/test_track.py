@@ -350,7 +350,7 @@ def test_a_live_source_is_waited_for_until_it_has_ended(
     )
     assert [frame.index for frame in poll_until_stopped(source, lambda: 5.0, Stopper())] == [0]
     said = capsys.readouterr().err
-    assert said == "perchctl: silent for 2 s; waiting for it (Ctrl-C stops)\n"
+    assert said == "perchctl: silent for 2 s; still waiting (Ctrl-C stops)\n"
     assert problems == []
 
 

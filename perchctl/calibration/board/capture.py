@@ -94,7 +94,7 @@ def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
     named = ", ".join(f"{name} is {size[0]}x{size[1]} px" for name, size in odd.items() if size)
     raise InvalidValue(
         f"{count} of {counts.total()} images are {most[0]}x{most[1]} px, but {named}: "
-        "a calibration needs images of one size, so remove the others"
+        "a calibration needs images of the same size, so remove the others"
     )
 
 

@@ -106,11 +106,14 @@ def check_calibration(
             advice = found.frames.advice or advice
         raise InvalidValue(f"{seen}, but a check needs at least {MIN_CHECK_VIEWS}: {advice}")
     free, kept, outliers = robust_fit(found.views)
-    reason = "the calibration was made from it"
+    reason = "the calibration was made from this image"
     rejections = [*(Rejection(view.name, reason) for view in own), *outliers]
     fixed = fit_poses(kept, camera)
     if fixed is None:
-        reason = "the calibration fits no pose of the boards: it may belong to another camera"
+        reason = (
+            "no pose of the board fits the images with this calibration, which may belong to "
+            "another camera"
+        )
         return CheckResult(False, reason, np.inf, free.rms_px, (), tuple(rejections))
     deviations = tuple(
         Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)

@@ -204,7 +204,7 @@ def _charuco(image: Grey, board: Board) -> _Corners | str:
         return _without_board(image)
     plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
     if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
-        return f"{markers} markers but too few corners of the board found"
+        return f"found {markers} markers, but too few corners of the board"
     return numbers, corners, board.legacy
 
 
@@ -246,7 +246,7 @@ def _without_board(image: Grey) -> str:
     _, ids, _ = detector.detectMarkers(image)
     if ids is not None and marker.id in ids:
         return (
-            "it shows the perching target, not a board; print a board with perchctl "
+            "the image shows the perching target, not a board; print a board with perchctl "
             "make-target board"
         )
     return "no board found"

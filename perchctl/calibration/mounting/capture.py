@@ -112,7 +112,7 @@ class _Progress:
         elif share < LEAST_TARGET_SHARE:
             advice = "no target in view"
         else:
-            advice = (*self._missing, "enough; continue a little for a more precise result")[0]
+            advice = (*self._missing, "enough data; continue a little for a more precise result")[0]
         done = min(self._seconds / self._least_s, 1.0)
         rows = (
             (recording.part, f"{self._seconds:.0f} s of {self._least_s:.0f}", _bar(done)),

@@ -175,8 +175,8 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
         )
     if latency_s < -2.0 * sigma_s:
         raise InvalidValue(
-            f"the images' time stamps are {-1e3 * latency_s:.0f} ms too early to be possible: "
-            "camera and telemetry must use the same clock"
+            f"the images' time stamps are {-1e3 * latency_s:.0f} ms too early, which is "
+            "impossible: camera and telemetry must use the same clock"
         )
 
 

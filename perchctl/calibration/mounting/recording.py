@@ -162,7 +162,8 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
 
 HOW_TO_RECORD: dict[MountingPart, str] = {
     "carry": "turn the vehicle by hand about every axis for 30 s, with the target in view",
-    "pivot": "keep the tip on its point and tilt the vehicle around it in every direction for 20 s",
+    "pivot": "keep the gear's tip on one point, and tilt the vehicle around that point in every "
+    "direction for 20 s",
 }
 MIRRORED = (
     "the picture is mirrored: turn mirroring off in the camera, or change "

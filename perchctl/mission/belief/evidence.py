@@ -19,7 +19,7 @@ class RequiredData(Enum):
     """Data that a condition requires. The condition does not count while that data is old or
     unknown."""
 
-    NOTHING = "nothing that could be old"
+    NOTHING = "no data that could be out of date"
     TELEMETRY = "fresh telemetry"
     POSITION = "fresh telemetry and a valid position"
 

@@ -113,8 +113,8 @@ def position_loss_text(b: Belief) -> str:
         why = why or NO_ESTIMATE_CORRECTION_TEXT
     if b.obs.rejected_sighting_to_estimate_distance_m > 0.0:
         why = (
-            f"the target shows the vehicle {b.obs.rejected_sighting_to_estimate_distance_m:.2f} m "
-            f"from its estimate"
+            "the target places the vehicle "
+            f"{b.obs.rejected_sighting_to_estimate_distance_m:.2f} m from its estimated position"
         )
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has arrived"
     return f"{text}: {why}" if why else text

@@ -181,7 +181,7 @@ ASCEND = PhaseDefinition(
             {Phase.ASCEND},
             lambda c: c.belief.target.gear_to_target_distance_xy_m > ascent_cone_radius_m(c),
             Phase.ALIGN,
-            "drifted out of the cone",
+            "drifted out of the ascent cone",
             Severity.HOLD,
         ),
         back_off_row(
