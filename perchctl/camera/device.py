@@ -206,7 +206,7 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
     if fitting:
         raise InvalidValue(
             f"camera:{wanted} matches {len(fitting)} cameras: {', '.join(map(str, fitting))}",
-            "write a longer part of the name, or the path or number",
+            "write more of the name, or use the path or number",
         )
     raise _not_found(wanted, known)
 

@@ -261,7 +261,7 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
     )
     latest_s = max(rehearsal.tick_delays_s)
     found = (
-        f"processing takes {1e3 * work_s:.0f} of {1e3 * period_s:.0f} ms for each picture; "
+        f"processing takes {1e3 * work_s:.0f} of the {1e3 * period_s:.0f} ms per picture; "
         f"{100.0 * late:.0f} % of the ticks are late, by at most {1e3 * latest_s:.0f} ms"
     )
     advice = "close other programs, request smaller pictures, or use a faster computer"

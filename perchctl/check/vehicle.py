@@ -263,7 +263,7 @@ def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
-        "mocap": f"by {profile.positioning.label}, see its rows",
+        "mocap": f"by {profile.positioning.label}; see the rows capture and body",
         "target": "by the target, see the row in view",
         "deck": f"by {decks}",
     }

@@ -143,7 +143,10 @@ def collect(
         poses = weights.TypedPoses() if truth == "typed" else _open_capture(config, target_body)
         with closing(poses):
             _collect_with_person(session, config, camera, positions, frames, poses, source)
-    say(f"{session} is complete: perchctl fit-weights {session} -o weights.yaml fits the weights")
+    say(
+        f"{session} is complete; now fit the weights: perchctl fit-weights {session} "
+        "-o weights.yaml"
+    )
 
 
 def _open_session(path: Path, frames: int) -> weights.SessionFile:

@@ -65,7 +65,7 @@ def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) ->
         abort_on(GroundCriteria.no_position_source(link.decks(), profile))
     elif profile.positioning.source.is_mocap and not has_feed:
         raise SafetyAbort(
-            "the profile says positioning: mocap, but nothing sends positions: not flying"
+            "the profile sets positioning: mocap, but nothing sends positions: not flying"
         )
 
 

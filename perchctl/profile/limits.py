@@ -145,7 +145,7 @@ _DOUBTFUL = {
             "a gust can tilt the vehicle that far, which would cut the motors"
         ),
         f"link.telemetry_period_s <= {SafetyConfig.proof_age_s / 2:g}": (
-            "a single lost packet would make telemetry too old for any evidence"
+            "a single lost packet would make telemetry too old to count as evidence"
         ),
     },
 }

@@ -137,7 +137,7 @@ class PrintCheck:
         few frames, it is not reported as wrong."""
         if not self.has_enough_frames:
             return PrintVerdict(
-                f"print not checked: both markers were seen in only {len(self._ratios)} of "
+                f"print not checked: both markers were seen in only {len(self._ratios)} of the "
                 f"{MIN_FRAMES} frames needed"
             )
         values, biases = np.array(self._ratios).T
@@ -149,7 +149,7 @@ class PrintCheck:
         nominal = self.target.small.side_m / self.target.large.side_m
         ratio_text = (
             f"the small marker is {value * nominal:.4f} times as large as the large one, and the "
-            f"profile says {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
+            f"profile specifies {nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
         )
         if abs(off) <= max(SIGMAS * total, MIN_ERROR):
             return PrintVerdict(f"print correct within the noise: {ratio_text}")

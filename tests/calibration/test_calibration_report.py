@@ -40,7 +40,7 @@ def good() -> Calibration:
 def test_a_page_says_the_verdict_in_millimetres(good: Calibration) -> None:
     page = Page(calibration_report(good, "camera.yaml", DATE))
     assert '<h2 class="good">GOOD TO FLY</h2>' in calibration_report(good, "camera.yaml", DATE)
-    assert "GOOD TO FLY The target's centre is within" in page.words
+    assert "GOOD TO FLY The target's centre is accurate to" in page.words
     far = next(e for e in good.errors if e.z_m == 1.0)
     assert f"{far.axis_mm95:.2g} mm at 1 m (95 %). camera.yaml" in page.words
     assert f"1 m {far.axis_mm95:.2f} mm 10.0 mm {far.mm95:.2f} mm" in page.words

@@ -216,7 +216,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     c = MountingReport(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
     assert "camera.latency_s" not in c.new_profile_values()
     assert "latency_s" not in c.record()["written"]
-    assert "the profile has `measured`, which is kept" in "\n".join(c.lines())
+    assert "the profile keeps `measured`" in "\n".join(c.lines())
 
 
 def carried(R: Array) -> RotationSolution:

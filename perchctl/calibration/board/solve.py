@@ -100,13 +100,13 @@ class Calibration:
         """The predicted errors at 10 cm and 1 m in words."""
         near, far = (e for e in self.errors if e.z_m in (0.1, 1.0))
         text = (
-            f"the target's centre is within {near.axis_mm95:.2g} mm at 10 cm and "
+            f"the target's centre is accurate to {near.axis_mm95:.2g} mm at 10 cm and "
             f"{far.axis_mm95:.2g} mm at 1 m (95 %)"
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
         if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
             text += (
-                f", but away from the optical axis only within {aside.mm95:.2g} mm at "
+                f", but away from the optical axis only to {aside.mm95:.2g} mm at "
                 f"{aside.z_m * 100:.0f} cm"
             )
         return text

@@ -37,8 +37,7 @@ class _Value:
         if self.written is None:
             return [
                 line,
-                f"{'':<12}the profile has `measured`, which is kept: each flight measures the "
-                "latency",
+                f"{'':<12}the profile keeps `measured`: each flight measures the latency",
             ]
         apart = self.measured - self.written
         apart = (apart + 180.0) % 360.0 - 180.0 if self.unit == "deg" else apart
