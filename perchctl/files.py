@@ -95,7 +95,7 @@ def check_writable(path: Path, force: bool, *, makes_folder: bool = True) -> Non
         InvalidValue: the path is a folder, a file that must not be replaced, or a place where
         no file or folder can be made.
     """
-    # Uses os.path, which treats a folder without permissions as empty.
+    # os.path treats a folder without permissions as empty; Path may raise PermissionError.
     if os.path.isdir(path):
         raise InvalidValue(f"{path} is a folder: name a file in it")
     if os.path.exists(path) and not force:

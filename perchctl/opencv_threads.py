@@ -15,8 +15,8 @@ _threads = 0  # number of OpenCV's threads before the first user
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit OpenCV to one thread until the last user leaves. The limit applies to the whole
-    process, because OpenCV's setting is global.
+    """Limit OpenCV to one thread during the block; if several such blocks overlap, until the last
+    of them ends. The limit applies to the whole process, because OpenCV's setting is global.
 
     Use it for small patches, where waking threads costs more than it saves, and where sums need a
     fixed order. Searching a whole image is faster with all threads.

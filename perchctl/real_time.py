@@ -50,9 +50,9 @@ def fly(
     record: bool | None = None,
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
-    **It arms without asking.** Ctrl-C works if you call it in the main thread. Press Ctrl-C to
-    land. Press it again to cut the motors. Warnings of the checks, and an incomplete log, are
-    Python warnings (`perchctl.errors.Note`).
+    **It arms the vehicle without asking.** Ctrl-C works if you call this function in the main
+    thread. Press Ctrl-C to land. Press it again to cut the motors. Warnings from the checks, and an
+    incomplete log, are Python warnings (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name, or its file.

@@ -15,9 +15,9 @@ else:
     from dataclasses import replace as _by_init
 
     class cached_property(functools.cached_property):
-        """A `functools.cached_property` without the lock that Python 3.11 takes for each value,
-        which takes longer than computing most of the values. Two threads may both compute a value,
-        with the same result."""
+        """A `functools.cached_property` without the lock of Python 3.11, because locking takes
+        longer than computing most of the values. Two threads may both compute a value, with the
+        same result."""
 
         def __get__(self, instance: Any, owner: type | None = None) -> Any:
             if instance is None:

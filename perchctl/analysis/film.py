@@ -27,10 +27,10 @@ ARM_M = 0.046
 BESIDE_M, ABOVE_M = 0.25, 0.12
 """Margins in the side view, to the left and right of the flight and above it, m."""
 LEAST_ASIDE_M = 0.05
-"""Horizontal distance of the start from the target below which it does not define the direction of
-the view, m."""
+"""If the start is horizontally closer to the target than this, m, it does not define the direction
+of the view."""
 LAST_PICTURE_S = 2.0
-"""Time for which the last image stays, s."""
+"""How long the last image stays on screen, s."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
 SIZE_STEP_PX = 32
 """Multiple to which the width is rounded, so that width and height are even, as H.264 requires."""
@@ -49,7 +49,8 @@ def write_film(
     width_px: int = 960,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write the flight as a real-time film (.mp4 or .gif), and return the film's number of images.
+    """Write the flight as a real-time film (.mp4 or .gif), and return the number of images in the
+    film.
 
     Args:
         pictures: the recorded images, oldest first; None if there is no recording.

@@ -99,8 +99,8 @@ def write_fleet_film(
     width_px: int = 960,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write the flight of a fleet as a real-time film (.mp4 or .gif), and return the film's number
-    of images. `rate_hz`, `width_px`, `progress` and errors are as in
+    """Write the flight of a fleet as a real-time film (.mp4 or .gif), and return the number of
+    images in the film. `rate_hz`, `width_px`, `progress` and errors are as in
     `perchctl.analysis.write_film`.
     """
     for vehicle in vehicles:

@@ -117,7 +117,7 @@ class FlightAnalysis:
 
     def to_pandas(self) -> Any:
         """Return the ticks as a `pandas.DataFrame` with one column per field and the index `t_s`,
-        seconds since the first tick. Raises UsageError without pandas."""
+        seconds since the first tick. Raises UsageError if pandas is not installed."""
         try:
             import pandas
         except ImportError:
@@ -136,8 +136,8 @@ class FlightAnalysis:
     @cached_property
     def position_holds(self) -> tuple[Hold, ...]:
         """Periods in which the mission paused, each within one phase and for one reason.
-        If the numbers in the reason change during a pause, its text is the one from the end of the
-        pause."""
+        If the numbers in the reason change during a pause, the text of the reason is the one at the
+        end of the pause."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")

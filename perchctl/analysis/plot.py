@@ -43,10 +43,10 @@ steady approach fills the plot."""
 Span = tuple[str, float, float]
 """A phase's name, and its start and end on the time axis."""
 NAME_GAP = 0.02
-"""Smallest distance between the names of two phases that does not make them overlap, as a share of
-the time axis."""
+"""Smallest distance between two phase names at which they do not overlap, as a fraction of the time
+axis."""
 LOST_SHARE = 0.05
-"""Share of a panel's height in which lost frames are marked."""
+"""Height of the marks for lost frames, as a fraction of the panel's height."""
 FULL_THRUST_PERCENT = 1 / 655.35
 RAW = (
     ("j", "s", GREEN, "both, raw"),

@@ -38,8 +38,8 @@ CAUTION = (
 class Difference:
     """The first field of one turn in which a replay differs from the log.
 
-    `tick`: number of the turn since take-off, from 0; negative before take-off. `t_s`: since the
-    first flown turn. `recorded`, `replayed`: the two values, in JSON types.
+    `tick`: number of the turn since take-off, from 0; negative before take-off. `t_s`: time since
+    the first flown turn. `recorded`, `replayed`: the two values, in JSON types.
     """
 
     tick: int
@@ -238,7 +238,7 @@ def replay(
     seen = None
     if pictures is not None:
         pipeline = pipeline or replay_pipeline(log, used, changed)
-        # A source subtracts the latency from an image's arrival time.
+        # A live source has already subtracted the flown latency from each image's arrival time.
         delay_s = flown.camera.start_latency_s - used.camera.start_latency_s
         replayed, missing = _replayed(turns, used, pipeline, pictures, delay_s)
         differing = list(_differing(log, turns, replayed, comparison))

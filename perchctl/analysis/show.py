@@ -15,7 +15,7 @@ from perchctl.record import FlightLog, PhaseSpan
 
 COLUMNS = 79
 _HANG = 11
-"""Column at which the text of a line begins, after its name."""
+"""Column at which the text of a line begins; the line's name is to the left of it."""
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
@@ -102,8 +102,8 @@ def _origin(log: FlightLog) -> str:
 
 
 def _positions_text(log: FlightLog) -> str:
-    """Return which positioning system measured the position. It may differ from the profile's,
-    because a fault or an option can replace it."""
+    """Return which positioning system measured the position. The flight may not have used the
+    system that its profile names, because a fault or an option can replace that system."""
     section = (log.header.get("profile") or {}).get("positioning") or {}
     return f"positions by {section['by']}" if "by" in section else ""
 

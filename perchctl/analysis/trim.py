@@ -143,15 +143,15 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
 
     A sample is a log packet with duty cycles and voltage, received while the vehicle is in the air,
     slow, level, and away from the floor and the target. The interval takes the noise's
-    autocorrelation into account (`mean_and_margin`). The estimate is wrong for a swinging load, and
-    near full duty, where a motor cannot deliver the demanded thrust. The estimate uses the thrust
-    curve of a Crazyflie 2.1. At the voltage at which a Brushless of 40 to 48 g hovers, the relative
-    slopes of the two vehicles' curves agree to 7 %, so a share's difference from 1 is also accurate
-    to 7 %.
+    autocorrelation into account (`mean_and_margin`). The estimate is wrong if the vehicle carries a
+    swinging load, and near full duty, where a motor cannot deliver the demanded thrust. The
+    estimate uses the thrust curve of a Crazyflie 2.1. At the voltage at which a Brushless of 40 to
+    48 g hovers, the relative slopes of the two vehicles' curves agree to 7 %, so a share's
+    difference from 1 is also accurate to 7 %.
 
-    Returns None for less than 2 s of hover, and for a log without duty cycles, as written by older
-    versions of perchctl. Raises InvalidValue for a value that is not a number. `simulated`: give no
-    advice.
+    Returns None if the vehicle hovered for less than 2 s, or if the log contains no duty cycles
+    because an older version of perchctl wrote it. Raises InvalidValue for a value that is not a
+    number. `simulated`: give no advice.
     """
     duties = np.stack([log.column(f"duty_m{motor}") for motor in (1, 2, 3, 4)], axis=1)
     volts = log.column("battery_v")

@@ -1,4 +1,4 @@
-"""Read calibration files of ROS, OpenCV and Kalibr, and write a YAML file that ROS, OpenCV and
+"""Read calibration files from ROS, OpenCV and Kalibr, and write a YAML file that ROS, OpenCV and
 PyYAML can read."""
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from perchctl.vision import CameraModel
 
 
 def profile_camera(config: CameraConfig) -> CameraModel:
-    """The calibrated camera of a profile. Raises the errors of `load_calibration`."""
+    """The calibrated camera of a profile. Raises the same errors as `load_calibration`."""
     return load_calibration(config.calibration)
 
 
 @dataclass(frozen=True)
 class CalibrationNotes:
-    """The notes in a calibration made by perchctl about its origin; empty for files of other
+    """What perchctl notes in a calibration file about its origin; empty for files from other
     programs.
 
     Attributes:
@@ -39,7 +39,7 @@ class CalibrationNotes:
 
 
 def load_notes(path: Path) -> CalibrationNotes:
-    """Read the notes in a calibration file. Raises the errors of `load_calibration`."""
+    """Read the notes in a calibration file. Raises the same errors as `load_calibration`."""
     _, values = _parsed(path)
     return CalibrationNotes(
         board=str(values.get("board") or ""),

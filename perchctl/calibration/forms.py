@@ -1,8 +1,8 @@
-"""Calibration files of other programs: recognise the form, and interpret each key.
+"""Calibration files from other programs: recognise the format, and interpret each key.
 
 If two lens models are confused, the target's position is wrong by centimetres although its standard
-deviation is a few millimetres, and no later check detects this. Each form therefore has a table of
-its keys:
+deviation is a few millimetres, and no later check detects this. Each format therefore has a table
+of its keys:
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must have a neutral value, since any other would change the projection (binning, xi,
@@ -15,7 +15,7 @@ is 0 or empty, which disables any term of a lens model. `rectification_matrix` a
 `projection_matrix` are among the notes, because according to sensor_msgs/CameraInfo they describe
 rectified images, whereas K and D describe the camera's own images.
 
-Known forms that are not supported are refused with a message that names them.
+Known formats that are not supported are refused with a message that names them.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ READ_FORMS = "camera_info file (ROS), FileStorage file (OpenCV) or camchain (Kal
 
 @dataclass(frozen=True)
 class Form:
-    """The keys of one form of calibration file.
+    """The keys of one calibration file format.
 
     Attributes:
-        name: the form's name in messages.
+        name: the format's name in messages.
         read: the keys for each meaning. All keys for ``lens`` must agree; for any other meaning, a
             file contains only one.
         neutral: keys that can change the projection, each with the values at which it does not.
@@ -147,7 +147,7 @@ _LENSES = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
-"""The lens models that are supported, by their names in ROS, OpenCV and Kalibr."""
+"""The supported lens models, keyed by their names in ROS, OpenCV and Kalibr."""
 _COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,)}
 _OPENCV_LONG = (12, 14)
 """Coefficients of OpenCV's thin prism and tilted sensor models."""
@@ -186,7 +186,8 @@ _OTHER_FORMS = (
     (r'"camera_type"\s*:', "a Basalt calibration", _AS_CAMERA_INFO),
     (r'"cameraData"\s*:', "a DepthAI (OAK) calibration", _AS_CAMERA_INFO),
 )
-"""Forms that are recognised but not supported: a pattern in the text, the name, and what to do."""
+"""Formats that are recognised but not supported: a pattern in the text, the name, and what to
+do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +205,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     """Return the lens that the text of a calibration file describes, and the values of all its
     keys.
 
-    Raises InvalidValue, which names the form that was found and what is needed.
+    Raises InvalidValue, which names the format that was found and what is needed.
     """
     for pattern, name, advice in _OTHER_FORMS:
         if re.search(pattern, text, re.MULTILINE):
@@ -331,7 +332,7 @@ def _kalibr_lens(cam: str, camera: Any) -> Lens:
 
 
 _Found = dict[str, list[tuple[str, Any]]]
-"""The keys and values of each meaning that the file contains."""
+"""The keys in the file and their values, grouped by meaning."""
 
 
 def _plain_key(key: str) -> str:

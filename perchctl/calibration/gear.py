@@ -21,9 +21,9 @@ LIVE_S = 20.0
 """Recording time with a live camera, s."""
 LEAST_PICTURES = 20
 MOST_GEAR_SHARE = 0.6
-_LEAST_MOTION_GREY = 8.0  # least spread over time of a pixel that sees the moving room
-_STILL_RATIO = 0.3  # share of that spread below which a pixel belongs to the gear
-_LEAST_BLOB_SHARE = 5e-4  # smallest part of the gear, as a share of the image
+_LEAST_MOTION_GREY = 8.0  # smallest spread over time of a pixel that sees the moving room
+_STILL_RATIO = 0.3  # fraction of the room's spread below which a pixel belongs to the gear
+_LEAST_BLOB_SHARE = 5e-4  # smallest part of the gear, as a fraction of the image
 _CLOSED_PX = 7  # width of gaps that are filled; larger: pixels between two parts are covered, too
 _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered than the gear hides
 

@@ -204,7 +204,7 @@ def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class MosaicFilter:
-    """Removes the colour mosaic from a stream's images once an image has shown one."""
+    """Removes the colour mosaic from a stream's images once one of them has shown a mosaic."""
 
     def __init__(self) -> None:
         self._in_a_row = 0

@@ -1,5 +1,4 @@
-"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame is returned, and none is
-dropped."""
+"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame is returned; none is dropped."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ orientation tag for viewers; an image rotated by this tag would no longer fit th
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
     """Decode any bytes to a grey image on the sensor's grid, ignoring the orientation tag. Returns
-    None if OpenCV cannot decode them; raises nothing."""
+    None if OpenCV cannot decode them; never raises an exception."""
     if not data:
         return None  # OpenCV raises an error for an empty array
     try:

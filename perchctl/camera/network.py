@@ -43,9 +43,9 @@ _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    The source gives up at once if the server rejects the user name and password. They are sent only
-    when the camera asks for them (digest with MD5, or basic), and never to a redirected address.
-    Proxy settings are ignored.
+    The source gives up at once if the server rejects the user name and password. The user name and
+    password are sent only when the camera asks for them (digest with MD5, or basic), and never to a
+    redirected address. Proxy settings are ignored.
     """
 
     silent_advice = "close other programs that use it: many cameras serve only one at a time"
@@ -91,8 +91,8 @@ class MjpegSource(LiveSource):
 
     def _answer(self, asked: str, request: Request) -> str | None:
         """Return the Authorization header: a digest if the camera accepts one, since basic
-        authentication reveals the password. None if the library supports none of the camera's
-        digests."""
+        authentication reveals the password. Returns None if the library supports none of the
+        camera's digest algorithms."""
         digests = _DIGEST.split(asked)[1:]
         if not digests:
             return "Basic " + b64encode(":".join(self._name_and_password).encode()).decode()
@@ -159,15 +159,15 @@ _OPTIONS = {
 class TransferDelay:
     """Estimates how much longer an image's transfer took than the fastest one in the last 10 s.
 
-    The delay is computed from the camera's timestamps. Without it, old images that arrive in a
-    burst after a radio stall would seem to be new.
+    The delay is computed from the camera's timestamps. Without this correction, old images that
+    arrive in a burst after a radio stall would seem to be new.
     """
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
         self._ways: deque[tuple[float, float]] = (
             deque()
-        )  # arrival times with their transfer times `way_s`
+        )  # arrival times, each with its transfer time `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
         """How much longer this image's transfer took than the fastest one's, s; 0 if `camera_s`,

@@ -237,7 +237,7 @@ class LiveSource:
                     return
                 reason = str(error)
             except Exception as error:
-                # Any error that damaged bytes cause in a library: a new connection may deliver
+                # Damaged bytes can cause any error in a library; a new connection may deliver
                 # intact bytes.
                 reason = describe_error(error)
                 is_unreached = isinstance(error, OSError)
@@ -440,7 +440,7 @@ _SECRET = re.compile(
 
 def without_password(text: str) -> str:
     """Return the text without user names and passwords in URLs, and without the values of
-    ``password=`` and similar keys. In doubt, more is removed rather than less."""
+    ``password=`` and similar keys. When in doubt, it removes more rather than less."""
     if start := _URL.match(text):  # treat all of it as one URL, including spaces in the password
         text = start.group() + _without_name(text[start.end() :])
     else:

@@ -108,8 +108,8 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
 class ClusterExecutor(Executor):
     """An executor that flies on the workers of a dask cluster, and repeats the flights of a lost
     worker. A future fails with an exception in `lost` if its workers were lost too often, and with
-    InvalidValue if its worker does not meet the requirements. It is cancelled if the scheduler
-    ends."""
+    InvalidValue if its worker does not meet the requirements. A future is cancelled if the
+    scheduler stops."""
 
     lost = (KilledWorker,)
 

@@ -104,7 +104,7 @@ def compare_variants(results: Iterable[FlightResult]) -> Comparison:
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """The comparison of two flights per seed with respect to `figures` (keys of `FIGURES`).
+    """Compare the two flights of each seed by success and by `figures` (keys of `FIGURES`).
 
     `comparisons`: number of comparisons that share the 5 % significance level.
     """
@@ -156,7 +156,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """The comparison `found` as a table with verdicts; `names`: the names of A and B."""
+    """Format a comparison as a table with verdicts; `names`: the names of A and B."""
     flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B - A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")

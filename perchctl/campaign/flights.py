@@ -75,8 +75,8 @@ def _give_back_memory() -> None:
     them until its next garbage collection."""
     gc.collect()
     if not gc.get_freeze_count():
-        # The remaining objects are used by all flights; scanning them each time takes as long as 30
-        # images.
+        # The remaining objects are used by all flights; scanning them after each flight takes as
+        # long as processing 30 images.
         gc.freeze()
 
 
@@ -138,7 +138,7 @@ def fly_all(
     called with each result as soon as the flight has ended.
 
     `executor`: as in `concurrent.futures`, or None for this process; its optional attribute `lost`
-    lists the exceptions with which a future fails if its flight was lost with its process. Errors:
+    lists the exceptions that a future raises if the process that flew its flight was lost. Errors:
     PerchError, as soon as one flight fails.
     """
     seeds = list(dict.fromkeys(seeds))

@@ -164,7 +164,7 @@ def _write(file: BinaryIO, record: dict[str, Any]) -> None:
 
 def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dict[int, R]) -> int:
     """Add the flights in a file to `earlier`, keyed by seed, and return the total length of its
-    complete lines. Errors: InvalidValue if it is not a results file, or belongs to another
+    complete lines. Errors: InvalidValue if the file is not a results file, or belongs to another
     campaign."""
     data = path.read_bytes()
     good = data[: data.rfind(b"\n") + 1]

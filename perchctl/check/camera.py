@@ -38,9 +38,9 @@ RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """Image rates below which the check warns and fails, Hz. An AI-deck with its standard program sends
 8 images per second, and a simulated vehicle can perch with 7."""
 GAP_WARN = 0.4
-"""Longest gap between images before the check warns, as a share of `safety.camera_hold_s`."""
+"""Longest gap between images before the check warns, as a fraction of `safety.camera_hold_s`."""
 SEEN_WARN = 0.5
-"""Share of images that show the target, below which the check warns."""
+"""Fraction of images that show the target, below which the check warns."""
 LEAST_RATED = 10
 """Number of images below which no rate can be computed."""
 _AGAIN = {

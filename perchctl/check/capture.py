@@ -236,10 +236,11 @@ BODY_FAIL_DEG = 15.0
 """Angle between the axes of rigid body and vehicle above which the row fails, deg. Larger: a body
 with rotated axes passes with a warning."""
 LEAST_RISE_M = 0.12
-"""Least displacement of a lift that shows the vertical direction, m. Larger: a short lift is not
-sufficient."""
+"""Smallest displacement at which a lift shows the vertical direction, m. Larger: a short lift is
+not sufficient."""
 HAND_REACH_M = 5.0
-"""Largest possible lift by hand, m. If a body moved further, its positions are in another unit."""
+"""Largest possible lift by hand, m. If a body seems to move farther, its positions must be in
+another unit."""
 STRANGER = 0.4
 """If the alignment A and B leaves a larger mean share of a rotation unexplained than this, the
 motion-capture system tracks another body."""
@@ -353,7 +354,8 @@ def _turned_rad(attitudes: Rotation) -> Array:
 
 
 def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Check that vehicle and motion-capture system agree on the motion; skipped for None."""
+    """Check that vehicle and motion-capture system agree on the motion; skipped if `motion` is
+    None."""
     if motion is None:
         return skipped(
             "the reports of the vehicle and the motion-capture system do not overlap in time",
@@ -399,7 +401,7 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
     """Find what is wrong with the motion-capture system's world frame: it may be tilted or
-    mirrored, or its axes may be swapped. The system may report positions in other axes than
+    mirrored, or its axes may be swapped. The system may use different axes for positions and
     attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > WORLD_TILT_DEG:
@@ -457,8 +459,9 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """One row that says if there is a saved lift comparison with this motion-capture system, as
-    `fly` requires. No row without motion capture, or for the simulated vehicle."""
+    """Return one row that says whether there is a saved lift comparison with this motion-capture
+    system, which `fly` requires. Without motion capture, or for the simulated vehicle, return no
+    row."""
     if not config.source.is_mocap or simulated:
         return []
     return [_record_row(config, uri, now)]

@@ -4,7 +4,7 @@ starting place of a fleet. The rows are for one of several vehicles on the floor
 ```
 vehicle  its LEDs blink, and somebody sees them blink at this home
 body     the motion capture sees its rigid body at this home
-target   its camera sees its target where it must be as seen from this home
+target   its camera sees its target at the position expected from this home
 ```
 
 The vehicle, its rigid body and the target in its camera's view are each compared with the home, so
@@ -43,7 +43,7 @@ BODY_AT_HOME_M = 0.25
 between a home and another vehicle's corridor. Larger: neighbours that have swapped places may pass.
 Smaller: homes measured by tape fail."""
 DARK_SHARE = 0.5
-"""Share of dark or blank images above which a camera counts as covered. Larger: a hand that does
+"""Fraction of dark or blank images above which a camera counts as covered. Larger: a hand that does
 not cover the whole lens is not recognised. Smaller: a camera with a bad signal counts as
 covered."""
 _DARK = ("dark", "uniform")
@@ -193,7 +193,8 @@ class View:
     scope: CheckScope
 
     def rehearse(self, profile: Profile | None = None) -> Rehearsal:
-        """Process a few seconds of images. If `profile` is given, look for its target instead."""
+        """Process a few seconds of images. If `profile` is given, look for the target of that
+        profile instead of this vehicle's own."""
         flown = profile or self.profile
         pipeline = make_pipeline(flown, self.calibrated)
         seconds = self.scope.rehearse_s

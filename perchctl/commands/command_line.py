@@ -74,7 +74,7 @@ COMMANDS: dict[str, str] = {
 """The commands in the order in which a user needs them, with the first sentence of their help."""
 
 _CLOSE = 0.75
-"""Similarity from which a word counts as a misspelt command rather than a file name."""
+"""Lowest similarity at which a word counts as a misspelt command rather than a file name."""
 _CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
@@ -261,8 +261,8 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        # If the error names no path and a disk is full, it is the disk that stdout is written to;
-        # any other refusal may concern a device.
+        # If a disk is full and the error names no path, stdout is being written to that disk; any
+        # other error without a path may concern a device.
         is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
         if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:

@@ -45,8 +45,8 @@ NUMBER_KEYS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class FleetSettings:
-    """The options from the command line. `log_dir`, `record`: None if not given. `view`: serve a
-    live page."""
+    """The options from the command line. `log_dir` and `record` are None if the user did not set
+    them. `view`: serve a live page."""
 
     seed: int
     log_dir: Path | None
@@ -221,7 +221,7 @@ class FleetSession:
         all vehicles have ended."""
         results = {v.name: v.result for v in coordinator.views if v.result is not None}
         failure = coordinator.failure
-        if coordinator.started:  # checked last, because it can become True at any time
+        if coordinator.started:  # read last, because `started` can become True at any time
             return
         if failure is not None:
             raise PerchError(f"{_failure_text(failure)}; no vehicle was armed")

@@ -372,7 +372,8 @@ def profile_and_keys(
         )
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    # An AI-deck sends few images, and late, so several keys must differ, not only the calibration.
+    # An AI-deck sends few images, and sends them late, so it needs other values for several keys,
+    # not only another calibration.
     base = profiles.load_profile("aideck") if _is_aideck(source) else profiles.Profile()
     shipped = analysis.profile_differences(
         *(p.model_dump(mode="json") for p in (profiles.Profile(), base))

@@ -28,8 +28,8 @@ from perchctl import calibration as calibrations
 from perchctl import display as displays
 
 _WHOLE_RUN_S = 1e6
-"""Period over which progress is averaged to estimate the remaining time, s. Within rich's default
-of 30 s, not a single flight may have ended."""
+"""Period over which progress is averaged to estimate the remaining time, s. Rich's default of 30 s
+is too short: not a single flight might end within it."""
 
 
 class FinishedFlight(Protocol):

@@ -122,10 +122,10 @@ def flight_state(
     tick: Tick, drawing_sizes: dict[str, float], past: Sequence[Past] = ()
 ) -> dict[str, Any]:
     """The page's state for a tick: phase, battery, the rows of the terminal's panel, and a flag
-    that the flight is over. For the page's drawings, it also contains the height, the target's
-    lateral offset and its distance above the vehicle in m (None: no target), and `drawing_sizes`
-    (`large_m`, `gear_m`). `past`: earlier values for a page that is opened late, sent as age in s,
-    offset and distance."""
+    that says whether the flight is over. For the page's drawings, it also contains the height, the
+    target's lateral offset and its distance above the vehicle in m (None: no target), and
+    `drawing_sizes` (`large_m`, `gear_m`). `past`: earlier values for a page that is opened late,
+    sent as age in s, offset and distance."""
     state, volts = tick.state, tick.telemetry.battery_v
     off_m, below_m = _off_and_below_m(tick)
     ground_m, hover = state.belief.ground_z_m, state.belief.profile.planner.hover

@@ -26,7 +26,7 @@ LONGEST_LOSS_S = 30.0
 """Longest duration of a temporary loss, s; the shortest is 0.1 s. Larger: fewer losses end before
 the vehicle has to land."""
 EVER_SHARE = 0.25
-"""Share of losses that are permanent. Larger: fewer losses end during the flight."""
+"""Fraction of losses that are permanent. Larger: fewer losses end during the flight."""
 
 
 # --- Draws ---
@@ -552,7 +552,7 @@ FAULTS: tuple[Fault, ...] = (
 )
 
 NO_FAULT = Fault("none", "no fault", (), ())
-"""Stands for no fault in a flight of a campaign in which other flights have faults."""
+"""Marks a flight without a fault in a campaign in which other flights have faults."""
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 

@@ -196,8 +196,8 @@ USER_PATIENCE_S = 60.0
 
 
 class ProgramKilled(BaseException):
-    """Ends the program under test. Not an Exception, so that its `except Exception` clauses do not
-    catch it."""
+    """Ends the program under test. This class is not derived from Exception, so the program's
+    `except Exception` clauses do not catch it."""
 
 
 class PlantedError(Exception):

@@ -20,7 +20,7 @@ NOTICED_S = 1.5
 """Time within which the program must accept a low battery reading, s. Larger: a late landing is
 excused."""
 FASTEST_LANDING_MPS = 0.4
-"""Highest speed of a landing, m/s. Smaller: a landing that takes long is excused."""
+"""Highest speed of a landing, m/s. Smaller: a slow landing is excused."""
 PUSHED_OFF_S = 0.2
 """Longest time until a blow of 0.04 s tears the vehicle off the magnet, s."""
 

@@ -204,7 +204,7 @@ class FaultyFlight:
                 return "refused", str(error), None
             self._crashed = True
             return "failed", f"{type(error).__name__}: {error}", None
-        self._vehicle.camera = None  # the program no longer reads it
+        self._vehicle.camera = None  # the program no longer reads the camera
         self._oracle.add_claims(report_claims(report), self._link.now_s)
         return END_OF[report.phase], report.reason, report
 

@@ -1,4 +1,4 @@
-"""The oracle: decide by the simulator's ground truth alone if a simulated flight went wrong.
+"""The oracle: decide from the simulator's ground truth alone whether a simulated flight went wrong.
 
 For each kind of failure, the oracle raises a flag (docs/campaigns.md, "Faults").
 """
@@ -184,7 +184,7 @@ class Oracle:
         self._pressed = _Lasting(PRESSED_S)
         self._calm_height_m = 0.0  # height when the vehicle was last not sinking fast
         self._fall: _Fall | None = None
-        self._weak_s = -math.inf  # last time at which the thrust was too small to slow down
+        self._weak_s = -math.inf  # last time at which the thrust was too small to slow the fall
         self._before: Sample | None = None
         self._least_up_z = 1.0
         self._supervisor_ended = False

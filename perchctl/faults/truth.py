@@ -303,7 +303,7 @@ class PositionBound:
 
 
 def _nearest_between(a: Place, b: Place, place: Place) -> Place:
-    """The point of the line from `a` to `b` that is nearest to `place`."""
+    """The point nearest to `place` on the line from `a` to `b`."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     long_m2 = dx * dx + dy * dy
     if long_m2 == 0.0:
@@ -394,9 +394,9 @@ class DescentBound:
     ) -> bool:
         """True if the vehicle should have descended by now but has not.
 
-        A vehicle that has been `touching` the ceiling in time may hang there. Without `uplink`, the
-        time allowed for obeying starts again. `lands`: the onboard landing is active, which counts
-        as descending unless the vehicle climbs.
+        A vehicle that touches the ceiling in time (`touching`) may hang there instead. As long as
+        there is no `uplink`, the time allowed for descending keeps restarting. `lands`: the onboard
+        landing is active, which counts as descending unless the vehicle climbs.
         """
         if self._due_s is None:
             return False

@@ -124,7 +124,8 @@ def open_capture(
 
 
 class MotionCapture:
-    """A `perchctl.positioning.feed.CaptureSource` whose child process ends with it.
+    """A `perchctl.positioning.feed.CaptureSource` that reads the system in a child process, which
+    `close` ends.
 
     `who` is the system's name in messages; `poll` prefers a frame that contains `body`. The
     constructor waits for the first frame. It raises ConnectionFailed, or UsageError if the library

@@ -1,9 +1,9 @@
 """The result of comparing a motion-capture system with the vehicle, which is lifted by hand
 (`perchctl check --lift`), stored for `fly`.
 
-Swapped axes cannot be detected while a vehicle stands in the same way as when its rigid body was
-defined, but only when it is lifted and rotated by hand. Each comparison is therefore stored for its
-vehicle and set-up, and a flight requires one that passed at most `VALID_S` ago.
+Swapped axes cannot be detected while a vehicle stands as it did when its rigid body was defined,
+but only when it is lifted and rotated by hand. Each comparison is therefore stored for its vehicle
+and set-up, and a flight requires one that passed at most `VALID_S` ago.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from perchctl.profile import PositioningConfig
 VALID_S = 24 * 3600.0
 """Time for which a comparison is valid, s."""
 CLOCK_ADJUSTMENT_S = 60.0
-"""Largest adjustment of the computer's clock that is not an error, s."""
+"""How far in the future the date of a comparison may seem to be, s: the computer's clock may have
+been adjusted since."""
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 _TRUE_OF = {"system", "host", "body", "body_rpy_deg", "body_position_m"}
 

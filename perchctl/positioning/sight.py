@@ -2,9 +2,9 @@
 position in a world fixed to the target, add the motion of the vehicle's estimate since the
 exposure, and send the result to its estimator.
 
-This world frame is set by the vehicle at rest on the ground, where its estimate is reset. The
-world's origin is sent until the target has been seen often enough from there; then the target's
-position is fixed. Ground, safety limits and heights therefore keep their meaning.
+The origin of this world frame is the place on the ground where the vehicle stands when its estimate
+is reset. The world's origin is sent until the target has been seen often enough from there; then
+the target's position is fixed. Ground, safety limits and heights therefore keep their meaning.
 
 No exposure is used twice, out of order, or when it is older than `OLDEST_S`. A position is rejected
 if it is farther from the estimate than the errors of both can explain. The age of the position then
@@ -136,8 +136,9 @@ class TargetFeed:
         at_rest: bool,
     ) -> None:
         """Send the vehicle's position, computed from a pose in this tick's image. While the
-        target's position is unknown, determine that instead if the vehicle is `at_rest`. `then` and
-        `now` are the vehicle's attitude and estimated position at the exposure and at `now_s`."""
+        target's position is unknown, send nothing, and determine the target's position if the
+        vehicle is `at_rest`. `then` and `now` are the vehicle's attitude and estimated position at
+        the exposure and at `now_s`."""
         if pose.t_s <= self._seen_s:
             return
         # A position that was sent without an image may be newer than this image's exposure.

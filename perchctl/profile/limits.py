@@ -20,8 +20,7 @@ from perchctl.profile.mission import (
 )
 
 REACHED_SHARE = 0.8
-"""Distance from the take-off height at which it counts as reached, m
-(`Condition.TAKEOFF_HEIGHT_REACHED`)."""
+"""Fraction of the take-off height that counts as reached (`Condition.TAKEOFF_HEIGHT_REACHED`)."""
 _KEY = re.compile(r"[a-z_]+(?:\.[a-z0-9_]+)+")
 
 
@@ -149,11 +148,13 @@ _DOUBTFUL = {
         ),
     },
 }
-"""Relations by the name of their row in the check, and what hardly works if one is broken."""
+"""Relations, grouped by the check row that reports them, and what may go wrong in a flight with a
+profile that breaks one."""
 
 IMPOSSIBLE = tuple(Limit(*each) for each in _IMPOSSIBLE.items())
 """Relations whose violation makes every flight fail."""
 DOUBTFUL = {
     name: tuple(Limit(*each) for each in relations.items()) for name, relations in _DOUBTFUL.items()
 }
-"""Combinations that are allowed but hardly work, by the name of their row in the check."""
+"""Relations that a profile may break, although flights then rarely succeed, keyed by the check row
+that reports them."""

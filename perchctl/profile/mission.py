@@ -46,7 +46,7 @@ class AlignConfig(Section):
     xy_m: float = key(
         0.04, "maximum distance of the gear from the target's axis to count as aligned", gt=0, le=1
     )
-    yaw_deg: ClassVar[float] = 5.0  # largest heading error to count as aligned
+    yaw_deg: ClassVar[float] = 5.0  # largest heading error that counts as aligned
     dwell_s: ClassVar[float] = 0.4  # time for which position and heading must both be aligned
     timeout_s: ClassVar[float] = 20.0
     """Time after which an attempt that is not aligned counts as failed, s."""
@@ -85,11 +85,11 @@ class AscendConfig(Section):
         gt=0,
         le=0.1,
     )
-    settle_z_m: ClassVar[float] = 0.02  # largest distance below the stand-off to count as settled
+    settle_z_m: ClassVar[float] = 0.02  # largest distance below stand-off that counts as settled
     settle_yaw_deg: ClassVar[float] = 3.0
-    """Largest heading error to count as settled, deg."""
+    """Largest heading error that counts as settled, deg."""
     settle_speed_mps: ClassVar[float] = 0.04
-    """Largest speed to count as settled, m/s."""
+    """Largest speed that counts as settled, m/s."""
     settle_dwell_s: float = key(
         0.3,
         "time for which position, heading and speed must stay within limits to count as settled",
@@ -129,7 +129,7 @@ class PerchConfig(Section):
         gt=0,
         le=0.5,
     )
-    # largest deviation of the accelerometer from 1 g to count as contact
+    # largest deviation of the accelerometer from 1 g that counts as contact
     contact_acc_g: ClassVar[float] = 0.12
     timeout_s: ClassVar[float] = 3.0
     """Time after which an attempt without contact counts as failed, s."""
@@ -152,15 +152,15 @@ class CompleteConfig(Section):
     release_drop_m: ClassVar[float] = 0.25
     """Distance of the last setpoint below the contact, m."""
     hold_ratio: ClassVar[float] = 0.6
-    """Thrust, as a share of the hover thrust, below which the magnet must hold the vehicle to prove
-    its hold."""
+    """Thrust, as a fraction of the hover thrust, below which the magnet must hold the vehicle to
+    prove its hold."""
     hold_dwell_s: ClassVar[float] = 0.3  # time for which the magnet must hold
     ramp_s: ClassVar[float] = 0.5
     """Time in which the raw thrust decreases from the minimum of position mode to zero, s."""
     hang_s: ClassVar[float] = 1.0
     """Time for which the whole weight must hang before the motors stop, s."""
     release_timeout_s: ClassVar[float] = 8.0  # time after which the attempt counts as failed
-    slip_m: ClassVar[float] = 0.03  # largest distance below the contact to count as hanging
+    slip_m: ClassVar[float] = 0.03  # largest distance below the contact that counts as hanging
     slip_mps: ClassVar[float] = 0.12  # sink rate that counts as a slip
     # duration of a slip before perchctl reacts; it reacts to a free fall at once
     slip_dwell_s: ClassVar[float] = 0.03
@@ -182,7 +182,7 @@ class RecoverConfig(Section):
     dwell_s: ClassVar[float] = 0.5
     """Time for which the vehicle must be steady, s."""
     steady_mps: ClassVar[float] = 0.1
-    """Largest speed to count as steady, m/s."""
+    """Largest speed that counts as steady, m/s."""
     timeout_s: ClassVar[float] = 6.0
     """Time after which the vehicle lands if it is not steady, s."""
 
@@ -197,8 +197,8 @@ class HoverConfig(Section):
 
 
 OVERDUE_SHARE = 0.5
-"""Share of a landing's time limit for which it may proceed by setpoints before the vehicle's own
-landing takes over."""
+"""Fraction of a landing's time limit for which the landing may proceed by setpoints before the
+vehicle's own landing takes over."""
 
 
 class LandingConfig(Section):
@@ -368,6 +368,6 @@ class SafetyConfig(Section):
     )
     start_tilt_deg: ClassVar[float] = 10.0
     """Roll or pitch above which take-off is refused, deg."""
-    # time pressed without moving after which the vehicle backs off downwards
+    # time for which the vehicle may press without moving before it backs off downwards
     blocked_s: ClassVar[float] = 0.7
     land_on_log_error: bool = key(False, "land if the log cannot be written")

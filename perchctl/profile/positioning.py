@@ -14,8 +14,8 @@ SPARE_S = 0.02
 """Tolerance of the rate, because frames do not arrive exactly on time."""
 MOST_CAPTURE_LATENCY_S = 0.04
 """Largest delay of a position, s, because the vehicle treats each position as its present one. With
-positions 40 ms late, it perches within 2 mm. At 50 ms, it may oscillate for a minute and then land
-(tests/flight/test_capture_flights.py)."""
+positions 40 ms late, the vehicle perches within 2 mm. At 50 ms, the vehicle may oscillate for a
+minute and then land (tests/flight/test_capture_flights.py)."""
 _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
 
 
@@ -69,8 +69,8 @@ class PositionSource(Enum):
 
 
 _SOURCES = {source.value: source for source in PositionSource}
-"""Sources by name. Every tick looks one up, and `PositionSource(name)` would take ten times as
-long."""
+"""Position sources by name. Every tick looks up a source here, because calling
+`PositionSource(name)` would take ten times as long."""
 
 
 class PositioningConfig(Section):

@@ -176,7 +176,7 @@ _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, str]:
     """Return the key of the first error (empty if it concerns several keys) and the reason.
-    `model`: what was validated."""
+    `model`: the model that was validated."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -26,7 +26,8 @@ def dictionary_names() -> tuple[str, ...]:
 
 @cache
 def aruco_dictionary(name: str) -> Any:
-    """The cv2.aruco dictionary of that name. Raises ValueError with the choices."""
+    """The cv2.aruco dictionary with this name. Raises ValueError, which lists the choices, if there
+    is none."""
     if name not in dictionary_names():
         raise ValueError(
             f"dictionary {name!r} is unknown; allowed are {', '.join(dictionary_names())}"

@@ -111,7 +111,7 @@ class Recorder:
 
     def write_frame(self, frame: Frame) -> None:
         """Record a frame from the source. Never raises an exception."""
-        self._hand_over()  # in flight, ticks do this; before take-off, there are none
+        self._hand_over()  # in flight, `write_tick` does this; before take-off, there are no ticks
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
         # A repeated frame also contains its image.

@@ -160,7 +160,7 @@ class FlightSummary:
 
     @property
     def reason_text(self) -> str:
-        """The reason, followed by the cause if the outcome does not say it."""
+        """The reason, followed by the cause if the cause is not the same as the outcome."""
         cause = f"[{self.cause}]" if self.cause and self.cause != self.outcome else ""
         return f"{self.reason} {cause}".strip()
 

@@ -107,7 +107,7 @@ class TargetDesign:
         return ranges | {"blind": vars(self.blind_range), "warnings": list(self.warnings)}
 
     def text(self, camera_name: str) -> str:
-        """Return ranges, mounting and warnings for people; several lines."""
+        """Return ranges, mounting and warnings as several lines of text."""
         width, height = self.camera.size_px
         large = self.target.large
         small = self.target.small

@@ -26,12 +26,12 @@ BORDER_BITS = 1
 """Width of a marker's black border in cells."""
 
 RING_MIN_PER_LARGE_SIDE = 1 / 150
-"""Least width of the white ring around the small marker, relative to the large marker's side: 1 mm
-on a 150 mm marker. Without a ring, the small marker is never found (measured for ids whose centre
-is black)."""
+"""Smallest width of the white ring around the small marker, relative to the large marker's side: 1
+mm on a 150 mm marker. Without a ring, the small marker is never found (measured for ids whose
+centre is black)."""
 
 SAMPLED_MARGIN = 0.13
-"""Share of a cell at each of its sides that cv2.aruco does not sample."""
+"""Margin along each side of a cell that cv2.aruco does not sample, as a fraction of the cell."""
 MAX_WHITE_IN_BLACK_CELL = 0.3
 """Largest share of white that the small marker and its ring may add to a black cell of the large
 one."""

@@ -59,7 +59,7 @@ SIDE_RANGE_PX = (6.0, 400.0)
 _READING_STREAM = 801
 _PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
 _MIN_PICTURE_PX = 64
-_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the image
+_PERIMETER_RATE = 0.03  # cv2.aruco's smallest perimeter, relative to the image's larger side
 
 
 @cache
@@ -134,8 +134,8 @@ def sample_pictures(
 
 
 MIN_DISTANCE = 3
-"""Number of cells in which two patterns of the same size must differ: one more than the number of
-wrong bits that are corrected in both together."""
+"""Number of cells in which two patterns of the same size must differ: one more than the total
+number of wrong bits that the detector corrects in both patterns."""
 _READ_SIDE_PX = 480.0
 
 

@@ -98,8 +98,8 @@ BLURRED = 1.15
 STRAIGHT_DEG = 2.0
 """Tilt of the camera's axis below which no tilt is reported, deg."""
 LEAST_UP = 0.2
-"""Least vertical component of the view's direction: a camera that looks farther to the side cannot
-see a target above it."""
+"""Smallest vertical component of the viewing direction: a camera that looks farther to the side
+cannot see a target above it."""
 
 
 def reliable_side_px(detected_px: float | None = None) -> float:

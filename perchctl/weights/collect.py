@@ -42,7 +42,7 @@ from perchctl.vision import (
 from perchctl.weights.data import HEADER, csv_row
 
 SEEN_SHARE = 0.9
-"""Share of a position's frames that must show both markers."""
+"""Fraction of the frames at a position that must show both markers."""
 MOST_WANDER_PX = 1.0
 """Largest drift and largest jitter of the target's image within a position, px."""
 MOST_MISMATCH_M = 0.03

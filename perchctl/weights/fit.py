@@ -28,8 +28,8 @@ from perchctl.geometry import Array
 from perchctl.weights.data import AXES, YAW_COLUMN, Measurements, wrap_angles
 
 OUTLIER_SIGMAS = 6.0
-"""Number of robust standard deviations from the median of its position beyond which a marker's
-error excludes the row on that axis."""
+"""A row is excluded on an axis if a marker's error there differs from the median at the same
+position by more than this many robust standard deviations."""
 LEAST_ROWS = 8
 """Average number of rows per position below which no row is treated as an outlier."""
 _MAD_TO_SIGMA = 1.4826

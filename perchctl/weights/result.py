@@ -106,7 +106,7 @@ def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
 
 
 def weights_record(result: FitResult) -> dict[str, Any]:
-    """The result as the JSON object of `--json`. Lengths in m, angles in rad."""
+    """The result as the JSON object that `--json` prints. Lengths in m, angles in rad."""
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),

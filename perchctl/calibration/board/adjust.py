@@ -159,8 +159,8 @@ VIEW_FACTOR = 2.5
 VIEW_FLOOR_PX = 0.1
 MAX_CORNERS_OUT = 0.25
 MAX_VIEWS_OUT = 1.0 / 3.0
-"""Largest share of rejected views. If more are rejected, the fault lies not in the views but in the
-board, its size or the lens."""
+"""Largest fraction of views that may be rejected. If more are rejected, the fault lies not in the
+views but in the board, its size or the lens."""
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median radius of a circular Gaussian with spread 1
 _REJECTION_ROUNDS = 10
 
@@ -236,8 +236,8 @@ def _spread_px(residual: Array) -> float:
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
 _LEAST_INFORMATION_SHARE = 1e-10
-"""Fraction of each parameter's information that is added to it, so that a parameter that no image
-determines stays finite."""
+"""Each parameter's information is increased by this fraction, so that the variance of a parameter
+that no image determines stays finite."""
 
 
 def jackknife_covariance(

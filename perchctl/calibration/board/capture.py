@@ -316,8 +316,8 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """Return how to move or tilt the board next, towards what the view `signatures` cover least.
-    Directions are those in the image."""
+    """Return how to move or tilt the board next, to extend the axis that the view `signatures`
+    cover least. Directions are those in the image."""
     done = covered_shares(signatures)
     least = min(COVERAGE_AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:

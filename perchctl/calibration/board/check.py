@@ -11,8 +11,8 @@ fails
 - if the target positions straight ahead differ by more than half of the limit (1 mm, or 1 % of the
   distance) and by more than the 95 % uncertainty of the fitted camera.
 
-If the 95 % uncertainty of the fitted camera is above twice the limit, the new images are not
-accurate enough, and the check is refused.
+If the calibration would pass but the 95 % uncertainty of the fitted camera is above twice the
+limit, the new images are not accurate enough, and perchctl reports an error instead of a verdict.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class CheckResult:
     rejections: tuple[Rejection, ...]
 
     def record(self, file: Path) -> dict[str, Any]:
-        """The JSON object of `calibrate check`; `file` is the checked calibration."""
+        """The JSON object that `calibrate check` prints; `file` is the checked calibration."""
         return {
             "pass": self.passed,
             "reason": self.reason,
@@ -144,7 +144,7 @@ def _verdict(
 
 
 def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
-    """Raises InvalidValue if the images could not reveal a wrong focal length."""
+    """Raise InvalidValue if these images could not show that a focal length is wrong."""
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(

@@ -80,7 +80,7 @@ class FrameCounts:
     """How many frames from a video or a camera were examined, and why some of them gave no view.
 
     Attributes:
-        live: a camera, whose user can be asked to hold still; otherwise a recording.
+        live: True for a camera, whose user can be asked to hold still; False for a recording.
         taken: frames that became views.
         without_board: frames that show no board, or too little of it.
         moved: frames in which the board had moved by more than `still_px` since the previous frame,
@@ -228,7 +228,7 @@ def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array,
 
 
 def _chessboard(image: Grey, board: Board) -> _Corners | str:
-    """The same as `_charuco` for a chessboard."""
+    """Like `_charuco`, but for a chessboard."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
     if not found:
@@ -371,8 +371,8 @@ def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
     if white >= REACH:
         return np.ones(grey.shape)
     positive = uv[..., 0] * uv[..., 1] > 0.0
-    # Near the corner, even the white squares of a ChArUco board are blank, which shows which
-    # squares are white.
+    # Near the corner, the white squares of a ChArUco board contain no print either, so the brighter
+    # squares there are the white ones.
     near = np.abs(uv).max(axis=2) < 0.5 * np.abs(uv).max(axis=(1, 2))[:, None]
     brighter = (grey * np.where(positive, 1.0, -1.0) * near).sum(axis=1) > 0.0
     clear = np.maximum(white - 1.0 / size_px, 0.5 * white)[:, None]

@@ -30,8 +30,8 @@ be patterns that look like markers."""
 MIN_MARKER_CORNERS = 12
 """Number of corners that must be found with a ChArUco board's layout before the board is named."""
 GRID_START = (5, 4)
-"""Grid of corners from which OpenCV grows the board. From a smaller grid, it stops inside the
-board. A grid that has not grown may be part of a board, or a keyboard."""
+"""Grid of corners from which OpenCV grows the board. If the grid is smaller, OpenCV stops growing
+it before the edge of the board. A grid that has not grown may be part of a board, or a keyboard."""
 _SIZES = (50, 100, 250)
 """Sizes of the dictionaries of one family. Boards have fewer than 250 markers, and searching with
 the dictionaries of 1000 would take longer."""
@@ -66,7 +66,8 @@ def _small(picture: Grey) -> Grey:
 
 
 def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
-    """The same as `describe_other_board` for boards with markers; None if there are no markers."""
+    """Like `describe_other_board`, but only for boards with markers; None if there are no
+    markers."""
     seen = [_marker_ids(image, _DICTIONARIES) for image in images]
     family, _ = max(
         ((name, sum(len(ids[name]) for ids in seen)) for name in _DICTIONARIES),

@@ -132,7 +132,7 @@ class Calibration:
         return [*lines, *self.defects, self.verdict_text]
 
     def record(self) -> dict[str, Any]:
-        """The JSON object of `calibrate`."""
+        """The JSON object that `calibrate` prints."""
         names = PARAMETERS[self.camera.model]
         values = self.fit.parameters.tolist()
         return {

@@ -265,8 +265,8 @@ def _vectors(R: Array) -> Array:
 
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
-"""Latencies of the grid, s. The grid contains impossible latencies too, so that a wrong clock is
-recognised."""
+"""Latencies on the search grid, s. The grid contains impossible latencies too, so that a wrong
+clock is recognised."""
 _SPAN_S = (0.2, 0.5)
 _MOST_PAIRS = 400
 _FIT_ROUNDS = 3

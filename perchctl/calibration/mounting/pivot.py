@@ -3,8 +3,8 @@ tilted around it.
 
 The point c in the target's frame and the tip in the camera's frame are the same in every image:
 ``tip = R_cam_target c + p_cam_target``. The point and the tip are found by linear least squares, in
-which each image is weighted by its own covariance and outliers count little. Neither the vehicle's
-attitude nor the images' timestamps are needed.
+which each image is weighted by its own covariance and outliers have little influence. Neither the
+vehicle's attitude nor the images' timestamps are needed.
 """
 
 from __future__ import annotations
@@ -129,5 +129,6 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
 
 
 def _size(rows: PoseResiduals) -> float:
-    """Return the robust mean size of all misfits, in which single outliers count little."""
+    """Return the robust mean size of all misfits, on which single outliers have little
+    influence."""
     return float(np.log1p(rows.chi2 / 3.0).mean())

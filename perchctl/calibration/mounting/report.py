@@ -111,8 +111,8 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """The JSON object of `calibrate mount`: measured values, sigmas, and the old and new values
-        in the profile."""
+        """The JSON object that `calibrate mount` prints: measured values, sigmas, and the old and
+        new values in the profile."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
             "sigma": {v.key: v.sigma.tolist() for v in values},
