@@ -9,7 +9,7 @@ import sys
 from perchctl.startup import NO_WINDOWS, exit_at_ctrl_c, is_command_line
 
 if is_command_line():
-    exit_at_ctrl_c()  # before lazy_loader is imported, which takes some time
+    exit_at_ctrl_c()  # done first, because importing lazy_loader takes some time
 
 import lazy_loader
 

@@ -76,7 +76,7 @@ def point_distance_m(point: Point, start: Point, end: Point) -> float:
 
 
 def segment_distance_m(a: Point, b: Point, c: Point, d: Point) -> float:
-    """Distance between the segments a to b and c to d; 0 where they cross."""
+    """Distance between the segments a to b and c to d; 0 if they cross."""
     if _are_apart(a, b, c, d) and _are_apart(c, d, a, b):
         return 0.0
     return min(

@@ -182,7 +182,7 @@ class Comparison:
 
     def _tolerance(self, name: str) -> float:
         last = name.rpartition(".")[2].partition("[")[0]
-        to_the_bit = -1.0  # negative: even 0.0 and -0.0 differ
+        to_the_bit = -1.0  # a negative tolerance, so that even 0.0 and -0.0 differ
         return self.tolerances.get(last, self.tolerances.get("", to_the_bit))
 
 

@@ -56,7 +56,7 @@ class _Given:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = delay_s
         self._pictures = _readable(pictures)
-        self._name: str | None = None  # name of the source in flight, set at its end
+        self._name: str | None = None  # name of the flown source, set when the source ends
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = TickInputs()
         self._samples: list[tuple[Telemetry, ...]] = []

@@ -12,7 +12,8 @@ and to the side, three patterns:
 
 - A centre of mass x forward and y left of the middle gives pitch = x / `MOTOR_OFFSET_M` and roll =
   y / `MOTOR_OFFSET_M`. Weaker motors at the front or on the left have the same effect. In free
-  flight, both moments are always proportional to the thrust, so no flight can distinguish them.
+  flight, the moment from either cause is always proportional to the thrust, so no flight can
+  distinguish the two causes.
 - In still air, the centre of mass does not affect the yaw pattern, which shows unequal motors or
   propellers, or a tilted motor.
 - A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the

@@ -62,7 +62,7 @@ _SILENT = "connected, but it sends no data"
 @runtime_checkable
 class FrameSource(Protocol):
     """A source of frames. Your own class is constructed with the loop's clock and the profile's
-    section `camera`. Any error that it raises counts as a lost camera.
+    section `camera`. Any error that your class raises counts as a lost camera.
 
     A live source returns only the newest frame; its `t_s` is the arrival time minus
     `config.start_latency_s`. A recorded source returns one frame per poll, in order, with the times
@@ -336,8 +336,8 @@ class WrappedSource:
 
 
 class GuardedSource:
-    """Checks the frames from your own camera class. An error that it raises, or an invalid frame,
-    counts as a lost camera; a live frame that is not newer than the last one is dropped."""
+    """Checks the frames from your own camera class. An error raised by your class, or an invalid
+    frame, counts as a lost camera; a live frame that is not newer than the last one is dropped."""
 
     def __init__(self, source: FrameSource, name: str, clock: Clock) -> None:
         self._source, self._name, self._clock = source, name, clock

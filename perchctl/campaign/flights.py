@@ -115,7 +115,7 @@ def fly_seed(
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
-    """The path of the log of a seed's flight in `log_dir`."""
+    """The path in `log_dir` of the flight log for a seed."""
     return log_dir / f"flight_seed{seed}.jsonl"
 
 

@@ -65,7 +65,7 @@ def campaign_results(
     """Yield the results (of class `result_type`) of a campaign, appended to the file `out`.
 
     An existing file is an error unless it is to be replaced (`force`) or continued (`resume`). To
-    be continued, it must come from the same program, profile, faults and `fleet` (a hash of
+    be continued, the file must come from the same program, profile, faults and `fleet` (a hash of
     everything that affects a fleet's flight; None for single flights). Errors: InvalidValue, also
     if `log_dir` is not writable.
     """

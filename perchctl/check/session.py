@@ -105,8 +105,8 @@ def start_if_simulated(
 
 
 MocapOrError = CaptureSource | PerchError | None
-"""An open connection to the motion-capture system, or the error for which it could not be opened;
-None if the profile uses no motion capture."""
+"""An open connection to the motion-capture system, or the error that prevented opening it; None if
+the profile uses no motion capture."""
 
 
 def open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrError:

@@ -365,8 +365,8 @@ BACK_M = 0.10
 """Difference between first and last height above which the position may be drifting, m. Larger: a
 drift passes."""
 MOVED_G = 0.05
-"""Deviation of the accelerometer from 1 g that shows a lift by hand; its noise at rest is a tenth
-of it."""
+"""Deviation of the accelerometer from 1 g that shows a lift by hand; the noise at rest is a tenth
+of this."""
 
 
 def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:

@@ -127,7 +127,7 @@ def track(
             paths, count = recording.paths, recording.count
         advice = ", the shipped example: name your own camera's file with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
-        # Image files may be unrelated.
+        # Image files may be unrelated, so each one is searched independently, as a still image.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
         target: TargetInCamera | None = None
         stack.enter_context(stop.as_handler())  # up to this point, Ctrl-C ends the command at once
@@ -370,7 +370,7 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
 
 
 class DatagramSender:
-    """Sends texts by UDP, each as one datagram. It cannot detect if nobody receives them.
+    """Sends texts by UDP, each as one datagram. It cannot detect whether anyone receives them.
 
     An address that the operating system cannot reach is reported once per outage, and tracking
     continues. Raises InvalidValue for a text that is not an address, or for an unknown host.

@@ -107,7 +107,7 @@ class FleetPage(Page):
 
 
 def _fetch_picture(port: int) -> bytes | None:
-    """Fetch the newest image from the page at this local port; None if it has none."""
+    """Fetch the newest image from the page at this local port; None if that page has no image."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PICTURE_TIMEOUT_S)
     with contextlib.closing(connection):
         try:

@@ -352,8 +352,8 @@ class Oracle:
             self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:
-        """Check if a lock of the vehicle was justified by what happened before it; a later tumble
-        does not justify it."""
+        """Check whether a lock of the vehicle was justified by what happened before it; a later
+        tumble does not justify it."""
         if s.supervisor_ended or s.body_up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:

@@ -124,7 +124,7 @@ class Facts:
             monitors it.
         slipped_s: when the vehicle first came off the magnet with its motors stopped, at the height
             `slip_height_m`; `toppled`: it turned over within `TOPPLES_S`.
-        weak_s: when battery and motors could first no longer lift the weight.
+        weak_s: when battery and motors first became unable to lift the weight.
         battery_low_s, battery_low_m: time and height at which the battery's voltage under load was
             first too low.
     """
@@ -247,8 +247,8 @@ REACTION_S = 1.0
 """Longest time from the profile's limit to the descent, s: the delay of one loop iteration, and the
 time for the thrust to decrease."""
 WATCHED_S, SUNK_M = 2.0, 0.15
-"""Time after `REACTION_S`, s, and the height that the vehicle must have lost by then, m, which
-takes less than a third of the landing speed."""
+"""Time after `REACTION_S`, s, and the height that the vehicle must have lost by then, m; losing
+this height takes less than a third of the landing speed."""
 COMING_DOWN_MPS = 0.1
 """Sink rate above which the vehicle counts as coming down in any case, m/s."""
 HANDED_OVER_M = 0.3

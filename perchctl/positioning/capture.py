@@ -262,7 +262,7 @@ class MotionCapture:
 # --- The child process that runs the motion-capture library ---
 # Some systems of the library wait in `connect` forever without letting any other thread of their
 # process run, and some end the process without a message (docs/positioning.md). In a child process,
-# neither stops the flight.
+# neither of these failures stops the flight.
 
 
 START_TIMEOUT_S = 30.0

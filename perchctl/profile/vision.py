@@ -65,8 +65,8 @@ class Mounting(Section):
     """The camera's mounting: its position in body axes and its rotation from them.
 
     With ``rpy_deg: [0, 0, 0]`` the camera looks up, the right of the image is the vehicle's front,
-    and the bottom of the image is its left. `rpy_deg` are rotations about body x, y, z (``Rz Ry
-    Rx``, right-handed): ``[0, 0, 90]`` turns the right of the image to the vehicle's left.
+    and the bottom of the image is the vehicle's left. `rpy_deg` are rotations about body x, y, z
+    (``Rz Ry Rx``, right-handed): ``[0, 0, 90]`` turns the right of the image to the vehicle's left.
     """
 
     position_m: BodyVector3 = key(
@@ -110,8 +110,9 @@ MOST_CAMERA_LATENCY_S = 1.0
 USUAL_LATENCY_S = 0.07
 """Default latency, s: most cameras are 60 to 100 ms late."""
 START_LATENCY_S = 0.1
-"""Latency at the start of a flight that measures it, s. It is the middle of the usable range, so
-until the flight knows more, images are at most 0.1 s newer or older than assumed."""
+"""Latency at the start of a flight that measures it, s. This is close to the middle of the usable
+range, so until the latency has been measured, images are at most 0.1 s newer or older than
+assumed."""
 USED_LATENCY_S = (0.02, 0.2)
 """Range of latencies that a flight may use if it measures its latency, s. No camera is faster, and
 later images are useless for control."""

@@ -1,8 +1,9 @@
 """Find out which board the images show if they do not show the specified board.
 
-For chessboards, this is the grid of corners that is found in the most images, and in at least two.
-For boards with markers, it is the dictionary that decodes most of the markers, and the layout whose
-corners OpenCV then finds. A board is named only if it is identified with certainty.
+A chessboard is identified by the grid of corners that is found in the most images, and in at least
+two. A board with markers is identified by the dictionary that decodes most of the markers, and by
+the layout whose corners OpenCV then finds. A board is named only if it is identified with
+certainty.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ images."""
 MIRRORED_PICTURES = 60
 """The recording ends after this many mirrored images if no image has yielded a pose."""
 SHARE_OVER = 60
-"""Number of the newest images from which the displayed share of images with a target is
-computed."""
+"""The displayed percentage of images with a target is computed from this many of the newest
+images."""
 LEAST_TARGET_SHARE = 0.3
 
 
