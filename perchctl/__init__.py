@@ -1,7 +1,7 @@
 """perchctl: hang a Crazyflie from a ceiling, guided by a camera and a printed target.
 
 The names in `__init__.pyi` are the public ones, for notebooks and scripts; `docs/python.md` shows
-how to use them. They are loaded on first use, so that the command line starts at once.
+how to use them. The public names are loaded on first use, so that the command line starts at once.
 """
 
 import sys

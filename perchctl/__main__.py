@@ -9,7 +9,7 @@ def main() -> int | str | None:
     """Run the command line. Returns the exit code, or exits with it."""
     if sys.platform == "win32":
         return refuse_windows()
-    from perchctl.commands import main as run  # imported late: it takes some time
+    from perchctl.commands import main as run  # imported late, because this import takes some time
 
     code: int | str | None = run()
     return code

@@ -49,7 +49,7 @@ class Telemetry:
 
     `motor_duty` is the duty cycle of M1 (front right), M2 (back right), M3 (back left) and M4
     (front left), 0..65535, as old as the battery reading; None if the vehicle does not report it.
-    No decision in a flight depends on it.
+    No decision in a flight depends on `motor_duty`.
     """
 
     t_s: float
@@ -114,8 +114,8 @@ def is_disarmed(newest: Telemetry) -> bool:
 
 
 def is_armed_by_request(supervisor: int) -> bool:
-    """True if a vehicle that does not arm itself is armed according to the supervisor's bits. Its
-    propellers then turn even on the ground."""
+    """True if a vehicle that does not arm itself is armed according to the supervisor's bits. The
+    propellers of such a vehicle turn even on the ground."""
     return bool(supervisor & ARMED) and not supervisor & AUTO_ARM
 
 

@@ -138,7 +138,7 @@ class Comparison:
         tolerances: permitted difference for the numbers in a field, in the field's unit, keyed by
             field name; the empty name stands for all other fields.
 
-    All names are those used in the log.
+    The names of dataclasses and fields are those used in the log.
     """
 
     unknown: Collection[tuple[str, str]] = ()

@@ -36,7 +36,7 @@ SIZE_STEP_PX = 32
 """Multiple to which the width is rounded, so that width and height are even, as H.264 requires."""
 Rgb = NDArray[np.uint8]
 Progress = Callable[[int, int | None], object]
-"""Called with the number done, and the total."""
+"""Called with the number of images done and the total number."""
 Recorded = Iterator[tuple[int, float, NDArray[np.uint8]]]
 """Recorded images: number, time of exposure, grey (height, width)."""
 

@@ -134,7 +134,7 @@ def _draw_raw_and_filtered(
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, marker, markersize=3, color=colour, label=text)
     filtered = flight.tracked_values(f"e{key}")
-    if key == "yaw_rad":  # where the angle wraps, leave a gap
+    if key == "yaw_rad":  # leave a gap in the line where the angle wraps
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
     ax.plot(log.t_s, filtered, color=BLACK, linewidth=1.1, label="filtered")

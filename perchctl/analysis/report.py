@@ -252,9 +252,9 @@ DECIDED = {
     "HOVER": "in position",
 }
 WIDEST_PX = 480
-"""Width to which a wider image is reduced. Larger: a larger file."""
+"""Width to which a wider image is reduced. Larger: the report becomes a larger file."""
 REPORT_JPEG_QUALITY = 80
-"""JPEG quality, 0 to 100. Larger: a larger file. Smaller: coarser images."""
+"""JPEG quality, 0 to 100. Larger: the report becomes a larger file. Smaller: coarser images."""
 LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 

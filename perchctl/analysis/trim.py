@@ -1,9 +1,9 @@
 """Estimate the balance of a vehicle and its motors from a level hover.
 
 The thrust f_i that the firmware demands from each motor follows from the motor's duty cycle, the
-battery voltage and the thrust curve. A weak motor delivers less. The shares a_i = 4 f_i / (f_1 +
-f_2 + f_3 + f_4) have the mean 1 and, on an X frame whose motors are `MOTOR_OFFSET_M` to the front
-and to the side, three patterns:
+battery voltage and the thrust curve. A weak motor delivers less thrust than the firmware demands.
+The shares a_i = 4 f_i / (f_1 + f_2 + f_3 + f_4) have the mean 1 and, on an X frame whose motors are
+`MOTOR_OFFSET_M` to the front and to the side, three patterns:
 
     M4 front left    M1 front right      pitch = (a_1 + a_4 - a_2 - a_3) / 4
                \\    /                    roll  = (a_3 + a_4 - a_1 - a_2) / 4

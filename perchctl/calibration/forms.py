@@ -253,8 +253,8 @@ def _values(text: str) -> dict[str, Any]:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a JSON object. Raises InvalidValue for a duplicate key, of which Python would silently
-    keep the last value."""
+    """Build a dict from the keys and values of a JSON object. Raises InvalidValue for a duplicate
+    key, of which Python would silently keep the last value."""
     values = dict(pairs)
     if len(values) < len(pairs):
         (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
@@ -263,7 +263,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _xml_values(text: str) -> dict[str, Any]:
-    """The values of OpenCV's FileStorage in XML."""
+    """The values in an XML file written by OpenCV's FileStorage."""
     if "<opencv_storage>" not in text:
         raise InvalidValue(
             f"this XML file is from another program: a calibration is a {READ_FORMS}"

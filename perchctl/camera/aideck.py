@@ -176,8 +176,8 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 
 
 # --- The colour mosaic of a camera whose images are delivered as grey ---
-# The pixels have colour filters in blocks of two by two. Their pattern shows in raw and grey JPEG
-# images.
+# The pixels have colour filters in blocks of two by two. The pattern of the filters is visible in
+# raw images and in grey JPEG images.
 
 
 LEAST_MOSAIC_SHARE = 0.04

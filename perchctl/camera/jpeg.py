@@ -67,8 +67,9 @@ def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | 
 class JpegSplitter:
     """Cuts a byte stream into whole JPEG images.
 
-    It follows the structure of the JPEGs, not the multipart headers. Wrong lengths and bad or
-    missing headers therefore do no harm, and an image is complete as soon as its last byte arrives.
+    The splitter follows the structure of the JPEGs, not the multipart headers. Wrong lengths and
+    bad or missing headers therefore do no harm, and an image is complete as soon as its last byte
+    arrives.
     """
 
     def __init__(self) -> None:

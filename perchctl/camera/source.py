@@ -152,7 +152,7 @@ class LiveSource:
         self._clock = clock
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._first = threading.Event()  # set at the first frame or a failure before it
+        self._first = threading.Event()  # set by the first frame, or by an earlier failure
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
@@ -215,8 +215,8 @@ class LiveSource:
         self._thread.join(CLOSE_WITHIN_S)
 
     def _connection(self) -> str:
-        """Open the camera, read it until it ends, and return why it ended. It calls `_put` for each
-        image, checks `_stop`, and may raise any Exception."""
+        """Open the camera, read it until it ends, and return why it ended. The method calls `_put`
+        for each image, checks `_stop`, and may raise any Exception."""
         raise NotImplementedError
 
     def _run(self) -> None:
@@ -275,7 +275,7 @@ class LiveSource:
         began_s: float | None = None,
         encoded: bytes | None = None,
     ) -> None:
-        """Keep an image that has arrived now.
+        """Keep an image that has just arrived.
 
         `waited_s`: how much longer than usual its transfer took. `began_s`: arrival time of its
         first byte, from which the latency is subtracted. `encoded`: as in `Frame`.

@@ -175,7 +175,7 @@ LEVEL = 0.95
 
 def rate_interval(count: int, total: int, level: float = LEVEL) -> tuple[float, float]:
     """The exact two-sided confidence interval for the rate `count` / `total` (Clopper and Pearson,
-    1934). It contains the true rate in at least a share `level` of all campaigns."""
+    1934). The interval contains the true rate in at least a fraction `level` of all campaigns."""
     found = binomtest(count, total).proportion_ci(level, method="exact")
     return float(found.low), float(found.high)
 

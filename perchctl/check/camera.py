@@ -88,7 +88,7 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """The rows named by `picture_row_names` for a rehearsal. The first one fails if no image
+    """The rows named by `picture_row_names` for a rehearsal. The first row fails if no image
     arrived."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture arrived during the rehearsal"

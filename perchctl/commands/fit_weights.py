@@ -131,8 +131,8 @@ def collect(
     """Collect the data for a fit: poses of both markers at positions with known ground truth.
 
     Place the camera at each position and type in its actual pose. With --truth mocap, the profile's
-    motion-capture system measures it. With --truth sim, the simulator places the camera at seeded
-    positions. To continue a stopped session, run the same command again.
+    motion-capture system measures the actual pose. With --truth sim, the simulator places the
+    camera at seeded positions. To continue a stopped session, run the same command again.
     """
     say_on_terminal(f"reading profile {profile}")
     config = profiles.load_profile(profile, with_weights=False)

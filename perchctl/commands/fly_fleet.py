@@ -36,9 +36,9 @@ from perchctl.files import write_files
 DISPLAY_PERIOD_S = 0.1
 """Update period of display and record, s. Commands are sent at once."""
 ENDING_TIMEOUT_S = 90.0
-"""Time for vehicles to land and their processes to end after a failure of the parent, s. It is
-longer than a landing and the closing of link and log. Shorter: a process may be ended while its
-vehicle still flies. Longer: a failed command ends later."""
+"""Time for vehicles to land and their processes to end after a failure of the parent, s. This time
+is longer than a landing and the closing of link and log take together. Shorter: a process may be
+ended while its vehicle still flies. Longer: a failed command ends later."""
 NUMBER_KEYS = 9
 """Number of vehicles that can be landed with a number key."""
 

@@ -26,7 +26,7 @@ PICTURE_TIMEOUT_S = 0.5
 """Timeout for a vehicle's process to deliver an image, s. Longer: a hanging process delays the
 other tiles. Shorter: images are missing if the computer is busy."""
 LARGEST_PICTURE_BYTES = 2_000_000
-"""Largest JPEG, bytes. Larger: invalid data may fill the memory. Smaller: large images are not
+"""Largest JPEG, bytes. Larger: invalid data could fill the memory. Smaller: large images are not
 shown."""
 
 

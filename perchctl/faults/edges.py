@@ -266,7 +266,7 @@ class FaultRig:
     """The parts of a flight that faults act on. `press` acts like the operator's Ctrl-C, and
     `hang_up` like closing the terminal. `disk.problem` is the error that the log's disk reports.
     The deck provides no positions while `deck_silent` is set. Each function in `on_sample` is
-    called every `SAMPLE_S` with the time."""
+    called with the time, every `SAMPLE_S`."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio

@@ -89,7 +89,7 @@ def external_positions(
 ) -> None:
     """For a vehicle without a deck, make the motion-capture system fail for `for_s` as in
     `CAPTURE_FAULTS[how]`, or delay its frames by `late_s`. `swapped_with`: the body that swaps
-    names with the vehicle's; None: the first other one."""
+    names with the vehicle's; None: the first of the other bodies."""
     assert rig.vehicle.capture is not None
     fault = replace(CAPTURE_FAULTS[how], late_s=late_s, swapped_with=swapped_with)
     rig.vehicle.capture.begin_fault(fault, for_s)
@@ -320,7 +320,7 @@ class Injector:
         if self.begin_s is not None:
             return
         if self.flown is not self._phase:
-            if self._due_s is not None:  # the phase has ended earlier
+            if self._due_s is not None:  # the phase ended before the effects were due
                 self.begin(self._edges.vehicle.t_s)
         elif self._due_s is None:
             self._due_s = tick.t_s + self._moment_s

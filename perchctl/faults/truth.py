@@ -352,8 +352,8 @@ class UndetectedDrift:
         self._slid_m = self._fault_s = 0.0
 
     def update_drift_m(self, fault_s: float, phase: Phase | None) -> float:
-        """The possible drift, m, `fault_s` after the fault began. Must be called in order of
-        time."""
+        """The possible drift, m, `fault_s` after the fault began. Must be called with increasing
+        times."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0

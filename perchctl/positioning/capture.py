@@ -128,8 +128,8 @@ class MotionCapture:
     `close` ends.
 
     `who` is the system's name in messages; `poll` prefers a frame that contains `body`. The
-    constructor waits for the first frame. It raises ConnectionFailed, or UsageError if the library
-    cannot be loaded.
+    constructor waits for the first frame. The constructor raises ConnectionFailed, or UsageError if
+    the library cannot be loaded.
     """
 
     def __init__(

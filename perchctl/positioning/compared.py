@@ -95,7 +95,8 @@ def save_comparison(
     """Replace the stored comparison of this vehicle and set-up.
 
     `at` must have a time zone; `found` is the result in words. Returns None, or why the file could
-    not be written. In that case, the old comparison is deleted if the new one did not pass.
+    not be written. If the file could not be written and the new comparison did not pass, the old
+    comparison is deleted.
     """
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)

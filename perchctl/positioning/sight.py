@@ -79,7 +79,8 @@ class TargetFeed:
 
     `target` is the target's position and heading; None until it has been seen from the ground.
     `off` is the body's position and heading from the sightings minus the estimate, low-pass
-    filtered to reduce noise. It is not zero, because the estimator lags behind late positions.
+    filtered to reduce noise. This difference is not zero, because the estimator lags behind late
+    positions.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:

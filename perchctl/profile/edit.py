@@ -100,7 +100,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 
     Raises:
         InvalidValue: the values do not fit into the YAML layout, the profile would not load with
-            them, or the file cannot be written. The file is then unchanged.
+            them, or the file cannot be written. After such an error, the profile's file is
+            unchanged.
     """
     listed = ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
     by_hand = f"write the values by hand: {listed}"

@@ -179,7 +179,7 @@ def find_calibration(name: str) -> Path:
 
 
 MOST_MASKED_SHARE = 0.75
-"""Largest covered share of the image. Larger: no room is left for a target."""
+"""Largest fraction of the image that a mask may cover. Larger: no room is left for a target."""
 _WHITE = 127
 
 

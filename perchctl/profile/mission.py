@@ -326,8 +326,8 @@ class SafetyConfig(Section):
     4.5 s after the last position. Larger: the vehicle drifts for longer."""
     flight_variance_m2: ClassVar[float] = 0.05
     """Variance of the position in flight above which the vehicle holds its position, too: the
-    estimator has restarted, or has received no position for 3 s. With decks, it is the variance of
-    the height."""
+    estimator has restarted, or has received no position for 3 s. If decks measure the position, the
+    limit applies to the variance of the height."""
     # time above one of these limits after which the vehicle lands
     variance_land_s: ClassVar[float] = 1.0
     # time for which the vehicle holds after a jump before it lands

@@ -76,9 +76,9 @@ _SOURCES = {source.value: source for source in PositionSource}
 class PositioningConfig(Section):
     """The source of the vehicle's position.
 
-    `deck`: the vehicle's own decks measure it. `mocap`: a motion-capture system measures a rigid
-    body on the vehicle, and perchctl sends its position to the vehicle. `target`: perchctl sends
-    the position that the camera measures from the printed target.
+    `deck`: the vehicle's own decks measure the position. `mocap`: a motion-capture system measures
+    a rigid body on the vehicle, and perchctl sends its position to the vehicle. `target`: perchctl
+    sends the position that the camera measures from the printed target.
 
     The rigid body's frame, as the system defines it, is rotated by `body_rpy_deg` and has its
     origin at `body_position_m`, both in the vehicle's body axes.
@@ -149,8 +149,9 @@ class PositioningConfig(Section):
         return f"motion capture at {self.system}:{self.host}".rstrip(":")
 
     def with_method(self, by: str) -> dict[str, Any]:
-        """Return the values with another `by`. Keys of the previous method are dropped. Keys for
-        motion capture are kept if the new method is a deck, because a profile may contain both."""
+        """Return the section's values with another position source (`by`). Keys of the previous
+        source are dropped, except `decks`. If motion capture replaces a deck, all keys are kept,
+        because a profile for a deck may contain the keys for motion capture as well."""
         if by == self.by:
             return self.model_dump()
         kept = self.model_dump() if (self.by, by) == ("deck", "mocap") else {"decks": self.decks}

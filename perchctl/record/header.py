@@ -1,9 +1,9 @@
 """The log's header: the setup of a flight, complete enough to replay the flight on another
 computer.
 
-It contains the profile with every key. The calibration and mask files named in the profile may have
-changed by the time of a replay, so their content is included as well, and so is a fingerprint of
-the computer's arithmetic.
+The header contains the profile with every key. The calibration and mask files named in the profile
+may have changed by the time of a replay, so their content is included as well, and so is a
+fingerprint of the computer's arithmetic.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ class Recorder:
         if not frame.repeated:
             self._add(IMAGE, ns, image_message(self._ns(frame.t_s), frame), number)
             self._written_pictures += 1
-        # Not rounded, because a replay needs exactly these times.
+        # The times are not rounded, because a replay needs them exactly.
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def _write_tick(self, record: Mapping[str, Any]) -> None:

@@ -49,8 +49,8 @@ Truth = tuple[tuple[float, float, float], float]
 class LogWatcher:
     """Writes the log of one flight and, optionally, its recording.
 
-    Only opening it raises exceptions. Later failures are reported by `problem`, and failures of the
-    recording by `remarks`.
+    Only opening the log raises exceptions. Later failures are reported by `problem`, and failures
+    of the recording by `remarks`.
 
     Attributes:
         path: the log file; `open` adds ``_2``, ``_3``... to the name rather than overwrite a file.

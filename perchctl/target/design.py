@@ -2,7 +2,8 @@
 
 z1 and z2 are the farthest ranges at which the large and the small marker are detected, and z3 the
 nearest range at which the whole large marker is in view (paper, section III-B: 115, 25, 12 cm).
-They depend on the smallest side that can be read despite the blur, and on the field of view.
+These ranges depend on the smallest side that can be read despite the blur, and on the field of
+view.
 """
 
 from __future__ import annotations

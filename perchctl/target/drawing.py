@@ -1,8 +1,8 @@
 """The geometry of the nested target: which squares are black, at any resolution.
 
 Drawing axes: origin in the target's centre, x right and y up *as printed and
-read from the printed side*, metres. They are OpenCV's marker axes. The sheet
-hangs face down on the ceiling; the upward-facing camera sees it unmirrored.
+read from the printed side*, metres. These axes are OpenCV's marker axes. The sheet hangs face down
+on the ceiling; the upward-facing camera sees it unmirrored.
 
 Bitmap and PDF come from one raster on a non-uniform grid, whose lines are the
 edges of both markers' cells and of the white ring around the small one.

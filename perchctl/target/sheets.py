@@ -236,7 +236,7 @@ class _Paper(FPDF):
         self.set_margin(0.0)
         self.set_title(title)
         self.set_producer("perchctl")
-        # Never the current time, so that the same target gives the same bytes.
+        # Not the current time, so that the same target always gives the same bytes.
         day = date or datetime.date(2000, 1, 1)
         self.set_creation_date(datetime.datetime.combine(day, datetime.time(), datetime.UTC))
         # Portrait pages are turned about their long edge, which is the vertical one.

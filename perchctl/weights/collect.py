@@ -2,7 +2,7 @@
 session's file.
 
 A session is a CSV file (`perchctl.weights.data`) to which each position is appended in a single
-write. It can be stopped and continued at any time; a crash costs at most the last position.
+write. A session can be stopped and continued at any time; a crash loses at most the last position.
 
 The actual pose at each position is typed by the user or measured by motion capture. Like the
 pipeline's poses, it is the pose of the target relative to the gear's tip in the level frame, (x, y,
@@ -51,7 +51,7 @@ is taken for an error in the camera's pose."""
 MOST_MISMATCH_RAD = math.radians(10.0)
 """Difference from the camera's yaw above which an actual yaw is a mistake, rad."""
 SAMPLES = 30
-"""Number of motion-capture frames whose median is the actual pose. They must arrive within
+"""Number of motion-capture frames whose median is the actual pose. The frames must arrive within
 `WITHIN_S`."""
 WITHIN_S = 5.0
 _LEAST_FRAMES = 3

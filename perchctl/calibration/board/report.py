@@ -35,7 +35,7 @@ _LONG_SHARE = 0.04
 directions of the residuals cannot be seen."""
 _LONG_PERCENTILE = 95.0
 """Percentile of the residuals' lengths that is used as the length of a long residual. Larger: a few
-outliers shrink the others. Smaller: the longest ones leave the image."""
+outliers shrink the others. Smaller: the longest arrows extend beyond the image."""
 _LEAST_RESIDUAL_PX = 1e-3
 """Smallest length that counts as a long residual, px: with exact corners, all residuals are 0."""
 _LEAST_STEPS = 2

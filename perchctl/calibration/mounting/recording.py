@@ -90,7 +90,7 @@ class MountingRecording:
 
         Raises:
             NotFound: there is no such file.
-            InvalidValue: the file was not written by `write`; names the invalid line.
+            InvalidValue: the file was not written by `write`; the message names the invalid line.
         """
         try:
             text = path.read_text(encoding="utf-8")
