@@ -28,7 +28,7 @@ from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
 STALLED_S = 2.0
-"""Time from an image's first to its last byte after which the image is dropped, s."""
+"""An image is dropped if it takes longer than this, s, from its first to its last byte."""
 MAX_PACKET_BYTES = 1022
 """Largest packet length, bytes: the size of the deck's buffers (its MTU)."""
 MOST_SIDE_PX = 1024

@@ -160,7 +160,8 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     span_s = times[-1] - times[0]
     rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
     gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
-    # `MotionCapture.poll` prefers frames with the body, so the others are frames without it.
+    # `MotionCapture.poll` prefers frames with the body, so the other frames are those without the
+    # body.
     share = 1.0 - len(places) / len(samples.frames)
     found = (
         f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, "

@@ -201,8 +201,8 @@ class View:
         return rehearse(self._telemetry, self.source, pipeline, flown, WallClock(), seconds)
 
     def _telemetry(self) -> list[Telemetry]:
-        """Roll and pitch come from the vehicle. Position and yaw do not, because they may still be
-        wrong before a flight."""
+        """Roll and pitch come from the vehicle. Position and yaw are not taken from the vehicle,
+        because they may still be wrong before a flight."""
         place_m = (*self.stand.home_m, self.profile.safety.ground_z_m)
         return [
             replace(

@@ -100,8 +100,8 @@ def camera(
     layout = targets.Board.parse(board)
 
     def checked_file(size_px: tuple[int, int]) -> Path:
-        """Return the path for the calibration file. If it cannot be written, raise an error now,
-        before the user has done any work."""
+        """Return the path for the calibration file. If the file cannot be written there, raise an
+        error now, before the user has done any work."""
         file = _file(output, size_px)
         _check_camera_output(file, force)
         return file

@@ -561,8 +561,8 @@ class Case:
     """One fault in one flight: its `effects` begin `moment_s` seconds into `phase`.
 
     To reach the phase LANDING, the operator commands a landing `landed_after_s` seconds into the
-    phase `landed_from`. To reach RECOVER, the magnet holds only the share `first_hold_ratio` of the
-    weight at the first contact.
+    phase `landed_from`. To reach RECOVER, the magnet's holding force at the first contact is only
+    `first_hold_ratio` times the weight.
     """
 
     fault: Fault

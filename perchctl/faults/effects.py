@@ -237,7 +237,7 @@ def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
-    """The scenario with a magnet that holds the share `of_weight` of the vehicle's weight."""
+    """The scenario with a magnet whose holding force is `of_weight` times the vehicle's weight."""
     hold_n = of_weight * (scenario.mass_kg * GRAVITY_MPS2)
     return replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
 

@@ -66,7 +66,7 @@ SEEN_S = 6.0
 """Once telemetry of a vehicle at rest has arrived for this time, s, the program must have noticed
 that the vehicle is at rest."""
 STOP_S = 0.5
-"""Time after the command to cut the motors within which they must be off, s."""
+"""The motors must be off within this time after the command to cut them, s."""
 SECOND_PRESS_S = 0.3
 """A second press only counts if it comes at least this long after the first, s (docs/safety.md)."""
 KEY_HELD_S = 1.0

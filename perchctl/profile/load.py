@@ -86,8 +86,8 @@ def _with_weights(profile: Profile) -> Profile:
 
 def layered_profile(path: Path, base: str, *layers: dict[str, Any]) -> Profile:
     """Return the profile that a file at `path` would give if it extended `base` with the keys of
-    all `layers`; later layers override earlier ones. File names in them are relative to the folder
-    of `path`.
+    all `layers`; later layers override earlier ones. File names in the layers are relative to the
+    folder of `path`.
 
     Errors: NotFound, InvalidValue; both messages begin with `path`.
     """

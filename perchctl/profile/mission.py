@@ -348,7 +348,7 @@ class SafetyConfig(Section):
     """Lateness of the loop at which the vehicle holds its position, s."""
     loop_late_land_s: ClassVar[float] = 1.0
     """Lateness of the loop at which the vehicle lands, s."""
-    estimator_wait_s: ClassVar[float] = 10.0  # waiting time on the ground
+    estimator_wait_s: ClassVar[float] = 10.0  # longest wait on the ground
     estimator_velocity_variance_m2ps2: ClassVar[float] = 0.01
     """Variance of the velocity above which take-off is refused. With ranging anchors, the variance
     is up to 0.007; without positions, it exceeds the limit within 1 s."""

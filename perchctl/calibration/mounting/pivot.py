@@ -26,7 +26,7 @@ from perchctl.geometry import Array
 
 MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
-"""Size of a jump, m, and the share of the misfit that it must explain to count as a slip. If the
+"""Size of a jump, m, and the fraction of the misfit that it must explain to count as a slip. If the
 tip stays in place, a jump explains 4 % at most."""
 TIP_SIGMA_FLOOR_M = 5e-5  # smallest standard deviation of the tip's position on the pivot point
 _PIVOT_ITERATIONS = 12  # iterations of the least squares for the tip; more: takes longer
