@@ -482,7 +482,7 @@ def test_the_vehicles_to_buy_add_up_and_can_be_flown() -> None:
     for masses, total in vehicles_to_buy():
         assert sum(masses) == pytest.approx(total)
         assert total <= MOST_G
-        assert f"This leaves {MOST_G - total:.1f} g" in page
+        assert f"These parts leave {MOST_G - total:.1f} g" in page
         share = total / 1e3 * GRAVITY_MPS2 / 0.48
         assert f"{100 * share:.0f} % of the full thrust" in page
 

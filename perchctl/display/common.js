@@ -4,7 +4,7 @@
 // showOrders(orders); and HANGS, what it means that perchctl answers with old numbers.
 const by = (id) => document.getElementById(id);
 const token = new URLSearchParams(location.search).get("token") || "";
-const TERMINAL = "On the terminal, press Ctrl-C to land. Press it again to cut the motors.";
+const TERMINAL = "On the terminal: Press Ctrl-C to land. Press it again to cut the motors.";
 // Older browsers have no such bound: better no bound than a button that throws.
 const within = (ms) => AbortSignal.timeout ? { signal: AbortSignal.timeout(ms) } : {};
 const OLD_S = 2, TIMEOUT_MS = 1500, ORDER_TIMEOUT_MS = 3000;

@@ -70,7 +70,7 @@ def test_rejected_views_are_named_with_the_reason() -> None:
 
 def test_residuals_are_drawn_enlarged_by_the_factor_that_is_given(good: Calibration) -> None:
     html = calibration_report(good, "camera.yaml", DATE)
-    (factor,) = map(float, re.findall(r"drawn (\d+) times\s+enlarged", html))
+    (factor,) = map(float, re.findall(r"detected corner,\s+(\d+)\s+times", html))
     (key,) = map(float, re.findall(r"= ([\d.]+) px</text>", html))
     (key_length,) = map(float, re.findall(r'class="key" d="M4 15h([\d.]+)"', html))
     assert key_length == pytest.approx(key * factor, abs=0.06)
