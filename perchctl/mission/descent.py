@@ -8,7 +8,7 @@ which data is known and fresh, and whether the magnet may hold the vehicle (see 
 docs/mission.md):
 
 - by position setpoints, straight down;
-- level, by raw thrust controlled by the vertical speed, without a position;
+- level, without a position: raw thrust with feedback from the vertical speed;
 - by the firmware's own landing, near the ground or if height, telemetry or loop are doubtful;
 - peeled off the magnet by a setpoint below; if the magnet does not let go, the weight is
   transferred to it.

@@ -451,7 +451,7 @@ class ImuMotion(
     # change of the estimated height over the successive gaps until now; at most 0
     height_change_in_gap_m: float = 0.0
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
-    # errors of roll and pitch due to corrections
+    # roll and pitch errors caused by corrections
     roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0)
     body_roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
     # age of the last correction of the state estimate, which this motion does not use
