@@ -43,6 +43,7 @@ from perchctl.commands.simulate import (
     ClusterOption,
     JobsOption,
     SeedOption,
+    list_faults,
     make_executor,
     run_campaign,
     stop_handler,
@@ -319,7 +320,7 @@ def simulate(
     to each other, and what went wrong according to the simulator's ground truth.
     """
     if faults == "list":
-        return _list_fleet_faults(as_json)
+        return list_faults(fleets.fleet_faults(), as_json)
     if resume and out is None:
         raise UsageError("--resume continues a results file: name it with --out")
     _say_reading(file)
@@ -360,14 +361,6 @@ def simulate(
             kept.write_result,
             unit="fleets",
         )
-
-
-def _list_fleet_faults(as_json: bool) -> int:
-    say_on_terminal("listing the faults")
-    faults = fleets.fleet_faults()
-    table = "\n".join(campaigns.align_columns(list(faults.items())))
-    print_result({"faults": faults} if as_json else table)
-    return 0
 
 
 @command(

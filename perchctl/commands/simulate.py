@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
+import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -118,7 +120,9 @@ def run(
 ) -> int:
     """Simulate many seeded flights, faster than real time, and count the outcomes."""
     if faults == "list":
-        return _list_faults(as_json)
+        return list_faults(
+            {fault.name: fault.description for fault in fault_campaigns.FAULTS}, as_json
+        )
     if record and log_dir is None:
         raise UsageError(
             "--record writes its files next to the flight logs: name their folder with --log-dir"
@@ -401,9 +405,13 @@ def log_error(results: Sequence[campaigns.CampaignFlight]) -> PerchError | None:
     return LogIncomplete(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def _list_faults(as_json: bool) -> int:
+def list_faults(faults: Mapping[str, str], as_json: bool) -> int:
+    """Print the name and the description of each fault; returns the exit code."""
     say_on_terminal("listing the faults")
-    faults = {fault.name: fault.description for fault in fault_campaigns.FAULTS}
-    table = "\n".join(campaigns.align_columns(list(faults.items())))
-    print_result({"faults": faults} if as_json else table)
+    indent, columns = 2 + max(map(len, faults)), shutil.get_terminal_size().columns
+    table = "\n".join(
+        textwrap.fill(f"{name:<{indent}}{text}", columns, subsequent_indent=" " * indent)
+        for name, text in faults.items()
+    )
+    print_result({"faults": dict(faults)} if as_json else table)
     return 0

@@ -349,6 +349,7 @@ def test_the_command_lists_and_refuses() -> None:
     listed = simulate("--faults", "list")
     assert listed.exit_code == 0
     assert all(f"{fault.name} " in listed.stdout for fault in FAULTS)
+    assert max(map(len, listed.stdout.splitlines())) <= 80
     told = json.loads(simulate("--faults", "list", "--json").stdout)
     assert told["faults"] == {fault.name: fault.description for fault in FAULTS}
     refused = simulate("--faults", "hanged")
