@@ -95,7 +95,7 @@ FIELDS: dict[str, str] = {
             (f"{short}_rms_px", "RMS reprojection error"),
         )
     },
-    "lock_note": "why the frame's pose was rejected, or why it was accepted far from the expected position",
+    "lock_note": "why the frame's pose was rejected, or accepted at an unexpected position",
     "cam_age_s": "time since the last good frame",
     "delay_s": "measured latency beyond the profile's camera.latency_s",
     "delay_used_s": "correction applied to the frames' times, with `camera.latency_s: measured`",
