@@ -182,12 +182,18 @@ def moments(log: FlightLog) -> Iterator[Moment]:
         if before is None or imu.last_telemetry_gap_ended_at_s > before.t_s:
             filter_.begin(b.telemetry.velocity_mps)
         if before is not None and 0.0 < dt_s < 0.3:
-            filter_.predict(np.subtract(imu.velocity_gained_mps, before.velocity_gained_mps), dt_s)
+            filter_.predict(
+                np.subtract(
+                    imu.velocity_since_first_sample_world_mps,
+                    before.velocity_since_first_sample_world_mps,
+                ),
+                dt_s,
+            )
         before = imu if before is None or dt_s > 0.0 else before
         filter_.remember(b.telemetry.t_s, b.telemetry.yaw_rad)
         if (
             b.is_position_valid
-            and b.dead_reckoning_since_s is None
+            and b.dead_reckoning_began_at_s is None
             and b.first_estimate_jump_at_s is None
             and dt_s > 0.0
         ):
@@ -213,7 +219,7 @@ def errors(log: FlightLog) -> Iterator[tuple[float, list[tuple[float, float]]]]:
         b = moment.belief
         known = (
             b.is_position_valid
-            and b.dead_reckoning_since_s is None
+            and b.dead_reckoning_began_at_s is None
             and b.dead_reckoning.imu is not None
         )
         if not known or b.height_m < LEAST_HEIGHT_M or b.obs.t_s - last_s < BEGINS_EVERY_S:
@@ -242,7 +248,9 @@ def _blind(
         )
         if struck or now.height_m < FLOOR_M or not left:
             return
-        gained = np.subtract(now.imu.velocity_gained_mps, imu.velocity_gained_mps)
+        gained = np.subtract(
+            now.imu.velocity_since_first_sample_world_mps, imu.velocity_since_first_sample_world_mps
+        )
         old = advance_dead_reckoning(old, now.imu, now.telemetry, is_estimate_trusted=False)
         for axis, dv in zip(new, gained, strict=True):
             axis.predict(float(dv), dt_s)

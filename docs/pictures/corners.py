@@ -38,7 +38,7 @@ from perchctl.vision.markers.photometric_fit import (
     project_nodes,
     render_blurred,
 )
-from perchctl.vision.markers.search import make_search_window, search, search_half_size
+from perchctl.vision.markers.search import make_search_window, search, search_half_size_image
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import SETUP
 from tests.helpers.target_picture import CAMERA
@@ -84,7 +84,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_half_size(view.picture, view.prior.expected_corners_both_markers_px)
+    searched = search_half_size_image(view.picture, view.prior.expected_corners_both_markers_px)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25

@@ -272,7 +272,7 @@ def _mission(
             began_s,
             # At the ceiling, the camera is too close to see the target.
             search=state is None or state.phase is not Phase.COMPLETE,
-            sends_sights=state is None or state.belief.dead_reckoning_since_s is None,
+            sends_sights=state is None or state.belief.dead_reckoning_began_at_s is None,
             drops_sightings=drops_sightings,
         )
         drops_sightings = False

@@ -64,7 +64,7 @@ from perchctl.mission.setpoints import (
     limit_setpoint,
     make_setpoint_at_vehicle,
     move_setpoint_to_vehicle,
-    step_towards,
+    step_setpoint_towards,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.profile import PlannerConfig, Profile
@@ -84,7 +84,7 @@ weight to the magnet, s. Larger: the vehicle pulls for longer, and falls if the 
 late."""
 MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
 """Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
-MAX_LANDED_HEIGHT_M = 0.05
+MAX_HEIGHT_TO_COUNT_AS_LANDED_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
 MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
@@ -96,9 +96,9 @@ ON_FLOOR_DWELL_S = 0.5
 LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing commands, s. Without its notify message, the firmware does not execute a
 command (docs/firmware.md, "Order without notify")."""
-MIN_LANDING_COMMANDS = 3
+MIN_LANDING_COMMAND_COUNT = 3
 """Number of landing commands before the telemetry can confirm that the vehicle is landing."""
-MAX_LANDING_COMMANDS = 6
+MAX_LANDING_COMMAND_COUNT = 6
 """Largest number of landing commands."""
 ONBOARD_LANDING_PEAK_SPEED_MPS = 0.35
 """Peak speed of the quintic landing trajectory, m/s."""
@@ -106,7 +106,7 @@ ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the duration of the quintic landing trajectory, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-MAX_ASSUMED_HEIGHT_DRIFT_M = 1.0
+MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
 """Specific force below which the vehicle falls, g: no floor supports it."""
@@ -170,7 +170,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     ):
         state = replace(
             state,
-            stop_or_land_command_count=MIN_LANDING_COMMANDS,
+            stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
             last_stop_or_land_command_at_s=b.obs.t_s,
         )
     elif heard and tel.thrust < 1 and previous_state.motor_stop_commanded_at_s is None:
@@ -193,9 +193,9 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     lost = b.has_only_imu_for_descent
     b = replace(
         b,
-        in_magnet_reach_since_s=previous_state.t_s
-        if within and old.in_magnet_reach_since_s is None
-        else old.in_magnet_reach_since_s,
+        magnet_reach_entered_at_s=previous_state.t_s
+        if within and old.magnet_reach_entered_at_s is None
+        else old.magnet_reach_entered_at_s,
         vehicle_world_z_at_last_contact_m=vehicle_world_z_at_last_contact_m,
         hover_thrust_estimate=hover.estimate_hover_thrust(old),
     )
@@ -272,7 +272,7 @@ def descend(c: Context) -> Action:
     return _command_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
 
 
-def has_landing_command_reached_end(c: Context) -> bool:
+def has_descent_command_reached_minimum(c: Context) -> bool:
     """True if a landing has reached its end: the raw thrust is at its minimum or, if the end of the
     landing could not be confirmed in time (`LANDING_UNCONFIRMED`), the setpoint is at most
     `landing.handover_m` above the take-off position. The motors must then be stopped, or the
@@ -314,9 +314,9 @@ def _is_standing_on_floor(c: Context) -> bool:
     if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
         return True
     placed = (
-        b.is_target_position_source and b.is_position_valid and b.dead_reckoning_since_s is None
+        b.is_target_position_source and b.is_position_valid and b.dead_reckoning_began_at_s is None
     )
-    low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_possibly_in_magnet_reach
+    low = b.height_m < MAX_HEIGHT_TO_COUNT_AS_LANDED_M and not b.is_possibly_in_magnet_reach
     return (
         placed
         and c.state.descent.last_commanded_raw_thrust > 0.0
@@ -332,7 +332,7 @@ def _restart_landing_by_catching_fall(c: Context) -> Action:
     belief = replace(
         b,
         vehicle_world_z_at_last_contact_m=None,
-        in_magnet_reach_since_s=None,
+        magnet_reach_entered_at_s=None,
         dead_reckoning=replace(b.dead_reckoning, gear_below_target_m=math.inf),
     )
     state = replace(
@@ -377,7 +377,9 @@ def _descend_by_setpoints(c: Context) -> Action:
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry.position_m
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = step_towards(c, start, goal, max_down_mps=landing.speed_mps, changes_heading=False)
+    setpoint = step_setpoint_towards(
+        c, start, goal, max_down_mps=landing.speed_mps, changes_heading=False
+    )
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(
             setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M)
@@ -410,7 +412,7 @@ def make_onboard_landing_command(
     above the vehicle.
     """
     drifted_m = min(
-        MAX_ASSUMED_HEIGHT_DRIFT_M,
+        MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M,
         planner.landing.drift_mps * max(0.0, time_in_flight_s),
     )
     goal_z_m = min(ground_z_m, vehicle_world_z_m) - (planner.landing.undershoot_m + drifted_m)
@@ -434,7 +436,7 @@ def _command_onboard_landing(c: Context) -> Action:
         and not state.stop_or_land_command_count
     ):
         return state, away
-    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMANDS and not (
+    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMAND_COUNT and not (
         b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
     )
     carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_IN_FALL_G or (
@@ -453,14 +455,14 @@ def _command_onboard_landing(c: Context) -> Action:
         else c.t_s - state.last_stop_or_land_command_at_s
     )
     seen = (
-        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS
+        state.stop_or_land_command_count >= MIN_LANDING_COMMAND_COUNT
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
     if (
         not seen
         and waited > LANDING_COMMAND_PERIOD_S
-        and state.stop_or_land_command_count < MAX_LANDING_COMMANDS
+        and state.stop_or_land_command_count < MAX_LANDING_COMMAND_COUNT
     ):
         time_in_flight_s = c.t_s - state.flight_started_at_s
         order = make_onboard_landing_command(

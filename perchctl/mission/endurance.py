@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
-    LOW_POWER_REPORT_DELAY_S,
+    FIRMWARE_LOW_POWER_REPORT_DELAY_S,
     MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S,
     BatteryFit,
     PowerTrain,
     charge_fraction_from_rest_v,
-    fit_sag_model,
+    fit_battery_voltage_model,
     full_thrust_discharge_fraction_per_s,
     identify_power_train,
 )
@@ -22,18 +22,18 @@ from perchctl.mission.state import BatteryOutlook
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
-MAX_BATTERY_READING_GAP_S = 5.0
+MAX_TIME_WITHOUT_BATTERY_READING_S = 5.0
 """Time without a reading after which the charge is unknown, s."""
-STANDOFF_SETTLING_DURATION_S = 3.0
+EXPECTED_STANDOFF_SETTLING_DURATION_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
-TOUCH_DURATION_S = 1.0
+EXPECTED_TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
-LANDING_DURATION_BEYOND_DESCENT_S = 3.0
+EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 3.0
 """Time that the end of a landing takes beyond the descent, s, as measured in simulated flights."""
 MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
-BACK_OFF_DURATION_S = 3.0
+EXPECTED_BACK_OFF_DURATION_S = 3.0
 """Time after an attempt until the vehicle is steady and sees the target again, s."""
 
 
@@ -51,7 +51,11 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     counted_s = predict_hover_time_s(
         energy, c.profile, thrust_fraction, identify_power_train(c.telemetry)
     )
-    seconds = None if energy.time_since_battery_reading_s > MAX_BATTERY_READING_GAP_S else counted_s
+    seconds = (
+        None
+        if energy.time_since_battery_reading_s > MAX_TIME_WITHOUT_BATTERY_READING_S
+        else counted_s
+    )
     if c.belief.target.world_position_m is None:
         return BatteryOutlook(seconds, None, consumed_charge_mah, energy.rest_v)
     enough_s, predicted = seconds, predict_durations(c)
@@ -62,12 +66,15 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
             else min(counted_s, _time_left_without_battery_reading_s(c))
         )
     spare_s = (
-        enough_s - c.safety.energy_reserve_s - predicted.landing_s - predicted.remaining_attempt_s
+        enough_s
+        - c.safety.energy_reserve_s
+        - predicted.landing_duration_s
+        - predicted.remaining_attempt_duration_s
     )
     left = c.planner.attempts - c.state.failed_attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
-        attempts = 1 + math.floor(min(spare_s / predicted.retry_s, max(0, left)))
+        attempts = 1 + math.floor(min(spare_s / predicted.retry_duration_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), consumed_charge_mah, energy.rest_v)
 
 
@@ -78,8 +85,8 @@ def predict_hover_time_s(
     `battery-low` applies; None if unknown.
 
     The row `battery-low` applies at the earlier of two events. The firmware reports low power
-    `LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the voltage
-    falls below `safety.min_load_v`, in hover or during a press.
+    `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the
+    voltage falls below `safety.min_load_v`, in hover or during a press.
     """
     if (
         battery_fit.rest_v is None
@@ -91,16 +98,16 @@ def predict_hover_time_s(
     low_power_v = float(
         profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)
     )
-    lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
+    lasts = EXPECTED_TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V)
     press_load = max(hover_thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, true_to_counted_discharge_ratio = fit_sag_model(battery_fit)
+    sag_v, true_to_coulomb_counted_discharge_ratio = fit_battery_voltage_model(battery_fit)
     min_v = safety.min_load_v + sag_v * hover_thrust_fraction
     if profile.planner.hover is None:
         min_v = max(min_v, press_v + sag_v * press_load)
     charge = charge_fraction_from_rest_v(battery_fit.rest_v)
     discharge_per_s = (
-        true_to_counted_discharge_ratio
+        true_to_coulomb_counted_discharge_ratio
         * hover_thrust_fraction
         * full_thrust_discharge_fraction_per_s(profile.vehicle.battery_mah, power_train)
     )
@@ -109,16 +116,16 @@ def predict_hover_time_s(
         return max(0.0, charge - charge_fraction_from_rest_v(rest_v)) / discharge_per_s
 
     low_power_s = time_until_s(low_power_v + sag_v * hover_thrust_fraction)
-    return min(low_power_s + LOW_POWER_REPORT_DELAY_S, time_until_s(min_v))
+    return min(low_power_s + FIRMWARE_LOW_POWER_REPORT_DELAY_S, time_until_s(min_v))
 
 
 @dataclass(frozen=True)
 class MissionDurations:
     """Predicted times that parts of a mission take, s."""
 
-    remaining_attempt_s: float  # the rest of this attempt
-    retry_s: float  # each further attempt
-    landing_s: float
+    remaining_attempt_duration_s: float  # the rest of this attempt
+    retry_duration_s: float  # each further attempt
+    landing_duration_s: float
 
 
 def predict_durations(c: Context) -> MissionDurations:
@@ -129,9 +136,9 @@ def predict_durations(c: Context) -> MissionDurations:
         0.0 if hover is None else hover.below_m
     )
     climb_height_m = max(0.0, top_z_m - c.telemetry.position_m[2])
-    touch_s = STANDOFF_SETTLING_DURATION_S + planner.ascend.settle_dwell_s
+    touch_s = EXPECTED_STANDOFF_SETTLING_DURATION_S + planner.ascend.settle_dwell_s
     if hover is None:
-        touch_s += TOUCH_DURATION_S
+        touch_s += EXPECTED_TOUCH_DURATION_S
         touch_s += (
             planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
         )
@@ -140,14 +147,20 @@ def predict_durations(c: Context) -> MissionDurations:
     aligned_s = 0.0
     if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH, Phase.HOVER):
         aligned_s = (
-            BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
+            EXPECTED_BACK_OFF_DURATION_S
+            if c.state.phase is Phase.RECOVER
+            else 2.0 * EXPECTED_BACK_OFF_DURATION_S
         )
     retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
     descent_s = max(0.0, c.belief.height_m + climb_height_m) / planner.landing.speed_mps
     return MissionDurations(
-        remaining_attempt_s=aligned_s + _climb_duration_s(c.profile, climb_height_m) + touch_s,
-        retry_s=2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, retry_climb_m) + touch_s,
-        landing_s=descent_s + LANDING_DURATION_BEYOND_DESCENT_S,
+        remaining_attempt_duration_s=aligned_s
+        + _climb_duration_s(c.profile, climb_height_m)
+        + touch_s,
+        retry_duration_s=2.0 * EXPECTED_BACK_OFF_DURATION_S
+        + _climb_duration_s(c.profile, retry_climb_m)
+        + touch_s,
+        landing_duration_s=descent_s + EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S,
     )
 
 
@@ -165,8 +178,8 @@ def battery_shortfall_text(c: Context) -> str:
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
     return (
-        f"{has}; an attempt takes {predicted.remaining_attempt_s:.0f} s, "
-        f"the landing {predicted.landing_s:.0f} s, "
+        f"{has}; an attempt takes {predicted.remaining_attempt_duration_s:.0f} s, "
+        f"the landing {predicted.landing_duration_s:.0f} s, "
         f"and the reserve is {c.safety.energy_reserve_s:g} s"
     )
 

@@ -21,7 +21,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import MAX_RAW_THRUST
 from perchctl.mission.belief.reckoning import ACCELERATION_BIAS_TIME_CONSTANT_S
-from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, VisualMotion
+from perchctl.mission.belief.target import VISUAL_VELOCITY_TIME_CONSTANT_S, VisualMotion
 from perchctl.mission.context import Context
 from perchctl.mission.release import forget_contact_when_below
 from perchctl.mission.setpoints import Action
@@ -45,24 +45,24 @@ MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS = 0.2
 SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M = 0.06
 """Product of the gain k and the age of the vertical speed, as long as k is between its smallest and
 its largest value."""
-THRUST_FACTOR_WITHOUT_CLIMB_RATE = 0.98
+THRUST_FACTOR_IF_CLIMB_RATE_UNKNOWN = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
-SINK_RATE_SETPOINT_BY_CAMERA_MPS = 0.4
+SINK_RATE_SETPOINT_IF_CAMERA_GUIDED_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
 MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS = 0.2
 """Sink rate measured from pictures below which the vehicle counts as not sinking, m/s; the error of
 single detections is half as large."""
-CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
+BRAKE_TILT_GAIN_IF_CAMERA_GUIDED_RAD_PER_MPS = 0.15
 """Tilt per lateral speed measured from pictures, rad per m/s. Larger: the vehicle oscillates, since
 the tilt itself looks like a motion. Smaller: it drifts further."""
 SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which the vehicle has come to rest, s."""
-THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.25
+THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, as a fraction of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S = 0.1
+CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.1
 """Rate at which the thrust of a vehicle that does not sink is reduced in a descent by pictures, as
 a fraction of the hover thrust per second; pictures show only after a quarter of a second that the
 vehicle sinks. Larger: the vehicle falls at first. Smaller: the vehicle stands on the floor for
@@ -72,11 +72,11 @@ MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 counts as not sinking, m/s."""
 MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
 """Smallest commanded thrust, as a fraction of the hover thrust."""
-MIN_TILT_COSINE_TO_COMPENSATE_THRUST = 0.8
+MIN_TILT_COSINE_DIVIDING_THRUST = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
-BRAKE_GAIN_RAD_PER_MPS = 0.25
+BRAKE_TILT_GAIN_RAD_PER_MPS = 0.25
 """Tilt per lateral speed, rad per m/s."""
-MAX_CAMERA_VELOCITY_AGE_S = 0.5
+MAX_VISUAL_VELOCITY_AGE_S = 0.5
 """Largest age of a lateral speed from pictures that the vehicle still brakes, s. Larger: after the
 last picture, the vehicle keeps leaning against a speed that no longer exists. Smaller: a few lost
 pictures end the braking."""
@@ -85,7 +85,7 @@ MAX_BRAKE_TILT_RAD = 0.22
 MAX_WIND_COMPENSATION_TILT_RAD = 0.2
 """Largest tilt against the wind, rad; it balances a wind of 6 m/s. Larger: an impact or a wrong
 bias moves the vehicle far off course."""
-MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S = 0.2
+MAX_LATERAL_VELOCITY_AGE_FOR_FULL_BRAKE_S = 0.2
 """Age of the lateral speed above which the vehicle brakes less, s; otherwise it would oscillate."""
 INITIAL_LATERAL_VELOCITY_SIGMA_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
@@ -113,9 +113,9 @@ MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
 TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration of a descent after which the vehicle must have landed or be
 hanging, s."""
-TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S = 0.8
+TOUCHDOWN_OVERDUE_MARGIN_IF_CLIMB_UNKNOWN_S = 0.8
 """Value of `TOUCHDOWN_OVERDUE_MARGIN_S` without a measured vertical speed, s."""
-MAX_DESCENT_BY_SETPOINTS_DURATION_S = 1.5
+MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S = 1.5
 """Time for which a vehicle with old telemetry and an imprecise hover thrust descends by setpoints,
 using its own estimate, s."""
 MIN_MEAN_DESCENT_SINK_RATE_MPS = 0.35
@@ -124,11 +124,11 @@ MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M = 0.1
 """Distance of the vehicle below its contact beyond which the magnet has let go, m. Larger: a
 vehicle that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle
 seems to have come off."""
-MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M = 0.2
+MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, at which the magnet
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
-MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA = 0.75
+MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING = 0.75
 """Fraction of the hover thrust below which a vehicle that does not move in the pictures must be
 standing on the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks
 like the floor. Smaller: the motors run on the floor for longer."""
@@ -155,7 +155,7 @@ def _is_target_redetected_without_velocity(c: Context) -> bool:
 def _climb_rate_measured_at_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
     seen = _visual_motion_if_telemetry_old(c)
-    return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
+    return c.telemetry.t_s if seen is None else seen.t_s - VISUAL_VELOCITY_TIME_CONSTANT_S
 
 
 def _is_climb_rate_unknown(c: Context) -> bool:
@@ -163,19 +163,19 @@ def _is_climb_rate_unknown(c: Context) -> bool:
     return _climb_rate_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
 
 
-def _limited_tick_duration_s(c: Context) -> float:
+def _clamped_time_since_last_tick_s(c: Context) -> float:
     """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_INTEGRATION_STEP_S`."""
     return max(0.0, min(MAX_THRUST_RAMP_INTEGRATION_STEP_S, c.t_s - c.state.t_s))
 
 
 def _climb_rate_measurement_age_s(c: Context) -> float:
     """Return the age of the vertical speed, s: at least one tick."""
-    return max(1e-3, _limited_tick_duration_s(c), c.t_s - _climb_rate_measured_at_s(c))
+    return max(1e-3, _clamped_time_since_last_tick_s(c), c.t_s - _climb_rate_measured_at_s(c))
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
     """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
-    in that case, setpoints are better, for at most `MAX_DESCENT_BY_SETPOINTS_DURATION_S`."""
+    in that case, setpoints are better, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
@@ -183,7 +183,7 @@ def should_wait_for_climb_rate(c: Context) -> bool:
     return (
         _is_climb_rate_unknown(c)
         and begins_rough
-        and c.time_in_phase_s < MAX_DESCENT_BY_SETPOINTS_DURATION_S
+        and c.time_in_phase_s < MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S
     )
 
 
@@ -192,7 +192,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     tilt brakes the lateral speed and balances the wind."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
-        _limited_tick_duration_s(c),
+        _clamped_time_since_last_tick_s(c),
         _climb_rate_measurement_age_s(c),
         _climb_rate_measured_at_s(c),
     )
@@ -200,20 +200,20 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     climb_mps = measured_mps + descent.climb_rate_change_not_yet_measured_mps
     is_sinking, ramp_per_s = (
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
-        THRUST_RAMP_DOWN_HOVER_FRACTION_PER_S,
+        THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S,
     )
     # Pictures must show the sinking: a vehicle on the floor does not respond to commands.
     if _visual_motion_if_telemetry_old(c) is not None:
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
-            THRUST_RAMP_DOWN_BY_CAMERA_HOVER_FRACTION_PER_S,
+            CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
-    height_m = b.height_m if b.dead_reckoning_since_s is None else b.dead_reckoned_height_m
+    height_m = b.height_m if b.dead_reckoning_began_at_s is None else b.dead_reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
-    thrust = _compute_sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
+    thrust = _compute_thrust_for_sink_rate(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S:
-        thrust *= THRUST_FACTOR_WITHOUT_CLIMB_RATE
+        thrust *= THRUST_FACTOR_IF_CLIMB_RATE_UNKNOWN
     floor_detected_at_s = _find_floor_detection_time_s(
         c, hover_thrust, height_m, is_sinking=is_sinking
     )
@@ -296,18 +296,18 @@ def _find_floor_detection_time_s(
     weak = (
         0.0
         < descent.last_commanded_raw_thrust
-        < MAX_STANDING_TO_HOVER_THRUST_RATIO_BY_CAMERA * hover_thrust
+        < MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING * hover_thrust
     )
     stands = (
         seen is not None
-        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M
+        and seen.gear_to_target_level_m[2] > MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M
         and weak
         and not is_sinking
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
 
-def _compute_sink_rate_thrust(
+def _compute_thrust_for_sink_rate(
     c: Context, hover_thrust: float, climb_mps: float, height_m: float
 ) -> float:
     """Return the rate controller's thrust, 0..65535, by the equation in the module docstring:
@@ -319,7 +319,7 @@ def _compute_sink_rate_thrust(
     low = height_m <= MAX_NEAR_FLOOR_HEIGHT_M or is_height_wrong
     sink_mps = NEAR_FLOOR_SINK_RATE_SETPOINT_MPS if low else SINK_RATE_SETPOINT_MPS
     if _visual_motion_if_telemetry_old(c) is not None:
-        sink_mps = SINK_RATE_SETPOINT_BY_CAMERA_MPS
+        sink_mps = SINK_RATE_SETPOINT_IF_CAMERA_GUIDED_MPS
     gain = SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M / max(
         1e-3, c.t_s - _climb_rate_measured_at_s(c)
     )
@@ -327,7 +327,7 @@ def _compute_sink_rate_thrust(
         MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS,
         min(MAX_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS, gain),
     )
-    tilt = max(MIN_TILT_COSINE_TO_COMPENSATE_THRUST, math.cos(b.tilt_rad))
+    tilt = max(MIN_TILT_COSINE_DIVIDING_THRUST, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
@@ -335,23 +335,23 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
     """Return the state without its recorded contact if a position or pictures show the vehicle
     clearly below it, or the accelerometer a fall; otherwise unchanged."""
     state, b, seen = c.state, c.belief, _visual_motion_if_telemetry_old(c)
-    if b.is_position_valid and b.dead_reckoning_since_s is None:
+    if b.is_position_valid and b.dead_reckoning_began_at_s is None:
         return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
-    in_magnet_reach_since_s = b.in_magnet_reach_since_s
-    fell = in_magnet_reach_since_s is not None and b.imu.last_fall_at_s > max(
-        in_magnet_reach_since_s, state.entry.t_s
+    magnet_reach_entered_at_s = b.magnet_reach_entered_at_s
+    fell = magnet_reach_entered_at_s is not None and b.imu.last_fall_at_s > max(
+        magnet_reach_entered_at_s, state.entry.t_s
     )
     seen_below = (
         seen is not None
-        and seen.gear_to_target_level_m[2] > MIN_GEAR_BELOW_TARGET_BY_CAMERA_WHEN_DETACHED_M
+        and seen.gear_to_target_level_m[2] > MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M
     )
     if fell or (b.is_possibly_in_magnet_reach and seen_below):
         belief = replace(
             b,
             vehicle_world_z_at_last_contact_m=None,
-            in_magnet_reach_since_s=None,
+            magnet_reach_entered_at_s=None,
             dead_reckoning=replace(b.dead_reckoning, gear_below_target_m=math.inf),
-            dead_reckoning_since_s=None if b.dead_reckoning_since_s is None else c.t_s,
+            dead_reckoning_began_at_s=None if b.dead_reckoning_began_at_s is None else c.t_s,
         )
         return replace(state, belief=belief)
     return state
@@ -361,18 +361,18 @@ def _is_touchdown_overdue(c: Context) -> bool:
     """True if the vehicle has descended without a position for so long that it must have landed or
     be hanging."""
     state, b = c.state, c.belief
-    if b.dead_reckoning_since_s is None and not b.is_position_diverged:
+    if b.dead_reckoning_began_at_s is None and not b.is_position_diverged:
         return False
     descent_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
-    began_s = max(b.dead_reckoning_since_s or 0.0, state.entry.t_s)
+    began_s = max(b.dead_reckoning_began_at_s or 0.0, state.entry.t_s)
     measured = (
         c.t_s - _climb_rate_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
     )
     spare_s = (
-        TOUCHDOWN_OVERDUE_MARGIN_S if measured else TOUCHDOWN_OVERDUE_MARGIN_WITHOUT_CLIMB_RATE_S
+        TOUCHDOWN_OVERDUE_MARGIN_S if measured else TOUCHDOWN_OVERDUE_MARGIN_IF_CLIMB_UNKNOWN_S
     )
     if not measured and b.hover_thrust_estimate.is_imprecise:
-        spare_s += MAX_DESCENT_BY_SETPOINTS_DURATION_S
+        spare_s += MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S
     return c.t_s - began_s > spare_s + descent_m / MIN_MEAN_DESCENT_SINK_RATE_MPS
 
 
@@ -397,7 +397,7 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     dead_reckoning, yaw_rad = b.dead_reckoning, c.telemetry.yaw_rad
     x_mps, y_mps, _ = dead_reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
-    blind_s = 0.0 if b.dead_reckoning_since_s is None else c.t_s - b.dead_reckoning_since_s
+    blind_s = 0.0 if b.dead_reckoning_began_at_s is None else c.t_s - b.dead_reckoning_began_at_s
     visual_age_s = (
         math.inf
         if c.obs.visual_inertial_motion is None
@@ -409,12 +409,12 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
         + LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
     )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
-    part *= min(1.0, MAX_VELOCITY_AGE_FOR_FULL_BRAKING_S / max(1e-3, b.attitude_age_s))
+    part *= min(1.0, MAX_LATERAL_VELOCITY_AGE_FOR_FULL_BRAKE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _world_to_heading_xy(part * x_mps, part * y_mps, yaw_rad)
-    seen, gain = _visual_motion_if_telemetry_old(c), BRAKE_GAIN_RAD_PER_MPS
+    seen, gain = _visual_motion_if_telemetry_old(c), BRAKE_TILT_GAIN_RAD_PER_MPS
     if seen is not None and b.does_camera_motion_match_vehicle:
-        ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
-        if c.t_s - seen.t_s <= MAX_CAMERA_VELOCITY_AGE_S:
+        ahead_mps, left_mps, gain = 0.0, 0.0, BRAKE_TILT_GAIN_IF_CAMERA_GUIDED_RAD_PER_MPS
+        if c.t_s - seen.t_s <= MAX_VISUAL_VELOCITY_AGE_S:
             ahead_mps, left_mps, _ = seen.vehicle_velocity_level_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         dead_reckoning.acceleration_bias_world_mps2,

@@ -38,7 +38,7 @@ def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
     trajectory in the old frame, so position control first catches the vehicle, and then the landing
     is commanded again."""
-    b, obstacle_blocked_at_z_m = state.belief, state.obstacle_blocked_at_z_m
+    b, vehicle_world_z_when_blocked_m = state.belief, state.vehicle_world_z_when_blocked_m
     if (
         state.phase is Phase.LANDING
         and state.stop_or_land_command_count
@@ -55,7 +55,7 @@ def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
         state,
         setpoint=b.command_history.setpoint,
         entry=replace(state.entry, position_m=b.command_history.maneuver_start_position_m),
-        obstacle_blocked_at_z_m=None
-        if obstacle_blocked_at_z_m is None
-        else obstacle_blocked_at_z_m + b.world_frame_shift_in_tick_m[2],
+        vehicle_world_z_when_blocked_m=None
+        if vehicle_world_z_when_blocked_m is None
+        else vehicle_world_z_when_blocked_m + b.world_frame_shift_in_tick_m[2],
     )

@@ -22,7 +22,7 @@ from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
+from perchctl.mission.phases.approach import MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
@@ -146,7 +146,7 @@ def act_in_phase(c: Context) -> Action:
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (
             state.phase is not Phase.APPROACH
-            or c.belief.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
+            or c.belief.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M
         )
         return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

@@ -7,7 +7,7 @@ whole weight is transferred to the magnet and monitored before the motors are st
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import HANGING_WITH_MOTORS_STOPPED, is_above_hover_thrust
+from perchctl.mission.belief.contact import HANGING_WITH_MOTORS_STOPPED, is_thrust_above_hover
 from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
 from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
 from perchctl.mission.context import Context
@@ -57,7 +57,7 @@ CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
 CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
-MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO = 0.5
+MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON = 0.5
 """Fraction of hover thrust above which the motors count as running."""
 MIN_FALL_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
@@ -81,7 +81,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     away_m = z - tel.position_m[2]
     calm = (
         away_m > MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M
-        and not is_above_hover_thrust(c.belief)
+        and not is_thrust_above_hover(c.belief)
         and tel.velocity_mps[2] > MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS
     )
     if calm or c.time_in_phase_s > PRESS_END_TIMEOUT_S:
@@ -222,7 +222,7 @@ def choose_catch_setpoint_height_above_vehicle_m(
     """Return the height, m, of the setpoint above a falling vehicle that catches the fall. The
     height depends on whether the motors turn, which the reported and the hover thrust (0..65535)
     show."""
-    turning = reported_thrust > MIN_MOTORS_ON_TO_HOVER_THRUST_RATIO * hover_thrust
+    turning = reported_thrust > MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON * hover_thrust
     return (
         CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
         if turning
@@ -243,7 +243,7 @@ def catch_falling_vehicle(c: Context) -> Action | None:
     ):
         x, y = (
             _braking_setpoint_world_xy_m(c)
-            if b.has_uncorrected_gust
+            if b.is_estimate_missing_gust
             else state.entry.position_m[:2]
         )
         setpoint = PositionSetpoint(

@@ -212,7 +212,7 @@ class FlightReport:
         return cls(
             phase=state.phase,
             outcome=state.outcome or Outcome.SAFETY,
-            reason=_end_reason(state, history),
+            reason=_flight_end_reason(state, history),
             # If a hanging vehicle is noticed after the last attempt, that attempt was counted as
             # failed.
             attempts=state.failed_attempts
@@ -272,13 +272,13 @@ def find_touchdown(c: Context) -> Touchdown | None:
     impact = imu.newest_impact
     if (
         c.state.phase is Phase.PERCHED
-        or min(tel.t_s, imu.motors_off_since_s) - impact.t_s > MAX_TOUCHDOWN_TO_MOTOR_STOP_S
+        or min(tel.t_s, imu.motors_stopped_at_s) - impact.t_s > MAX_TOUCHDOWN_TO_MOTOR_STOP_S
     ):
         return None
     higher = impact.world_z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M
-    if b.is_position_valid and b.dead_reckoning_since_s is None and higher:
+    if b.is_position_valid and b.dead_reckoning_began_at_s is None and higher:
         return None
-    reckoned = b.dead_reckoning_since_s is not None or b.is_position_diverged
+    reckoned = b.dead_reckoning_began_at_s is not None or b.is_position_diverged
     speed_mps = -(
         dead_reckoning.climb_before_impact_mps
         if reckoned
@@ -287,7 +287,7 @@ def find_touchdown(c: Context) -> Touchdown | None:
     return Touchdown(max(0.0, speed_mps), impact.peak_acc_z_g)
 
 
-def _end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:
+def _flight_end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     told = why and (
         state.phase is not Phase.ABORTED

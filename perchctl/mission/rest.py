@@ -19,7 +19,7 @@ MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
 with the height at the start of a descent or with the present height."""
 MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
 """Height up to which a vehicle with its motors off stands on the floor, m."""
-MAX_DESCENT_IF_STILL_HANGING_M = 0.15
+MAX_HEIGHT_LOSS_IF_STILL_HANGING_M = 0.15
 """Height loss below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
 table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
@@ -47,7 +47,7 @@ def find_rest_state(c: Context) -> RestState:
         return _find_rest_state_from_falls(c)
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
-    stayed = high and not b.target.is_far_above and came_down_m < MAX_DESCENT_IF_STILL_HANGING_M
+    stayed = high and not b.target.is_far_above and came_down_m < MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
     at_contact = b.vehicle_world_z_at_last_contact_m is not None and not b.target.is_far_above
     if stayed or (b.height_m > MAX_HEIGHT_RESTING_ON_FLOOR_M and at_contact):
         return RestState.HANGS
@@ -60,7 +60,8 @@ def _is_held_by_other_object(c: Context) -> bool:
         return False
     if (
         b.is_position_valid
-        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_DESCENT_IF_STILL_HANGING_M
+        and state.entry.position_m[2] - b.telemetry.position_m[2]
+        >= MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
     ):
         return False
     if VehicleDiagnosis.HELD_BY_OTHER_OBJECT in state.entry.diagnosis:
@@ -84,7 +85,11 @@ def _find_rest_state_from_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured since the vehicle
     came within the magnet's reach. The state is UNKNOWN after a gap in the telemetry that was long
     enough to hide a fall or an attachment to the magnet."""
-    b, dead_reckoning, since_s = c.belief, c.belief.dead_reckoning, c.belief.in_magnet_reach_since_s
+    b, dead_reckoning, since_s = (
+        c.belief,
+        c.belief.dead_reckoning,
+        c.belief.magnet_reach_entered_at_s,
+    )
     floor_s = c.state.descent.floor_detected_at_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt

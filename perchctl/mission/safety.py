@@ -20,7 +20,7 @@ from perchctl.mission.belief.contact import (
     gear_to_target_at_last_touch_or_now,
     max_press_thrust,
 )
-from perchctl.mission.belief.motion import MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
+from perchctl.mission.belief.motion import MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
 from perchctl.mission.belief.quality import (
     BATTERY_LOW,
     ESTIMATE_CONTRADICTS_IMU,
@@ -63,15 +63,15 @@ MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
 it over."""
 MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
-MAX_DISTANCE_FROM_SETPOINT_AT_LOW_HEIGHT_M = 0.22
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_IF_LOW_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
 `MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
-MAX_DISTANCE_FROM_SETPOINT_IN_LANDING_M = 0.4
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_LANDING_M = 0.4
 """Lateral distance from the setpoint at which positions have diverged during a landing, m."""
-MAX_DISTANCE_FROM_SETPOINT_M = 0.8
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_M = 0.8
 """Lateral distance from the setpoint at which positions have diverged in all other cases, m:
 further than any draught moves the vehicle. Larger: the vehicle reaches the walls."""
-DISTANCE_FROM_SETPOINT_PER_LATENCY_SIGMA_MPS = 4.0
+SETPOINT_DISTANCE_LIMIT_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the limit on the lateral distance from the setpoint with the target as the position
 source, in m per second of the camera latency's standard deviation: pictures that are 0.1 s later
 than assumed cause up to 0.2 m. Larger: a rotated camera leads the vehicle further away."""
@@ -81,7 +81,7 @@ ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
 MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS = 0.35
+MIN_EXCESS_CLIMB_RATE_IN_OSCILLATION_MPS = 0.35
 """If the climb rate exceeds `ascend.speed_mps`, the setpoint's climb rate in an ascent, by more
 than this value, m/s, position control must be oscillating; in flights with prompt positions, the
 difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends the flight."""
@@ -93,10 +93,10 @@ HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 """Time that it takes to distinguish the magnet from other supports, s."""
 MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
-MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M = 0.3
+MIN_SIGHTING_TO_WRONG_ESTIMATE_DISTANCE_M = 0.3
 """Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
 position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
-MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S = 0.35
+MIN_POSITION_AGE_TO_BELIEVE_SIGHTINGS_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings can no longer
 be a single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection
 ends the flight."""
@@ -125,10 +125,10 @@ def is_position_control_diverging(c: Context) -> bool:
         )
         return (
             not touched
-            and _lateral_distance_from_setpoint_m(c) > MAX_DISTANCE_FROM_SETPOINT_IN_LANDING_M
+            and _lateral_distance_from_setpoint_m(c) > MAX_LATERAL_DISTANCE_FROM_SETPOINT_LANDING_M
         )
     spare_m = (
-        DISTANCE_FROM_SETPOINT_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        SETPOINT_DISTANCE_LIMIT_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
         if b.is_target_position_source
         else 0.0
     )
@@ -141,20 +141,20 @@ def is_position_control_diverging(c: Context) -> bool:
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = (
-        b.imu.t_s - b.imu.last_lateral_push_at_s <= MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
+        b.imu.t_s - b.imu.last_lateral_push_at_s <= MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
     )  # by moving air
     stays = b.height_m < MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M or (only_climbs and not is_pushed)
     return _lateral_distance_from_setpoint_m(c) > (
-        MAX_DISTANCE_FROM_SETPOINT_AT_LOW_HEIGHT_M + spare_m
+        MAX_LATERAL_DISTANCE_FROM_SETPOINT_IF_LOW_M + spare_m
         if stays
-        else MAX_DISTANCE_FROM_SETPOINT_M
+        else MAX_LATERAL_DISTANCE_FROM_SETPOINT_M
     )
 
 
 def _is_oscillating_vertically(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
-    most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_ABOVE_COMMANDED_IN_OSCILLATION_MPS
+    most_mps = c.planner.ascend.speed_mps + MIN_EXCESS_CLIMB_RATE_IN_OSCILLATION_MPS
     return (
         moves
         and by_capture
@@ -196,15 +196,15 @@ def is_position_lost(c: Context) -> bool:
     is useless: after an impact or gust that no sighting has corrected, because of its variance, or
     because sightings contradict it."""
     b = c.belief
-    if b.position_correction_age_s > c.profile.positioning.land_s or b.has_uncorrected_gust:
+    if b.position_correction_age_s > c.profile.positioning.land_s or b.is_estimate_missing_gust:
         return True
     if (
-        b.position_correction_age_s > MIN_POSITION_AGE_TO_TRUST_CONTRADICTION_S
+        b.position_correction_age_s > MIN_POSITION_AGE_TO_BELIEVE_SIGHTINGS_S
         and c.obs.rejected_sighting_to_estimate_distance_m
-        > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_OF_CONTRADICTION_M
+        > MIN_SIGHTING_TO_WRONG_ESTIMATE_DISTANCE_M
     ):
         return True
-    unsure = b.worst_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
+    unsure = b.max_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
     return b.is_target_position_source and b.is_position_stale and unsure
 
 

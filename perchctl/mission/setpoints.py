@@ -61,10 +61,10 @@ MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
 MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
 """Largest lateral position error that the integral still accumulates while the vehicle moves, m."""
-MAX_LATERAL_INTEGRAL_M = 0.4
+MAX_LATERAL_INTEGRAL_SHIFT_M = 0.4
 """Largest integral, m; it balances a wind of 5 m/s. Larger: the setpoint of a vehicle that is held
 winds up further. Smaller: a wind keeps the vehicle off its target permanently."""
-MAX_SPEED_HOVERING_IN_PLACE_MPS = 0.1
+MAX_SPEED_TO_COUNT_AS_HOVERING_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
 MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS = 0.25
@@ -100,7 +100,7 @@ def make_setpoint_under_target(c: Context, vehicle_world_z_m: float) -> Position
     return PositionSetpoint(x, y, vehicle_world_z_m, yaw)
 
 
-def step_towards(
+def step_setpoint_towards(
     c: Context,
     old: PositionSetpoint,
     goal: PositionSetpoint,
@@ -156,7 +156,7 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(
         c,
-        step_towards(
+        step_setpoint_towards(
             c, old, goal, max_up_mps=max_up_mps, limits_speed_until_camera_mounting_confirmed=True
         ),
     )
@@ -176,12 +176,16 @@ def update_lateral_integral(
     ex = goal_xy_m[0] - c.telemetry.position_m[0]
     ey = goal_xy_m[1] - c.telemetry.position_m[1]
     tx, ty = c.state.lateral_integral_m
-    stands = c.belief.speed_mps < MAX_SPEED_HOVERING_IN_PLACE_MPS
-    most_m = MAX_LATERAL_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
+    stands = c.belief.speed_mps < MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
+    most_m = (
+        MAX_LATERAL_INTEGRAL_SHIFT_M
+        if stands
+        else max(planner.integral_limit_m, math.hypot(tx, ty))
+    )
     if stands or math.hypot(ex, ey) < MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
-    return limit_vector(tx, ty, most_m)
+    return limit_vector_length(tx, ty, most_m)
 
 
 def move_setpoint_to_vehicle(c: Context) -> PlannerState:
@@ -194,17 +198,19 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
         return replace(c.state, lateral_integral_m=(0.0, 0.0))
-    if not c.belief.is_position_valid or c.belief.speed_mps > MAX_SPEED_HOVERING_IN_PLACE_MPS:
+    if not c.belief.is_position_valid or c.belief.speed_mps > MAX_SPEED_TO_COUNT_AS_HOVERING_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        lateral_integral_m=limit_vector(sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_M),
+        lateral_integral_m=limit_vector_length(
+            sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_SHIFT_M
+        ),
     )
 
 
-def limit_vector(x: float, y: float, max_length: float) -> tuple[float, float]:
+def limit_vector_length(x: float, y: float, max_length: float) -> tuple[float, float]:
     """Return the vector (x, y), shortened to at most `max_length`."""
     size = math.hypot(x, y)
     return (x, y) if size <= max_length else (x * max_length / size, y * max_length / size)
@@ -272,7 +278,11 @@ def _lateral_error_and_velocity(
     (x, y) in world axes. Both come from pictures and tilt while recent pictures show the target,
     otherwise from the state estimate. During take-off and landing, which do not follow the target,
     they always come from the state estimate."""
-    lateral, tel, maneuver = c.belief.lateral_state, c.telemetry, c.belief.command_history.maneuver
+    lateral, tel, maneuver = (
+        c.belief.lateral_offset_and_velocity,
+        c.telemetry,
+        c.belief.command_history.maneuver,
+    )
     follows_target = maneuver.is_camera_guided or maneuver.presses_against_target
     if lateral is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m

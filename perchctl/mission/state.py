@@ -120,7 +120,9 @@ class PlannerState:
     must_end_press: bool = False
     catch_setpoint_height_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
-    obstacle_blocked_at_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
+    vehicle_world_z_when_blocked_m: float | None = (
+        None  #: height at which an obstacle blocked the vehicle
+    )
     weight_transfer_began_at_s: float | None = None  #: start of the transfer by raw thrust
     motor_stop_commanded_at_s: float | None = None  #: first command to stop the motors
     last_stop_or_land_command_at_s: float | None = None  #: last command to land or to stop motors

@@ -11,7 +11,7 @@ from perchctl.vehicle import EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
 Reason = str | Callable[[Context], str]
-NewOutcome = Outcome | Callable[[Outcome | None], Outcome | None]
+OutcomeAfterTransition = Outcome | Callable[[Outcome | None], Outcome | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Transition:
     to: Phase
     reason: Reason
     severity: Severity = Severity.CONTINUE
-    outcome: NewOutcome | None = None
+    outcome: OutcomeAfterTransition | None = None
     stop_command: EmergencyStop | StopMotors | None = None
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 

@@ -28,7 +28,7 @@ _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
-_MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO = 5.0
+_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # energy per pixel of strong differences that noise alone may cause
 _COMBING_CHECK_INTERVAL_FRAMES = 3
@@ -71,9 +71,7 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(
-        _MIN_ROW_DIFFERENCE_TO_FIELD_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY
-    )
+    least = max(_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)

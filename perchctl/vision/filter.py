@@ -32,7 +32,7 @@ TILTS, PRINT = slice(0, 2), slice(2, 4)
 
 MAX_TRACK_GAP_S = 1.0
 """Longest gap between two frames of a track, s; a longer gap ends the track."""
-MAX_PREDICTION_S = 1.0
+MAX_PREDICTION_DURATION_S = 1.0
 """Longest prediction, s; for a later time, the target is assumed to stay where it was predicted
 after this time."""
 
@@ -104,8 +104,8 @@ class FilterSetup:
             (equation 3).
         max_unseen_frames: frames without a measurement after which a track ends, ``kalman.n_max``
             of the profile.
-        acceleration_noise: process noise that replaces Q; the covariance of each pose then replaces
-            R. If None, Q and R are used.
+        acceleration_process_noise: process noise that replaces Q; the covariance of each pose then
+            replaces R. If None, Q and R are used.
         roll_pitch_bias_sigma_rad: standard deviation of the bias of the vehicle's roll and pitch.
         max_target_speed_mps: upper limit of the target's speed, in the track's frame, while there
             is no measurement. In the world frame it is the frame's drift speed; in the level frame
@@ -124,7 +124,7 @@ class FilterSetup:
     P0: Array
     velocity_factor_per_unseen_frame: float
     max_unseen_frames: int
-    acceleration_noise: ProcessNoise | None = None
+    acceleration_process_noise: ProcessNoise | None = None
     roll_pitch_bias_sigma_rad: float = 0.0
     max_target_speed_mps: float = math.inf
     max_nis_without_restart: float = math.inf
@@ -155,7 +155,7 @@ def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
     return loaded
 
 
-def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
+def make_filter_setup(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
     """Return the filter's parameters. The initial standard deviation of the velocity is 5 cm/s in
     the world frame. In the level frame, it is 30 cm/s, or 1 m/s if ``kalman.noise`` is
     ``measured``."""
@@ -165,9 +165,9 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
     first = np.full(8, config.k1)
     first[RATES] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
     squares = _SI_PER_PAPER_UNIT**2
-    acceleration_noise = None
+    acceleration_process_noise = None
     if measured:
-        acceleration_noise = (
+        acceleration_process_noise = (
             ProcessNoise(
                 config.drift_mps2,
                 _WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2,
@@ -182,7 +182,7 @@ def make_filter(config: KalmanConfig, is_world_frame: bool = False) -> FilterSet
         P0=np.diag(first * squares),
         velocity_factor_per_unseen_frame=config.alpha,
         max_unseen_frames=config.n_max,
-        acceleration_noise=acceleration_noise,
+        acceleration_process_noise=acceleration_process_noise,
         roll_pitch_bias_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         max_target_speed_mps=config.drift_mps if is_world_frame else math.inf,
         # In flight, the gate in `perchctl.vision.tracks` detects jumps of the state estimate.
@@ -209,7 +209,7 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
     track's frame: relative to the gear in level axes, or in the world. The noise grows with the
     target's distance because rotations of the level frame move a distant target further than a
     close one."""
-    noise = setup.acceleration_noise
+    noise = setup.acceleration_process_noise
     if noise is None:
         return setup.Q
     pushed = _acceleration_covariance(noise, target_position_m) * dt_s
@@ -333,7 +333,7 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
 
 def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
     """Return the track predicted to time `t_s`, without a measurement."""
-    dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
+    dt_s = min(t_s - track.t_s, MAX_PREDICTION_DURATION_S)
     if dt_s <= 0.0:
         return track
     return _predict_from_state(track, track.x, dt_s, t_s, track.unseen_frames, setup)

@@ -62,7 +62,7 @@ class MergedTarget:
     stage: VisibleMarkers
 
 
-def measure_markers(
+def estimate_marker_poses(
     detections: Detections,
     attitude: VehicleState | None,
     start_pose: PoseCandidate | None,
@@ -96,12 +96,12 @@ def measure_markers(
         return MarkerPoses(poses, {"joint": joint})
     do_markers_contradict = False
     if not clear and len(singles) == 2:
-        do_markers_contradict = is_pair_inconsistent(
+        do_markers_contradict = are_marker_positions_inconsistent(
             singles["large"], singles["small"], config.disagreement_m
         )
     poses_by_track, one = dict(singles), joint
     if len(singles) == 2:
-        better = choose_better_conditioned(singles["large"], singles["small"])
+        better = choose_more_certain_pose(singles["large"], singles["small"])
         one = joint or better
         if do_markers_contradict:
             poses_by_track = {better.source: better}
@@ -181,7 +181,7 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 # frame's time.
 
 
-UNKNOWN_READOUT_SIGMA_S = 0.012
+READOUT_TIME_SIGMA_IF_UNKNOWN_S = 0.012
 """Standard deviation of a camera's rolling-shutter readout time, s, if the profile does not specify
 it."""
 FLOW_ALONG_SIGMA_FRACTION, FLOW_ACROSS_SIGMA_FRACTION = 0.05, 0.015
@@ -200,7 +200,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
-    late = UNKNOWN_READOUT_SIGMA_S if readout_s is None else readout_s
+    late = READOUT_TIME_SIGMA_IF_UNKNOWN_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
         flow = detections.flow_pxps.get(d.marker)
@@ -257,7 +257,7 @@ def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
     return np.asarray(merged)
 
 
-def is_pair_inconsistent(
+def are_marker_positions_inconsistent(
     large: MarkerPose, small: MarkerPose, max_position_difference_m: float
 ) -> bool:
     """True if the positions from the two markers differ on any axis by more than
@@ -272,7 +272,7 @@ def is_pair_inconsistent(
     return bool((gap > np.maximum(max_position_difference_m, vague)).any())
 
 
-def choose_better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
+def choose_more_certain_pose(large: MarkerPose, small: MarkerPose) -> MarkerPose:
     """Return the pose whose position has the smaller standard deviation."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

@@ -23,14 +23,14 @@ from perchctl.opencv_threads import one_thread
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import classify_interlacing, deinterlace_frame
-from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
+from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter_setup, predict_track
 from perchctl.vision.markers.cut import warm_up_truncated_marker_fit
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_detector_setup
 from perchctl.vision.merge import (
     MergedTarget,
     classify_visible_markers,
-    measure_markers,
+    estimate_marker_poses,
     merge_tracks,
     widen_covariance_for_rival,
 )
@@ -137,8 +137,8 @@ def make_pipeline(
         pose_setup=pose_setup,
         merge=profile.merge,
         track_setup=TrackSetup(
-            level_filter=make_filter(profile.kalman, is_world_frame=False),
-            world_filter=make_filter(profile.kalman, is_world_frame=True),
+            level_filter=make_filter_setup(profile.kalman, is_world_frame=False),
+            world_filter=make_filter_setup(profile.kalman, is_world_frame=True),
             pose_setup=pose_setup,
             is_gate_enabled=profile.kalman.gate,
             own_target=own,
@@ -201,7 +201,7 @@ def step(
         )
         empty = None if first else state.frames_without_markers
         own_target = pipeline.track_setup.own_target
-        measure_own_target_distance_m = partial(
+        measure_marker_to_own_target_distance_m = partial(
             marker_to_own_target_distance_m, own_target, frame.t_s, attitude, pipeline.pose_setup
         )
         with nullcontext() if state.last_detections is None else one_thread():
@@ -212,7 +212,7 @@ def step(
                 pipeline.camera,
                 expected_corners_px,
                 empty,
-                measure_own_target_distance_m,
+                measure_marker_to_own_target_distance_m,
             )
     return step_detections(
         state, detections, attitude, pipeline, start_pose, frame.picture_kind or "whole"
@@ -269,7 +269,7 @@ def step_detections(
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
     )
-    marker_poses = measure_markers(
+    marker_poses = estimate_marker_poses(
         detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose_setup
     )
 

@@ -23,9 +23,9 @@ from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import CameraModel, Detection, MarkerPose, VehicleState
 
 # Combined error of the mounting, the attitude estimate and the ceiling.
-_ATTITUDE_TILT_SIGMA_RAD = math.radians(6.0)
+_TILT_FROM_ATTITUDE_SIGMA_RAD = math.radians(6.0)
 # Change of the tilt between two frames.
-_PREVIOUS_TILT_SIGMA_RAD = math.radians(10.0)
+_TILT_FROM_PREVIOUS_POSE_SIGMA_RAD = math.radians(10.0)
 # If the corners of both markers on a flat sheet have a larger chi-squared per degree of freedom,
 # the sheet may be curled.
 _MIN_SHEET_CURL_CHI2_PER_DOF = 3.0
@@ -106,9 +106,9 @@ def estimate_pose(
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
-        prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_SIGMA_RAD)
+        prior = TiltPrior(-R_level_cam[2], _TILT_FROM_ATTITUDE_SIGMA_RAD)
     else:
-        prior = TiltPrior(previous_target_normal_cam, _PREVIOUS_TILT_SIGMA_RAD)
+        prior = TiltPrior(previous_target_normal_cam, _TILT_FROM_PREVIOUS_POSE_SIGMA_RAD)
     max_rms_reprojection_px = setup.config.max_reprojection_px
     solution = _refine_from_start(points, start, prior, max_rms_reprojection_px) or solve_pose(
         points, prior
@@ -239,8 +239,10 @@ def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) ->
 # --- Rotation and translation from corners: a closed form, then weighted least squares ---
 
 
-_MIN_FLIP_ANGLE_RAD = math.radians(2.0)  # Two solutions that are closer together count as one.
-_MIN_COST_CORNER_SIGMA_PX = 0.05  # Lens and print errors make smaller values meaningless.
+_MIN_ANGLE_BETWEEN_SOLUTIONS_RAD = math.radians(
+    2.0
+)  # Two solutions that are closer together count as one.
+_MIN_CORNER_SIGMA_IN_POSE_COST_PX = 0.05  # Lens and print errors make smaller values meaningless.
 _MAX_GAUSS_NEWTON_STEPS = 8
 # Weight of the standard deviation in the detections relative to the residuals, in degrees of
 # freedom.
@@ -321,7 +323,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
         B, weighed = A, error
         if points.allows_for_sheet_curl:
-            weight = sheet_curl_weight_matrix(_whitened_paper_curl_shift(points, scored))
+            weight = sheet_curl_weight_matrix(_whitened_sheet_curl_shift(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -372,7 +374,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     W = points.whitening_matrix
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
-    curl = _whitened_paper_curl_shift(points, scored)
+    curl = _whitened_sheet_curl_shift(points, scored)
     weight = sheet_curl_weight_matrix(curl) if points.allows_for_sheet_curl else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
@@ -390,7 +392,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     return PoseCovariance(cov, chi2 / freedom, curled)
 
 
-def _whitened_paper_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
+def _whitened_sheet_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
     each mode of the sheet's curl."""
     target_normal_cam = rotation_matrix(scored.rvec_rad)[:, 2]
@@ -457,7 +459,7 @@ def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> lis
     axis = np.cross(normal, other)
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
     angle = math.atan2(sine, cosine)
-    if angle < _MIN_FLIP_ANGLE_RAD or sine < 1e-9:
+    if angle < _MIN_ANGLE_BETWEEN_SOLUTIONS_RAD or sine < 1e-9:
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refine_unweighted(points, PoseCandidate(rvec, scored.tvec_m))
@@ -469,7 +471,7 @@ def _choose_most_likely_pose(
 ) -> ScoredPose:
     if len(scored) == 1:
         return scored[0]
-    sigma = np.maximum(points.sigma_px, _MIN_COST_CORNER_SIGMA_PX)[:, None]
+    sigma = np.maximum(points.sigma_px, _MIN_CORNER_SIGMA_IN_POSE_COST_PX)[:, None]
 
     def cost(s: ScoredPose) -> float:
         total = float(((s.reprojection_error_px / sigma) ** 2).sum())

@@ -38,12 +38,12 @@ class OwnTargetPosition:
     max_distance_m: float = math.inf
 
 
-OwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
+MarkerToOwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
 """Type of functions that return the horizontal distance, m, of a marker with corners (4, 2) px from
 the position of the vehicle's own target, or infinity if the marker is too far away."""
 
 
-_NO_POSE_DISTANCE_M = 1e9
+_ASSUMED_DISTANCE_WITHOUT_POSE_M = 1e9
 """Distance, m, that is assumed for corners that yield no pose yet, for example next to a highlight.
 Such a marker is considered last, but not rejected."""
 
@@ -62,7 +62,7 @@ def marker_to_own_target_distance_m(
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
-        _NO_POSE_DISTANCE_M
+        _ASSUMED_DISTANCE_WITHOUT_POSE_M
         if pose is None
         else horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
     )
@@ -102,8 +102,8 @@ def foreign_target_message(
 
 _IDENTITY_4 = np.eye(4)
 # Errors of the lens and the print: 0.006 deg and 0.03 mm.
-_MIN_MEASUREMENT_COVARIANCE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
-_YAW_FIRST_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
+_MIN_YAW_XYZ_MEASUREMENT_COVARIANCE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
+_XYZ_YAW_TO_YAW_XYZ_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
 def target_level_to_world(
@@ -148,7 +148,7 @@ def make_track_measurement(
         lever_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
         z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
-    if filter_setup.acceleration_noise is None or pose.xyz_yaw_cov is None:
+    if filter_setup.acceleration_process_noise is None or pose.xyz_yaw_cov is None:
         return TrackMeasurement(z)
     noise = pose.xyz_yaw_cov.copy()
     noise[:3, :3] -= pose.shift_per_print_error_sigma_m.dot(pose.shift_per_print_error_sigma_m.T)
@@ -164,7 +164,7 @@ def make_track_measurement(
         noise = turn.dot(noise).dot(turn.T)
         shift_per_bias_sigma[1:] = attitude.R_world_level.dot(shift_per_bias_sigma[1:])
     R = (
-        np.asarray(noise[_YAW_FIRST_INDICES] + _MIN_MEASUREMENT_COVARIANCE)
+        np.asarray(noise[_XYZ_YAW_TO_YAW_XYZ_INDICES] + _MIN_YAW_XYZ_MEASUREMENT_COVARIANCE)
         if is_finite(noise)
         else None
     )

@@ -154,9 +154,9 @@ def update_tracks(
 #
 # If the camera is not on a vehicle, neither its motion nor the number of frames that a recording
 # lacks is known, so a rival is most likely the target from a different viewpoint. The lock then
-# changes when only the rival has been seen for `MIN_ONLY_RIVAL_SEEN_DURATION_S`, if the rival shows
-# both markers or if the locked target never did. A rival that was seen before the target was lost
-# is a second target, and the lock only changes to it after `REACQUIRE_S`.
+# changes when only the rival has been seen for `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S`, if the rival
+# shows both markers or if the locked target never did. A rival that was seen before the target was
+# lost is a second target, and the lock only changes to it after `REACQUIRE_S`.
 #
 # While a rival is seen and the target is not, the target's predicted position may be wrong, so its
 # covariance also covers the rival's position.
@@ -172,21 +172,23 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
-MIN_ONLY_RIVAL_SEEN_DURATION_S = 0.3
+MIN_RIVAL_ALONE_IN_VIEW_DURATION_S = 0.3
 """Time, s, for which a camera without a vehicle must see only the rival before the lock changes to
 it. Larger: after lost frames, a recording is without a target for longer. Smaller: fewer successive
 wrong frames are enough to capture the lock."""
 LOCK_TIMEOUT_S = 10.0
 """Time after which a lock in the world frame expires if the target is not seen, s."""
-MIN_ESTABLISHED_TRACK_FRAMES = 5
+MIN_ESTABLISHED_LOCK_FRAMES = 5
 """If a lock has fewer frames than this, it yields to a rival that was seen more often."""
 
 _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the last pose: that pose may have been wrong"
 )
-_MAX_GATE_CHI2 = 25.0  # With four dimensions, 5 of 100 000 squared distances exceed it by chance.
-_MAX_SAME_RANGE_SIGMAS = 4.0
+_MAX_ACCEPTED_INNOVATION_CHI2 = (
+    25.0  # With four dimensions, 5 of 100 000 squared distances exceed it by chance.
+)
+_MAX_RANGE_DIFFERENCE_SIGMAS = 4.0
 # Errors that no covariance includes (calibration, print, latency): constants and fractions of the
 # range.
 _MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
@@ -254,8 +256,11 @@ def judge_pose(
     rival_misfit = (
         None if rival is None else _compute_innovation(rival.track, frame_pose, filter_setup)
     )
-    theirs = rival_misfit is not None and rival_misfit.squared_mahalanobis <= _MAX_GATE_CHI2
-    if innovation.squared_mahalanobis <= _MAX_GATE_CHI2 and not (
+    theirs = (
+        rival_misfit is not None
+        and rival_misfit.squared_mahalanobis <= _MAX_ACCEPTED_INNOVATION_CHI2
+    )
+    if innovation.squared_mahalanobis <= _MAX_ACCEPTED_INNOVATION_CHI2 and not (
         theirs
         and rival_misfit is not None
         and rival_misfit.log_likelihood_cost < innovation.log_likelihood_cost
@@ -414,7 +419,7 @@ def _is_clearly_consistent(
     residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
     residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))
-    return float(residual @ residual) <= _MAX_GATE_CHI2
+    return float(residual @ residual) <= _MAX_ACCEPTED_INNOVATION_CHI2
 
 
 def _range_m(frame_pose: FramePose) -> float:
@@ -450,7 +455,10 @@ def _matches_last_view(
     seen, jumped = (
         float(((o / unclaimed) ** 2).sum()) for o in (residual, world_innovation_yaw_xyz)
     )
-    calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _MAX_GATE_CHI2
+    calm = (
+        float((residual * residual / (unclaimed**2 + moved * moved)).sum())
+        <= _MAX_ACCEPTED_INNOVATION_CHI2
+    )
     return calm and seen < _MAX_COST_RATIO_TO_ALTERNATIVE * jumped
 
 
@@ -472,7 +480,7 @@ def _matches_previous_track(
         float(((o / unclaimed) ** 2).sum()) for o in (innovation.yaw_xyz, innovation_yaw_xyz)
     )
     return (
-        innovation.squared_mahalanobis <= _MAX_GATE_CHI2
+        innovation.squared_mahalanobis <= _MAX_ACCEPTED_INNOVATION_CHI2
         and before < _MAX_COST_RATIO_TO_ALTERNATIVE * now
     )
 
@@ -502,7 +510,7 @@ def _update_rival(
         abs(float(innovation.yaw_xyz[0])),
         float(innovation.yaw_xyz[3]),
     )
-    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(innovation.S[3, 3])
+    has_different_range = farther_m**2 > _MAX_RANGE_DIFFERENCE_SIGMAS**2 * float(innovation.S[3, 3])
     where = f"{innovation.distance_m:.2f} m away from it"
     if turned_rad > _MIN_RIVAL_ROTATION_TO_REPORT_RAD:
         where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
@@ -522,14 +530,14 @@ def _update_rival(
 
 def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     if (
-        lock.accepted_frame_count < MIN_ESTABLISHED_TRACK_FRAMES
+        lock.accepted_frame_count < MIN_ESTABLISHED_LOCK_FRAMES
         and rival.seen_frame_count > lock.accepted_frame_count
     ):
         return True
     if frame_pose.is_attitude_unknown and _is_rival_likely_target(lock, rival, frame_pose):
         return True
     if (
-        rival.frames_with_both_markers < MIN_ESTABLISHED_TRACK_FRAMES
+        rival.frames_with_both_markers < MIN_ESTABLISHED_LOCK_FRAMES
         or not frame_pose.has_both_markers
     ):
         return False
@@ -548,18 +556,18 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     """True if the rival is most likely the target itself, displaced from the track because the
     camera moved during lost frames. Since the target was last seen, only the rival has been seen
-    for `MIN_ONLY_RIVAL_SEEN_DURATION_S`, in enough frames and with as many markers as the
+    for `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S`, in enough frames and with as many markers as the
     target."""
     if (
         rival.first_seen_at_s < lock.track.t_s
-        or frame_pose.t_s - rival.first_seen_at_s < MIN_ONLY_RIVAL_SEEN_DURATION_S
+        or frame_pose.t_s - rival.first_seen_at_s < MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
     ):
         return False
     if not lock.has_shown_both_markers:
-        return rival.seen_frame_count >= MIN_ESTABLISHED_TRACK_FRAMES
+        return rival.seen_frame_count >= MIN_ESTABLISHED_LOCK_FRAMES
     return (
         frame_pose.has_both_markers
-        and rival.frames_with_both_markers >= MIN_ESTABLISHED_TRACK_FRAMES
+        and rival.frames_with_both_markers >= MIN_ESTABLISHED_LOCK_FRAMES
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
 from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, RestState, Tick
-from perchctl.mission.descent import MAX_LANDING_COMMANDS, MIN_LANDING_COMMANDS
+from perchctl.mission.descent import MAX_LANDING_COMMAND_COUNT, MIN_LANDING_COMMAND_COUNT
 from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
@@ -54,7 +54,7 @@ def landed_after_a_break(rig: Rig, error: type[BaseException] = Broken) -> None:
         rig.fly()
     assert rig.link.said(PositionSetpoint)
     orders_s = rig.link.said(Land)
-    assert 1 <= len(orders_s) <= MAX_LANDING_COMMANDS
+    assert 1 <= len(orders_s) <= MAX_LANDING_COMMAND_COUNT
     assert orders_s[0] >= rig.link.said(PositionSetpoint)[0]
     land = orders(rig)[0]
     assert land.height_m < 0.0
@@ -166,7 +166,7 @@ def test_it_is_bounded() -> None:
     rig.link.motors = False
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
-    assert len(rig.link.said(Land)) == MIN_LANDING_COMMANDS
+    assert len(rig.link.said(Land)) == MIN_LANDING_COMMAND_COUNT
 
 
 def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:

@@ -62,7 +62,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
     state = remembering(
-        state_in(Phase.LANDED, z_m=0.0), dead_reckoning=carried, dead_reckoning_since_s=blind_s
+        state_in(Phase.LANDED, z_m=0.0), dead_reckoning=carried, dead_reckoning_began_at_s=blind_s
     )
     return speed_mps, find_touchdown(context_at(state, obs, profile))
 

@@ -14,8 +14,8 @@ from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
 from perchctl.mission.descent import (
     LANDING_COMMAND_PERIOD_S,
-    MAX_LANDING_COMMANDS,
-    MIN_LANDING_COMMANDS,
+    MAX_LANDING_COMMAND_COUNT,
+    MIN_LANDING_COMMAND_COUNT,
 )
 from perchctl.mission.release import (
     CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
@@ -210,15 +210,15 @@ def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
     assert rig.after(late_s + 0.05) is None
     active = READY | HL_ACTIVE  # also shown where the notify was lost, and nothing lands
     again_s = LANDING_COMMAND_PERIOD_S + 0.01
-    for i in range(1, MIN_LANDING_COMMANDS):
+    for i in range(1, MIN_LANDING_COMMAND_COUNT):
         assert isinstance(rig.after(late_s + i * again_s, supervisor=active), Land)
-    assert rig.after(late_s + MIN_LANDING_COMMANDS * again_s, supervisor=active) is None
+    assert rig.after(late_s + MIN_LANDING_COMMAND_COUNT * again_s, supervisor=active) is None
 
 
 def test_a_landing_is_ordered_a_limited_number_of_times() -> None:
     rig = Rig()
     orders = [rig.poll(1.05 + 0.05 * i, None) for i in range(200)]
-    assert sum(isinstance(c, Land) for c in orders) == MAX_LANDING_COMMANDS
+    assert sum(isinstance(c, Land) for c in orders) == MAX_LANDING_COMMAND_COUNT
     assert not [c for c in orders if c is not None and not isinstance(c, Land)]
 
 
@@ -252,7 +252,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
     landing = remembering(
         IN_AIR,
         phase=Phase.LANDING,
-        stop_or_land_command_count=MIN_LANDING_COMMANDS,
+        stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
         last_stop_or_land_command_at_s=T_S,
     )
     rig = Rig(Idle(), landing)

@@ -46,7 +46,7 @@ def touching(
         "target": target_at(
             BEGIN_S, place_m, (0, 0, HANG_Z_M), last_measured_at_s=BEGIN_S - unseen_s
         ),
-        "imu": ImuMotion(t_s=BEGIN_S, climb_rate_steady_since_s=steady_s),
+        "imu": ImuMotion(t_s=BEGIN_S, climb_rate_became_steady_at_s=steady_s),
     }
     return at(HANG_Z_M, obs=seen, **{"thrust": PRESSED, **changes})(BEGIN_S)
 
@@ -110,7 +110,7 @@ def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     assert not is_contact(touching(), hover_thrust=0.0)
     unanswered = {
         "commanded_raw_thrust": 20000,
-        "thrust_differs_from_command_since_s": BEGIN_S - 1.0,
+        "thrust_began_to_differ_from_command_at_s": BEGIN_S - 1.0,
         "setpoint": None,
     }
     assert not is_contact(touching(), **unanswered)

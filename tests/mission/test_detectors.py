@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    LATERAL_VELOCITY_TIME_CONSTANT_S,
-    MAX_CLIMB_RATE_GAINED_IN_FALL_MPS,
-    MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
-    MAX_STEADY_CLIMB_DEVIATION_MPS,
-    MAX_STEADY_LATERAL_DEVIATION_MPS,
+    FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
+    MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS,
+    MAX_STEADY_CLIMB_RATE_DEVIATION_MPS,
+    MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS,
+    MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S,
     MIN_FREE_FALL_DURATION_S,
     MIN_LATERAL_PUSH_G,
     UP_ACCELERATION_OFFSET_TIME_CONSTANT_S,
@@ -112,7 +112,7 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
 ) -> None:
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
-    late_s = (MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS - MAX_CLIMB_RATE_GAINED_IN_FALL_MPS) / (
+    late_s = (FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS - MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS) / (
         0.8 * falls_mps2
     )
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
@@ -215,19 +215,19 @@ def test_a_constant_speed_is_steady_whatever_it_is(
         t_s += dt_s
         speed = speed.update_steady_speed(t_s, velocity, dt_s)
     assert (
-        t_s - min(speed.climb_rate_steady_since_s, t_s) >= 1.9
-        or abs(climb_mps) <= MAX_STEADY_CLIMB_DEVIATION_MPS
+        t_s - min(speed.climb_rate_became_steady_at_s, t_s) >= 1.9
+        or abs(climb_mps) <= MAX_STEADY_CLIMB_RATE_DEVIATION_MPS
     )
     # The first deviation is from a mean that has moved for one sample.
-    first_mps = abs(aside_mps) * math.exp(-dt_s / LATERAL_VELOCITY_TIME_CONSTANT_S)
+    first_mps = abs(aside_mps) * math.exp(-dt_s / MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S)
     assert (
-        t_s - min(speed.lateral_steady_since_s, t_s) >= 1.0
-        or first_mps <= MAX_STEADY_LATERAL_DEVIATION_MPS + 1e-9
+        t_s - min(speed.lateral_velocity_became_steady_at_s, t_s) >= 1.0
+        or first_mps <= MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS + 1e-9
     )
     jerked = speed.update_steady_speed(
-        t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_DEVIATION_MPS), dt_s
+        t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_RATE_DEVIATION_MPS), dt_s
     )
-    assert jerked.climb_rate_steady_since_s == t_s + dt_s
+    assert jerked.climb_rate_became_steady_at_s == t_s + dt_s
 
 
 # --- Pushes --------------------------------------------------------------------------------------
@@ -276,6 +276,9 @@ def test_the_velocity_turns_with_the_heading(
             motion, last = motion.with_sample(last, now), now
         return motion
 
-    (x, y, z), (tx, ty, tz) = flown(0.0).velocity_gained_mps, flown(heading_rad).velocity_gained_mps
+    (x, y, z), (tx, ty, tz) = (
+        flown(0.0).velocity_since_first_sample_world_mps,
+        flown(heading_rad).velocity_since_first_sample_world_mps,
+    )
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     assert (tx, ty, tz) == pytest.approx((cos * x - sin * y, sin * x + cos * y, z), abs=1e-9)

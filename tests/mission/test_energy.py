@@ -17,7 +17,7 @@ from perchctl.mission.belief.battery import (
     BRUSHLESS_POWER_TRAIN,
     BatteryFit,
     PowerTrain,
-    fit_sag_model,
+    fit_battery_voltage_model,
     update_battery_fit,
 )
 from perchctl.mission.context import Context
@@ -42,10 +42,10 @@ from tests.mission.rig import at, fly
 
 PERIOD_S, MAH = 0.02, 250.0
 BRUSHLESS_MAH = 350.0
-LOW_V = 3.2  # below it, the firmware reports low power after `LOW_POWER_REPORT_DELAY_S`
-LOW_POWER_REPORT_DELAY_S = 5.0
+LOW_V = 3.2  # below it, the firmware reports low power after `FIRMWARE_LOW_POWER_REPORT_DELAY_S`
+FIRMWARE_LOW_POWER_REPORT_DELAY_S = 5.0
 HOVER = HOVER_THRUST / FULL_THRUST
-ATTEMPT_S, LANDING_DURATION_BEYOND_DESCENT_S = 12.0, 10.0
+ATTEMPT_S, EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 12.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def end_of_hover_s(moments: list[Moment], low_v: float = LOW_V) -> float:
     low_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
     least_v = PROFILE.safety.min_load_v
     ends_s = (m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < least_v)
-    return min(low_s + LOW_POWER_REPORT_DELAY_S, next(ends_s, math.inf))
+    return min(low_s + FIRMWARE_LOW_POWER_REPORT_DELAY_S, next(ends_s, math.inf))
 
 
 WEAK = {
@@ -118,12 +118,16 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
             assert (
                 told_s
-                < ATTEMPT_S + LANDING_DURATION_BEYOND_DESCENT_S + PROFILE.safety.energy_reserve_s
+                < ATTEMPT_S
+                + EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S
+                + PROFILE.safety.energy_reserve_s
             )
         if ahead_s > 70.0:  # and one that is safe three times over is
             assert (
                 told_s
-                > ATTEMPT_S + LANDING_DURATION_BEYOND_DESCENT_S + PROFILE.safety.energy_reserve_s
+                > ATTEMPT_S
+                + EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S
+                + PROFILE.safety.energy_reserve_s
             )
 
 
@@ -145,10 +149,10 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
 @given(st.floats(0.4, 0.8))
 def test_the_firmware_reports_low_power_only_after_its_delay(hover: float) -> None:
     """A vehicle whose voltage has just fallen to the limit flies on until the report."""
-    sag_v = fit_sag_model(FINE_BATTERY).full_thrust_sag_v * hover
+    sag_v = fit_battery_voltage_model(FINE_BATTERY).full_thrust_sag_v * hover
     at_limit = replace(FINE_BATTERY, rest_v=LOW_V + sag_v)
     at_least_v = replace(FINE_BATTERY, rest_v=PROFILE.safety.min_load_v + sag_v)
-    for energy, expected_s in ((at_limit, LOW_POWER_REPORT_DELAY_S), (at_least_v, 0.0)):
+    for energy, expected_s in ((at_limit, FIRMWARE_LOW_POWER_REPORT_DELAY_S), (at_least_v, 0.0)):
         hovers = changed({"planner.hover": {"below_m": 0.5, "duration_s": 1.0}})  # no press
         left_s = predict_hover_time_s(energy, hovers, hover, BRUSHED_POWER_TRAIN)
         assert left_s == pytest.approx(expected_s)

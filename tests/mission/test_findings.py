@@ -108,8 +108,8 @@ def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
         dead_reckoning=dead_reckoning, vehicle_world_z_at_last_contact_m=1.9,
-        in_magnet_reach_since_s=BEGIN_S, motor_stop_commanded_at_s=BEGIN_S,
-        dead_reckoning_since_s=BEGIN_S,
+        magnet_reach_entered_at_s=BEGIN_S, motor_stop_commanded_at_s=BEGIN_S,
+        dead_reckoning_began_at_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
     rest = [

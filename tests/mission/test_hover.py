@@ -21,9 +21,9 @@ from perchctl.mission.belief.hover import (
 )
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION,
+    HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION,
     HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
-    ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION,
+    ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION,
     HoverThrust,
 )
 from perchctl.mission.phase import Phase
@@ -63,11 +63,14 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
     settled_s = (
-        12.0 * ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION / drift
+        12.0 * ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION / drift
     )  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
     found = measured(
-        HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION), [true] * steps, 0.02, drift
+        HoverThrust(first, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION),
+        [true] * steps,
+        0.02,
+        drift,
     )
     assert found.thrust == pytest.approx(true, rel=1e-3)
 
@@ -77,14 +80,14 @@ def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: f
     """P = r d for a scalar Kalman filter, within the step of a tick."""
     found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
     assert found.sigma_fraction == pytest.approx(
-        math.sqrt(ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION * drift), rel=0.05
+        math.sqrt(ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION * drift), rel=0.05
     )
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
     """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
-    start = HoverThrust(first, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
+    start = HoverThrust(first, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
     assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
@@ -127,7 +130,7 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
     [
         {"command_history": replace(DESCENDS, floor_detected_at_s=9.9)},
         {"vehicle_world_z_at_last_contact_m": 1.0},  # a magnet may hold it
-        {"in_magnet_reach_since_s": 9.0},
+        {"magnet_reach_entered_at_s": 9.0},
     ],
     ids=["floor", "contact", "reach"],
 )
@@ -179,7 +182,7 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
     later = HoverThrust(50_000.0, sigma).propagate_without_measurement(dt_s)
-    assert sigma <= later.sigma_fraction <= max(sigma, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
+    assert sigma <= later.sigma_fraction <= max(sigma, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    MAX_FROZEN_READING_S,
+    MAX_FROZEN_READING_DURATION_S,
     MAX_TELEMETRY_GAP_S,
     MIN_LATERAL_PUSH_G,
     NO_FUSION_TIMEOUT_S,
@@ -21,8 +21,8 @@ from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_BELOW_TARGET_M,
     MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS,
     DeadReckoning,
-    add_sighting,
     advance_dead_reckoning,
+    restart_dead_reckoning_at_sighting,
 )
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import telemetry
@@ -42,7 +42,10 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert motion.acceleration_frozen_for_s == pytest.approx(2.99)
     assert motion.last_telemetry_gap_ended_at_s == pytest.approx(2.99)
     assert motion.last_fall_at_s < 0.0
-    assert abs(motion.velocity_gained_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
+    assert (
+        abs(motion.velocity_since_first_sample_world_mps[2])
+        < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_DURATION_S
+    )
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.acceleration_frozen_for_s == 0.0
     assert alive.last_fall_at_s > 0.0
@@ -130,7 +133,9 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
     misled, true = flown(flight(True)), flown(flight(False))
     assert true.roll_pitch_error_rad == (0.0, 0.0)
     assert misled.roll_pitch_error_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
-    assert misled.velocity_gained_mps[:2] == pytest.approx(true.velocity_gained_mps[:2], abs=0.04)
+    assert misled.velocity_since_first_sample_world_mps[:2] == pytest.approx(
+        true.velocity_since_first_sample_world_mps[:2], abs=0.04
+    )
 
 
 @given(
@@ -172,14 +177,16 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
     ):
         imu = flown([before])
-        old = add_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
+        old = restart_dead_reckoning_at_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
         new = advance_dead_reckoning(
             old, imu.with_sample(before, after), after, is_estimate_trusted=False
         )
         assert (new.last_gap_in_which_magnet_may_attach_ended_at_s == after.t_s) is unsure
         assert new.gear_below_target_m == (z_m if kept else math.inf)
         assert (
-            add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_gear_below_target_m
+            restart_dead_reckoning_at_sighting(
+                new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001
+            ).gear_below_target_lower_bound_m
             == z_m
         )
 
@@ -188,10 +195,12 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     """It fell by 5 cm, and the setpoint that catches it is a metre above."""
     falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
     motion = flown(falls[:1])
-    dead_reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
+    dead_reckoning = restart_dead_reckoning_at_sighting(
+        DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001
+    )
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
-        assert new is not late or 0.02 < dead_reckoning.min_gear_below_target_m < 0.1
+        assert new is not late or 0.02 < dead_reckoning.gear_below_target_lower_bound_m < 0.1
         motion = motion.with_sample(last, new)
         dead_reckoning = advance_dead_reckoning(
             dead_reckoning, motion, new, is_estimate_trusted=False

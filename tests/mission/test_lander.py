@@ -77,12 +77,12 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
     "onboard": (DECKS, {"link_problem": "gone"}, {}, Land),
     "height": (DECKS, {}, {"is_heading_lost": True}, RawThrust),
     "imu": (
-        BY_TARGET, {"external_position_age_s": 3.0}, {"dead_reckoning_since_s": NOW_S - 1.0},
+        BY_TARGET, {"external_position_age_s": 3.0}, {"dead_reckoning_began_at_s": NOW_S - 1.0},
         RawThrust,
     ),
     "nothing": (
         BY_TARGET, {"external_position_age_s": 3.0, "age_s": 0.6},
-        {"dead_reckoning_since_s": NOW_S - 1.0}, RawThrust,
+        {"dead_reckoning_began_at_s": NOW_S - 1.0}, RawThrust,
     ),
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
@@ -124,7 +124,7 @@ def context(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
         t_s=NOW_S - TICK_S, last_telemetry=sample, dead_reckoned_height_m=z_m,
         vehicle_world_z_at_last_contact_m=z_m if held else None,
-        in_magnet_reach_since_s=NOW_S - 2.0 if held else None,
+        magnet_reach_entered_at_s=NOW_S - 2.0 if held else None,
         dead_reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
@@ -258,8 +258,8 @@ def uncorrected(for_s: float) -> dict[str, Any]:
         (DECKS, {}, uncorrected(0.6), False),
         (DECKS, {}, uncorrected(0.3), True),
         # What once came down blindly, or went astray, believes no sight and no position again.
-        (MOCAP, {"dead_reckoning_since_s": NOW_S - 1.0}, {}, False),
-        (BY_TARGET, {"dead_reckoning_since_s": NOW_S - 1.0}, {}, False),
+        (MOCAP, {"dead_reckoning_began_at_s": NOW_S - 1.0}, {}, False),
+        (BY_TARGET, {"dead_reckoning_began_at_s": NOW_S - 1.0}, {}, False),
         (MOCAP, {"is_position_diverged": True}, {}, False),
         (MOCAP, {"is_position_diverged": True}, {"age_s": 0.6}, False),
     ],
@@ -490,7 +490,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     held = remembering(state, catch_setpoint_height_above_vehicle_m=None)
     assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
-        assert (after.belief.dead_reckoning_since_s is not None) is stale
+        assert (after.belief.dead_reckoning_began_at_s is not None) is stale
 
 
 # --- Where it is, in the end --------------------------------------------------------------------
@@ -499,7 +499,7 @@ UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
 
 
 def ended(
-    in_magnet_reach_since_s: float | None = None,
+    magnet_reach_entered_at_s: float | None = None,
     imu: ImuMotion = UNMOVED,
     dead_reckoning: DeadReckoning = UNRECKONED,
     floor_detected_at_s: float | None = None,
@@ -509,14 +509,15 @@ def ended(
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_commanded_at_s=NOW_S - 1.0,
-        in_magnet_reach_since_s=in_magnet_reach_since_s, floor_detected_at_s=floor_detected_at_s,
+        magnet_reach_entered_at_s=magnet_reach_entered_at_s,
+        floor_detected_at_s=floor_detected_at_s,
         dead_reckoning=replace(dead_reckoning, imu=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, BY_TARGET))
 
 
 @pytest.mark.parametrize(
-    ("in_magnet_reach_since_s", "fell_s", "gap_s", "found"),
+    ("magnet_reach_entered_at_s", "fell_s", "gap_s", "found"),
     [
         (4.0, -math.inf, -math.inf, RestState.HANGS),
         (4.0, 3.0, 3.5, RestState.HANGS),  # before it came there
@@ -527,11 +528,11 @@ def ended(
     ],
 )
 def test_what_was_in_reach_and_has_not_fallen_since_hangs(
-    in_magnet_reach_since_s: float | None, fell_s: float, gap_s: float, found: RestState
+    magnet_reach_entered_at_s: float | None, fell_s: float, gap_s: float, found: RestState
 ) -> None:
     assert (
         ended(
-            in_magnet_reach_since_s,
+            magnet_reach_entered_at_s,
             ImuMotion(
                 t_s=NOW_S, last_fall_at_s=fell_s, last_gap_that_may_hide_fall_ended_at_s=gap_s
             ),
@@ -555,28 +556,28 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
     begun = remembering(
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_command_count=6,
         last_stop_or_land_command_at_s=BEGIN_S,
-        in_magnet_reach_since_s=BEGIN_S - 1.0,
+        magnet_reach_entered_at_s=BEGIN_S - 1.0,
         dead_reckoning=DeadReckoning(gear_below_target_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
-    assert (state.belief.in_magnet_reach_since_s is not None) is (part < 1.0)
+    assert (state.belief.magnet_reach_entered_at_s is not None) is (part < 1.0)
 
 
-@pytest.mark.parametrize("in_magnet_reach_since_s", [None, NOW_S - 2.0])
+@pytest.mark.parametrize("magnet_reach_entered_at_s", [None, NOW_S - 2.0])
 def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
-    in_magnet_reach_since_s: float | None,
+    magnet_reach_entered_at_s: float | None,
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
     silence = DeadReckoning(last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S - 3.0)
-    assert ended(in_magnet_reach_since_s, dead_reckoning=silence) is RestState.UNKNOWN
+    assert ended(magnet_reach_entered_at_s, dead_reckoning=silence) is RestState.UNKNOWN
     assert (
-        ended(in_magnet_reach_since_s, dead_reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
+        ended(magnet_reach_entered_at_s, dead_reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
         is RestState.STANDS
     )
     seen = replace(silence, last_sighting_at_s=NOW_S - 2.5)
-    told = RestState.STANDS if in_magnet_reach_since_s is None else RestState.HANGS
-    assert ended(in_magnet_reach_since_s, dead_reckoning=seen) is told
+    told = RestState.STANDS if magnet_reach_entered_at_s is None else RestState.HANGS
+    assert ended(magnet_reach_entered_at_s, dead_reckoning=seen) is told
 
 
 @pytest.mark.parametrize(
@@ -638,15 +639,15 @@ BITS = st.lists(BIT, min_size=1, max_size=5)
 REMEMBERED = st.sampled_from(
     [
         {},
-        {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "in_magnet_reach_since_s": 9.0},
+        {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "magnet_reach_entered_at_s": 9.0},
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
-            "in_magnet_reach_since_s": 9.0,
+            "magnet_reach_entered_at_s": 9.0,
             "weight_transfer_began_at_s": 9.9,
         },
         {
             "vehicle_world_z_at_last_contact_m": HANG_Z_M,
-            "in_magnet_reach_since_s": 9.0,
+            "magnet_reach_entered_at_s": 9.0,
             "weight_transfer_began_at_s": 9.0,
             "motor_stop_commanded_at_s": 9.8,
             "stop_or_land_command_count": 2,
@@ -654,7 +655,7 @@ REMEMBERED = st.sampled_from(
         {"catch_setpoint_height_above_vehicle_m": 1.0},
         {"must_end_press": True},
         {"hover_thrust": 0.0},
-        {"dead_reckoning_since_s": 9.0, "dead_reckoned_height_m": 1.0},
+        {"dead_reckoning_began_at_s": 9.0, "dead_reckoned_height_m": 1.0},
     ]
 )
 

@@ -297,7 +297,7 @@ def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
         (ascending(), {"camera_imu_mismatch": late}, False),
     ):
         ticks = fly(state, lambda t_s, c=changes: observation(t_s, Z_M, **c), 0.5).ticks
-        assert (ticks[-1].state.belief.lateral_state is not None) is known
+        assert (ticks[-1].state.belief.lateral_offset_and_velocity is not None) is known
 
 
 @AGAIN

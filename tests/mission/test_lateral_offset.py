@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from perchctl.mission.belief.lateral_offset import (
     MAX_AGE_OF_NEWEST_PICTURE_S,
     MAX_VELOCITY_SIGMA_TO_PREDICT_MPS,
+    LateralMotionSample,
+    LateralOffsetAndVelocity,
     LateralOffsetFilter,
-    LateralState,
     LateralVector,
-    MotionSample,
 )
 
 AGAIN = settings(max_examples=20)
@@ -62,7 +62,7 @@ def watch(
         bias = acceleration_bias_mps2
         acceleration_mps2 = (a_x + bias, a_y + bias)
         velocity_mps = (v_x + velocity_error_mps, v_y + velocity_error_mps)
-        filtered = filtered.with_sample(MotionSample(t_s, acceleration_mps2, velocity_mps))
+        filtered = filtered.with_sample(LateralMotionSample(t_s, acceleration_mps2, velocity_mps))
         while pictures and pictures[0] + latency_s <= t_s:
             exposure_s = pictures.pop(0)
             if exposure_s <= last_picture_s:
@@ -74,7 +74,7 @@ def watch(
     return filtered
 
 
-def known(filtered: LateralOffsetFilter, t_s: float) -> LateralState:
+def known(filtered: LateralOffsetFilter, t_s: float) -> LateralOffsetAndVelocity:
     found = filtered.predict(t_s)
     assert found is not None
     return found
@@ -179,7 +179,7 @@ def test_a_step_of_the_pose_is_no_velocity() -> None:
 def test_a_picture_or_sample_from_the_past_changes_nothing() -> None:
     filtered = watch(swaying(0.005, 1.7, 0.0), 1.0)
     assert filtered.with_picture_measurement(filtered.t_s, (1.0, 1.0), 0.001) is filtered
-    assert filtered.with_sample(MotionSample(1.0, (9.0, 9.0), (9.0, 9.0))) is filtered
+    assert filtered.with_sample(LateralMotionSample(1.0, (9.0, 9.0), (9.0, 9.0))) is filtered
 
 
 @AGAIN

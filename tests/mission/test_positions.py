@@ -13,7 +13,7 @@ from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import current_gear_to_target
 from perchctl.mission.belief.quality import MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.descent import MIN_LANDING_COMMANDS
+from perchctl.mission.descent import MIN_LANDING_COMMAND_COUNT
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -183,7 +183,10 @@ class Hangs(Motors):
 
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
-    held = {"vehicle_world_z_at_last_contact_m": HANG_Z_M, "in_magnet_reach_since_s": BEGIN_S - 5.0}
+    held = {
+        "vehicle_world_z_at_last_contact_m": HANG_Z_M,
+        "magnet_reach_entered_at_s": BEGIN_S - 5.0,
+    }
     return remembering(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
@@ -256,7 +259,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
         state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, vehicle_world_z_at_last_contact_m=0.6,
         weight_transfer_began_at_s=9.0,
         motor_stop_commanded_at_s=9.9, position_last_stale_at_s=BEGIN_S,
-        in_magnet_reach_since_s=8.0,
+        magnet_reach_entered_at_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -274,7 +277,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     [
         ({}, Phase.PERCHED),
         (
-            {"vehicle_world_z_at_last_contact_m": None, "in_magnet_reach_since_s": None},
+            {"vehicle_world_z_at_last_contact_m": None, "magnet_reach_entered_at_s": None},
             Phase.LANDED,
         ),
     ],
@@ -530,7 +533,7 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(
         state_in(Phase.LANDING),
-        stop_or_land_command_count=MIN_LANDING_COMMANDS,
+        stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
         last_stop_or_land_command_at_s=BEGIN_S,
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)

@@ -350,7 +350,7 @@ CASES: dict[str, Case] = {
         state={
             "outcome": O.SAFETY, "motor_stop_commanded_at_s": BEGIN_S,
             "vehicle_world_z_at_last_contact_m": CONTACT_Z_M,
-            "in_magnet_reach_since_s": BEGIN_S - 1.0,
+            "magnet_reach_entered_at_s": BEGIN_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),

@@ -20,7 +20,7 @@ from perchctl.mission.belief.belief import (
 )
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import (
-    BRAKE_GAIN_RAD_PER_MPS,
+    BRAKE_TILT_GAIN_RAD_PER_MPS,
     MAX_BRAKE_TILT_RAD,
     SINK_RATE_SETPOINT_MPS,
 )
@@ -67,7 +67,7 @@ def blinded(
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
     dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
     state = remembering(
-        state_in(Phase.LANDING, z_m=z_m), dead_reckoning_since_s=BEGIN_S,
+        state_in(Phase.LANDING, z_m=z_m), dead_reckoning_began_at_s=BEGIN_S,
         dead_reckoned_height_m=z_m, severity=Severity.LAND, dead_reckoning=dead_reckoning,
     )  # fmt: skip
     return remembering(state, **changes)  # type: ignore[arg-type]
@@ -165,7 +165,7 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     speed_mps = math.hypot(vx_mps, vy_mps)
     assert max(abs(ahead), abs(left)) <= MAX_BRAKE_TILT_RAD + 1e-9
     assert x * vx_mps + y * vy_mps <= -0.1 * min(speed_mps, 1.0) * speed_mps
-    if speed_mps * BRAKE_GAIN_RAD_PER_MPS < MAX_BRAKE_TILT_RAD:
+    if speed_mps * BRAKE_TILT_GAIN_RAD_PER_MPS < MAX_BRAKE_TILT_RAD:
         assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
 
 
@@ -215,9 +215,9 @@ def test_a_landing_that_loses_it_goes_on_blindly() -> None:
     ordered = at(obs={"operator_request": OperatorRequest.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
     assert state.phase is Phase.LANDING
-    assert state.belief.dead_reckoning_since_s is None
+    assert state.belief.dead_reckoning_began_at_s is None
     state, command = step_mission(state, unseen(0.9, for_s=LAND_S + 0.1)(BEGIN_S + 2.0), PROFILE)
-    assert state.belief.dead_reckoning_since_s is not None
+    assert state.belief.dead_reckoning_began_at_s is not None
     assert isinstance(command, RawThrust)
 
 
@@ -231,7 +231,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     state = remembering(
         state_in(Phase.LANDING, z_m=1.9), vehicle_world_z_at_last_contact_m=1.9,
         weight_transfer_began_at_s=BEGIN_S - 1.0,
-        in_magnet_reach_since_s=BEGIN_S - 6.0, dead_reckoning_since_s=BEGIN_S - 3.0,
+        magnet_reach_entered_at_s=BEGIN_S - 6.0, dead_reckoning_began_at_s=BEGIN_S - 3.0,
         dead_reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
             lateral_velocity_missed_by_estimate_mps=(x_mps, y_mps),

@@ -264,9 +264,9 @@ def test_pictures_that_show_it_below_its_contact_clear_that() -> None:
         vehicle,
         5.0,
         vehicle_world_z_at_last_contact_m=HANG_Z_M,
-        in_magnet_reach_since_s=BEGIN_S - 1.5,
+        magnet_reach_entered_at_s=BEGIN_S - 1.5,
     )
     assert vehicle.state is not None
     assert vehicle.state.belief.vehicle_world_z_at_last_contact_m is None
-    assert vehicle.state.belief.dead_reckoning_since_s is not None
-    assert vehicle.state.belief.dead_reckoning_since_s < BEGIN_S + 4.0
+    assert vehicle.state.belief.dead_reckoning_began_at_s is not None
+    assert vehicle.state.belief.dead_reckoning_began_at_s < BEGIN_S + 4.0

@@ -21,7 +21,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, TARGET_CONTACT
 from perchctl.mission.descent import (
-    MAX_ASSUMED_HEIGHT_DRIFT_M,
+    MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M,
     ONBOARD_LANDING_DURATION_MARGIN_S,
     ONBOARD_LANDING_PEAK_SPEED_MPS,
     make_onboard_landing_command,
@@ -440,7 +440,7 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     pressing = landing(phase=Phase.PERCH, condition_start_times_s={TARGET_CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
-    obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_rate_steady_since_s=steady_s))
+    obs = observation(10.02, telemetry=tel, imu=ImuMotion(climb_rate_became_steady_at_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
     assert (after.belief.gear_to_target_at_last_contact is not None) is touched
@@ -506,7 +506,7 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     """The supervisor's word, or the thrust, reads as before the stop. Nothing spins up again."""
     stopped = hanging(
         Phase.COMPLETE,
-        in_magnet_reach_since_s=9.0,
+        magnet_reach_entered_at_s=9.0,
         weight_transfer_began_at_s=9.0,
         motor_stop_commanded_at_s=10.0,
         last_stop_or_land_command_at_s=10.0,
@@ -646,7 +646,7 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
     order = make_onboard_landing_command(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MAX_ASSUMED_HEIGHT_DRIFT_M, config.drift_mps * flown_s)
+    drift_m = min(MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
     assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_DURATION_MARGIN_S) == pytest.approx(

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase
 from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
 from perchctl.mission.phases.recover import STEADY_AFTER_ATTEMPT
-from perchctl.mission.setpoints import MAX_LATERAL_INTEGRAL_M, MAX_SPEED_HOVERING_IN_PLACE_MPS
+from perchctl.mission.setpoints import (
+    MAX_LATERAL_INTEGRAL_SHIFT_M,
+    MAX_SPEED_TO_COUNT_AS_HOVERING_MPS,
+)
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import BY_TARGET, MOCAP, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Look, at, fly
@@ -81,11 +84,13 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
     x_m, y_m = flight.state.lateral_integral_m
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
-    assert along_m == pytest.approx(-min(gain * lateral_offset_m, MAX_LATERAL_INTEGRAL_M), rel=0.1)
+    assert along_m == pytest.approx(
+        -min(gain * lateral_offset_m, MAX_LATERAL_INTEGRAL_SHIFT_M), rel=0.1
+    )
 
 
 @BRIEFLY
-@given(flown_mps=st.floats(2.0 * MAX_SPEED_HOVERING_IN_PLACE_MPS, 0.5))
+@given(flown_mps=st.floats(2.0 * MAX_SPEED_TO_COUNT_AS_HOVERING_MPS, 0.5))
 def test_an_offset_on_the_way_is_not_trimmed(flown_mps: float) -> None:
     flight = fly(state_in(Phase.ALIGN), blown(0.3, 0.0, 0.0, flown_mps), 0.4, MOCAP)
     assert flight.state.phase is Phase.ALIGN

@@ -29,7 +29,7 @@ from perchctl.vision.filter import (
     X,
     Y,
     Z,
-    make_filter,
+    make_filter_setup,
     start_track,
     step_track,
 )
@@ -39,12 +39,12 @@ from perchctl.vision.types import MarkerTrack
 from tests.helpers.seen import seen_from
 
 CONFIG = KalmanConfig(noise="fixed")
-SETUP = make_filter(CONFIG)
+SETUP = make_filter_setup(CONFIG)
 H = np.eye(8)[MEASURED]
 
 
 def test_gains_are_the_papers_units_in_si() -> None:
-    setup = make_filter(KalmanConfig(k1=0.09, k2=0.01, noise="fixed"))
+    setup = make_filter_setup(KalmanConfig(k1=0.09, k2=0.01, noise="fixed"))
     assert np.allclose(np.sqrt(np.diag(setup.R)), [math.radians(0.3), 0.003, 0.003, 0.003])
     assert np.allclose(np.sqrt(np.diag(setup.Q))[[X, VX, YAW]], [0.001, 0.001, math.radians(0.1)])
     assert np.count_nonzero(setup.R - np.diag(np.diag(setup.R))) == 0
@@ -65,7 +65,7 @@ steps = st.lists(
 @given(steps=steps, k1=st.floats(0.001, 1.0), k2=st.floats(0.0001, 0.1))
 @settings(max_examples=60, deadline=None)
 def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> None:
-    setup = make_filter(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85, noise="fixed"))
+    setup = make_filter_setup(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85, noise="fixed"))
     z0 = np.array([0.1, 0.2, -0.1, 0.5])
     track: MarkerTrack | None = start_track(TrackMeasurement(z0), 0.0, setup)
     x, P, t = np.zeros(8), setup.P0.copy(), 0.0
@@ -154,7 +154,7 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     jump_m: tuple[float, float, float], velocity_mps: tuple[float, float, float]
 ) -> None:
     """The track restarts at the jump, and covers where it was predicted until it is confirmed."""
-    setup, R = make_filter(KalmanConfig()), np.diag([1e-3, 1e-3, 1e-3, 1e-3]) ** 2
+    setup, R = make_filter_setup(KalmanConfig()), np.diag([1e-3, 1e-3, 1e-3, 1e-3]) ** 2
     place, jump = np.array([0.1, 0.2, -0.1, 0.6]), np.array([0.0, *jump_m])
     steps = np.array([0.0, *velocity_mps]) / 30.0
     track: MarkerTrack | None = None
@@ -169,7 +169,7 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     confirmed = step_track(track, TrackMeasurement(jumped + steps, R), 21 / 30.0, setup)
     assert np.sqrt(confirmed.P.diagonal()[POSITION]).max() < 0.002
     # In the world of a state estimate a camera's motion is known.
-    world, there = make_filter(KalmanConfig(), is_world_frame=True), None
+    world, there = make_filter_setup(KalmanConfig(), is_world_frame=True), None
     for k in range(20):
         there = step_track(there, TrackMeasurement(place, R), k / 30.0, world)
     there = step_track(there, TrackMeasurement(place + jump, R), 20 / 30.0, world)
@@ -295,8 +295,8 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
 def test_filterpy_is_loaded_with_the_setup_so_that_no_frame_waits_for_it() -> None:
     code = (
         "import sys; from perchctl.profile import KalmanConfig\n"
-        "from perchctl.vision.filter import make_filter\n"
-        "before = 'filterpy' in sys.modules; make_filter(KalmanConfig())\n"
+        "from perchctl.vision.filter import make_filter_setup\n"
+        "before = 'filterpy' in sys.modules; make_filter_setup(KalmanConfig())\n"
         "print(before, 'filterpy' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -22,12 +22,12 @@ from perchctl.vision import (
     VehicleState,
     estimate,
 )
-from perchctl.vision.filter import TrackMeasurement, X, make_filter
+from perchctl.vision.filter import TrackMeasurement, X, make_filter_setup
 from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
     LOCK_TIMEOUT_S,
-    MIN_ESTABLISHED_TRACK_FRAMES,
-    MIN_ONLY_RIVAL_SEEN_DURATION_S,
+    MIN_ESTABLISHED_LOCK_FRAMES,
+    MIN_RIVAL_ALONE_IN_VIEW_DURATION_S,
     REACQUIRE_S,
     FramePose,
     _is_clearly_consistent,
@@ -129,7 +129,7 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     assert all(measured(watch.show(LOCKED)))
     decoy = DECOYS[name]
     lasts = watch.in_world or "markers" in decoy
-    outputs = watch.show(72 if lasts else int(MIN_ONLY_RIVAL_SEEN_DURATION_S * HZ), **decoy)
+    outputs = watch.show(72 if lasts else int(MIN_RIVAL_ALONE_IN_VIEW_DURATION_S * HZ), **decoy)
     assert all(output.poses for output in outputs)  # it was seen
     assert not any(measured(outputs))
     assert all(o.lock_note.startswith("not the tracked target: ") for o in outputs)
@@ -164,7 +164,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     sight = FramePose(
         0.03, pose, TrackMeasurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
     )
-    constants = make_filter(KalmanConfig(), is_world_frame=True)
+    constants = make_filter_setup(KalmanConfig(), is_world_frame=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
     lock = TargetLock(
         track=track,
@@ -190,11 +190,13 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     measured = TrackMeasurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
     sight = FramePose(0.1, pose, measured, in_world, True)
     lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
-    verdict = judge_pose(lock, None, sight, make_filter(KalmanConfig(), in_world))
+    verdict = judge_pose(lock, None, sight, make_filter_setup(KalmanConfig(), in_world))
     assert verdict.is_accepted is (x_m == -0.02 and not in_world)
     assert verdict.restarts_at_locked_target is verdict.is_accepted
     again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
-    assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).is_accepted
+    assert not judge_pose(
+        again, None, sight, make_filter_setup(KalmanConfig(), in_world)
+    ).is_accepted
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:
@@ -205,7 +207,7 @@ def test_without_the_gate_all_of_them_steer(build: Build) -> None:
 
 def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
     watch.show(LOCKED)
-    while_s = REACQUIRE_S if watch.in_world else MIN_ONLY_RIVAL_SEEN_DURATION_S
+    while_s = REACQUIRE_S if watch.in_world else MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
     outputs = watch.show(int(1.2 * while_s * HZ) + 2, away_m=(0.3, 0.0, 0.0))
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2
@@ -319,8 +321,8 @@ def test_a_clock_that_was_set_back_begins_anew(watch: Watch) -> None:
 def test_both_markers_overrule_a_lock_on_one(watch: Watch) -> None:
     """What was locked on was perhaps never the target."""
     watch.show(20, markers=("large",), scale=0.5)
-    outputs = watch.show(MIN_ESTABLISHED_TRACK_FRAMES + 1)
-    assert measured(outputs) == [False] * (MIN_ESTABLISHED_TRACK_FRAMES - 1) + [True] * 2
+    outputs = watch.show(MIN_ESTABLISHED_LOCK_FRAMES + 1)
+    assert measured(outputs) == [False] * (MIN_ESTABLISHED_LOCK_FRAMES - 1) + [True] * 2
 
 
 def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:

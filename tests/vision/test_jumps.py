@@ -15,7 +15,7 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.vision import MARKERS, Pipeline, PipelineState, VehicleState
 from perchctl.vision.pipeline import step_detections
-from perchctl.vision.tracks import MIN_ONLY_RIVAL_SEEN_DURATION_S
+from perchctl.vision.tracks import MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -180,7 +180,7 @@ def test_no_vaguer_track_excuses_a_jump(build: Build, hz: float, away_m: float) 
     jump_m = away_m * np.array([0.5, 0.866, 0.0])
     told = claims(build(), Scene("target", jump_m, hz, 1.0, 0.4, ("large",), 0.1), in_flight=False)
     assert not any(
-        claim.measured for claim in told if claim.after_s < MIN_ONLY_RIVAL_SEEN_DURATION_S
+        claim.measured for claim in told if claim.after_s < MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
     )
 
 
@@ -238,7 +238,9 @@ def test_the_spread_after_lost_frames_is_true(
             scene = Scene("camera", np.array(jump_m), hz, 0.45, 0.3, MARKERS, sigma_px)
             told = claims(setup, scene, in_flight=False)
             again = [
-                claim for claim in told if claim.after_s > MIN_ONLY_RIVAL_SEEN_DURATION_S + 2.0 / hz
+                claim
+                for claim in told
+                if claim.after_s > MIN_RIVAL_ALONE_IN_VIEW_DURATION_S + 2.0 / hz
             ]
             squared += [((c.off_m / c.sigma_m) ** 2).mean() for c in again if c.measured]
     assert len(squared) > 100

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import Profile, WeightsConfig
 from perchctl.vision import MarkerPose, PipelineState, deinterlace, make_pipeline, step
-from perchctl.vision.merge import is_pair_inconsistent, merge_xyz_yaw
+from perchctl.vision.merge import are_marker_positions_inconsistent, merge_xyz_yaw
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -58,10 +58,10 @@ def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> 
 
 def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:
     sure = pose((0.0, 0.0, 0.5))
-    assert not is_pair_inconsistent(sure, pose((0.0, 0.029, 0.5), name="small"), 0.03)
-    assert is_pair_inconsistent(sure, pose((0.0, 0.031, 0.5), name="small"), 0.03)
-    assert is_pair_inconsistent(sure, pose((0.0, 0.0, 0.54), name="small"), 0.03)
-    assert not is_pair_inconsistent(sure, pose((0.0, 0.0, 0.54), 0.02, "small"), 0.03)
+    assert not are_marker_positions_inconsistent(sure, pose((0.0, 0.029, 0.5), name="small"), 0.03)
+    assert are_marker_positions_inconsistent(sure, pose((0.0, 0.031, 0.5), name="small"), 0.03)
+    assert are_marker_positions_inconsistent(sure, pose((0.0, 0.0, 0.54), name="small"), 0.03)
+    assert not are_marker_positions_inconsistent(sure, pose((0.0, 0.0, 0.54), 0.02, "small"), 0.03)
 
 
 # --- A rolling shutter's corners, brought to one moment ----------------------------------------

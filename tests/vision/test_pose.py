@@ -36,8 +36,8 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.filter import PRINT, make_filter
-from perchctl.vision.merge import is_pair_inconsistent
+from perchctl.vision.filter import PRINT, make_filter_setup
+from perchctl.vision.merge import are_marker_positions_inconsistent
 from perchctl.vision.pose import target_normal_cam
 from perchctl.vision.target_selection import make_track_measurement
 from perchctl.vision.types import Detection
@@ -321,14 +321,14 @@ def test_a_wrong_print_excuses_no_gap_between_the_markers() -> None:
     large = solved(["large"], setup, place)
     smaller = solved(["small"], setup, (0.0, 0.0, 1.0, 0.0, 0.05, -0.04))
     assert np.abs(large.e_m - smaller.e_m).max() < 4.0 * large.sigma_m.max()
-    assert is_pair_inconsistent(large, smaller, 0.03)
+    assert are_marker_positions_inconsistent(large, smaller, 0.03)
 
 
 def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     """They do not change from frame to frame: no filter trusts a pose less for them, and no
     number of frames takes them away."""
     true, doubtful = setup_of(size_sigma=0.0, curl_per_m=0.0), setup_of(size_sigma=0.02)
-    constants = make_filter(KalmanConfig())
+    constants = make_filter_setup(KalmanConfig())
     known, told = (
         make_track_measurement(solved(["large", "small"], setup), None, False, constants, setup)
         for setup in (true, doubtful)

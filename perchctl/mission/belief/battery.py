@@ -3,11 +3,11 @@
 A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
 voltage as a function of its charge (`DISCHARGE_CURVE_REST_VOLTAGES_V`) and the current at full
 thrust (`PowerTrain`). Two parameters are fitted by least squares with exponential forgetting: the
-voltage sag at full thrust, and `true_to_counted_discharge_ratio`, the discharge rate of this
-battery divided by the rate calculated from the assumed current:
+voltage sag at full thrust, and `true_to_coulomb_counted_discharge_ratio`, the discharge rate of
+this battery divided by the rate calculated from the assumed current:
 
     reading = rest voltage(charge) - sag * load
-    d charge / dt = -true_to_counted_discharge_ratio * load * current / capacity
+    d charge / dt = -true_to_coulomb_counted_discharge_ratio * load * current / capacity
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ FULL_THRUST_SAG_SIGMA_V = 0.3
 worn battery."""
 MIN_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
-TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.1
+TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 1.1
 """Discharge rate of a typical battery, divided by the rate calculated from the assumed current."""
-TRUE_TO_COUNTED_DISCHARGE_RATIO_SIGMA = 0.3
+TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_SIGMA = 0.3
 """Standard deviation of the ratio of true to calculated discharge between batteries."""
-MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO = 1.0
+MIN_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 1.0
 """Lower bound of the fitted ratio of true to calculated discharge."""
-MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO = 3.0
+MAX_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 3.0
 """Upper bound of the fitted ratio of true to calculated discharge."""
 ONE_SECOND_MEAN_VOLTAGE_SIGMA_V = 0.02
 """Standard deviation of the mean of the voltage readings over one second, V."""
-BATTERY_FIT_TIME_CONSTANT_S = 40.0
+BATTERY_FIT_FORGETTING_TIME_CONSTANT_S = 40.0
 """Time constant with which the fit forgets old readings, s. Larger: the fit adapts too slowly to a
 change in temperature."""
 REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
@@ -88,7 +88,7 @@ MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
 """Smallest load, as a fraction of full thrust, at which a reading contributes to the fitted sag."""
 MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
 """Total time of readings under load that an estimate requires, s."""
-LOW_POWER_REPORT_DELAY_S = 5.0
+FIRMWARE_LOW_POWER_REPORT_DELAY_S = 5.0
 """Time below the low-power voltage after which the firmware reports low power, s (from the power
 management in the firmware source). Larger: perchctl starts attempts that the battery cannot
 finish."""
@@ -96,19 +96,20 @@ MAX_BATTERY_READING_AGE_S = 1.0
 """Age beyond which a voltage reading is no longer used, s."""
 
 
-class SagModel(NamedTuple):
+class BatteryVoltageModel(NamedTuple):
     """The two fitted parameters of the battery model: the voltage sag at full thrust, V, and the
     true discharge rate divided by the rate calculated from the assumed current."""
 
     full_thrust_sag_v: float
-    true_to_counted_discharge_ratio: float
+    true_to_coulomb_counted_discharge_ratio: float
 
 
 class NormalEquationSums(NamedTuple):
     """Weighted sums over the voltage readings: the normal equations of the least-squares fit.
 
     The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
-    `TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO` predict. The fit models this error as a sum of two
+    `TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO` predict. The fit models this error as a sum of
+    two
     products: the thrust, as a fraction of full thrust, times the deviation of the sag from its
     typical value; and the drop of the resting voltage since take-off, V, calculated from the
     assumed current, times the deviation of the discharge ratio.
@@ -240,7 +241,7 @@ def update_battery_fit(
         if state.rest_v is None:
             return state
         spent = (
-            fit_sag_model(state).true_to_counted_discharge_ratio
+            fit_battery_voltage_model(state).true_to_coulomb_counted_discharge_ratio
             * state.lagged_thrust_fraction
             * full_thrust_discharge_fraction_per_s(battery_capacity_mah, power_train)
             * dt_s
@@ -267,7 +268,10 @@ def update_battery_fit(
         state = replace(
             state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
         )
-    now_v = battery_v + fit_sag_model(state).full_thrust_sag_v * state.lagged_thrust_fraction
+    now_v = (
+        battery_v
+        + fit_battery_voltage_model(state).full_thrust_sag_v * state.lagged_thrust_fraction
+    )
     rest_v = (
         now_v
         if state.rest_v is None
@@ -276,22 +280,24 @@ def update_battery_fit(
     return replace(state, rest_v=rest_v)
 
 
-def fit_sag_model(state: BatteryFit) -> SagModel:
+def fit_battery_voltage_model(state: BatteryFit) -> BatteryVoltageModel:
     """Return the sag model that fits the readings best: least squares, regularized by the typical
     values and bounded."""
     a, b, c, p, q = state.normal_equation_sums
     a += FULL_THRUST_SAG_SIGMA_V**-2
-    c += TRUE_TO_COUNTED_DISCHARGE_RATIO_SIGMA**-2
+    c += TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_SIGMA**-2
     det = a * c - b * b
     sag_v = TYPICAL_FULL_THRUST_SAG_V + (c * p - b * q) / det
-    true_to_counted_discharge_ratio = (
-        TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO + (a * q - b * p) / det
+    true_to_coulomb_counted_discharge_ratio = (
+        TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO + (a * q - b * p) / det
     )
-    return SagModel(
+    return BatteryVoltageModel(
         max(MIN_FULL_THRUST_SAG_V, sag_v),
         min(
-            MAX_TRUE_TO_COUNTED_DISCHARGE_RATIO,
-            max(MIN_TRUE_TO_COUNTED_DISCHARGE_RATIO, true_to_counted_discharge_ratio),
+            MAX_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO,
+            max(
+                MIN_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO, true_to_coulomb_counted_discharge_ratio
+            ),
         ),
     )
 
@@ -335,11 +341,11 @@ def _add_voltage_reading_to_sums(
         state.takeoff_rest_v
         - battery_v
         - TYPICAL_FULL_THRUST_SAG_V * state.lagged_thrust_fraction
-        - TYPICAL_TRUE_TO_COUNTED_DISCHARGE_RATIO * spent_v
+        - TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO * spent_v
     )
     weight, keep = (
         dt_s / ONE_SECOND_MEAN_VOLTAGE_SIGMA_V**2,
-        math.exp(-dt_s / BATTERY_FIT_TIME_CONSTANT_S),
+        math.exp(-dt_s / BATTERY_FIT_FORGETTING_TIME_CONSTANT_S),
     )
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
     return NormalEquationSums(

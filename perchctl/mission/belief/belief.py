@@ -15,7 +15,7 @@ from typing import Any
 from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.lateral_offset import LateralOffsetFilter, LateralState
+from perchctl.mission.belief.lateral_offset import LateralOffsetAndVelocity, LateralOffsetFilter
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.motion import ZERO_VECTOR, ImuMotion, Vector
 from perchctl.mission.belief.mounting import CameraMountingMonitor
@@ -27,13 +27,13 @@ from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
-POSITION_SETTLING_TIME_AFTER_GAP_S = 0.5
+ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S = 0.5
 """Time that the state estimate needs to converge once positions return after a gap, s. Smaller: the
 estimate is trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """Largest age of the newest external position, in addition to the camera's latency, at which it
 still corrects the estimated velocity, s: three pictures at 30 per second. Larger:
-`has_uncorrected_gust` detects an impact later."""
+`is_estimate_missing_gust` detects an impact later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
 """Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
 flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
@@ -93,8 +93,8 @@ class Belief:
     #: heading is so wrong that position control would move the vehicle away from its setpoint
     is_heading_lost: bool = False
     #: time at which the belief switched to accelerometer and attitude alone
-    dead_reckoning_since_s: float | None = None
-    #: height above the ground, integrated since `dead_reckoning_since_s`
+    dead_reckoning_began_at_s: float | None = None
+    #: height above the ground, integrated since `dead_reckoning_began_at_s`
     dead_reckoned_height_m: float = 0.0
 
     # --- motion, target and contact ---
@@ -113,7 +113,7 @@ class Belief:
     vehicle_world_z_at_last_contact_m: float | None = None
     gear_to_target_at_last_contact: GearToTargetDistance | None = None
     #: time at which the gear came within the magnet's reach
-    in_magnet_reach_since_s: float | None = None
+    magnet_reach_entered_at_s: float | None = None
     #: start time of each true condition
     condition_start_times_s: dict[Condition[Any], float] = field(default_factory=dict)
 
@@ -122,7 +122,7 @@ class Belief:
     #: thrust that the rotors produce, 0..65535; None before the first sample
     rotor_thrust: float | None = None
     #: time at which the reported thrust began to differ from the commanded one
-    thrust_differs_from_command_since_s: float | None = None
+    thrust_began_to_differ_from_command_at_s: float | None = None
     #: last tick in which they had differed for longer than `MAX_THRUST_REPORT_DELAY_S`
     thrust_last_differed_from_command_at_s: float = -math.inf
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
@@ -188,24 +188,24 @@ class Belief:
         return self.profile.positioning.source.is_target
 
     @cached_property
-    def worst_axis_velocity_variance_m2ps2(self) -> float:
+    def max_axis_velocity_variance_m2ps2(self) -> float:
         """Variance of the estimated velocity along its most uncertain axis, (m/s)^2. Infinite if it
         is missing; 0 if `link.unreported` says that the vehicle never reports it, so that no
         variance limit applies."""
-        return self._variance_or_default(self.obs.telemetry.velocity_variance_m2ps2)
+        return self._replace_missing_variance(self.obs.telemetry.velocity_variance_m2ps2)
 
     @cached_property
-    def worst_axis_position_variance_m2(self) -> float:
+    def max_axis_position_variance_m2(self) -> float:
         """Variance of the estimated position along its most uncertain axis, m^2; with decks, of the
         height alone, because a Flow deck measures no other position. Infinite if unknown, 0 if
         `link.unreported` says that the vehicle does not report it."""
         tel = self.obs.telemetry
         by_deck = self.profile.positioning.source.is_deck
-        return self._variance_or_default(
+        return self._replace_missing_variance(
             tel.height_variance_m2 if by_deck else tel.position_variance_m2
         )
 
-    def _variance_or_default(self, variance: float | None) -> float:
+    def _replace_missing_variance(self, variance: float | None) -> float:
         if variance is None:
             return 0.0 if "variance" in self.profile.link.unreported else math.inf
         return variance if variance >= 0.0 else math.inf
@@ -215,8 +215,8 @@ class Belief:
         """True if the variance of velocity or position is too large for position control."""
         safety = self.profile.safety
         return (
-            self.worst_axis_velocity_variance_m2ps2 > safety.flight_velocity_variance_m2ps2
-            or self.worst_axis_position_variance_m2 > safety.flight_variance_m2
+            self.max_axis_velocity_variance_m2ps2 > safety.flight_velocity_variance_m2ps2
+            or self.max_axis_position_variance_m2 > safety.flight_variance_m2
         )
 
     @cached_property
@@ -237,14 +237,15 @@ class Belief:
     @cached_property
     def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `POSITION_SETTLING_TIME_AFTER_GAP_S`, have not led the vehicle away from its setpoint
-        (diverged) and, if they come from pictures, agree with the accelerometer."""
+        `ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S`, have not led the vehicle away from its
+        setpoint (diverged) and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
             self.is_target_position_source and self.obs.camera_imu_mismatch is not None
         )
         returns = (
             self.position_last_stale_at_s is not None
-            and self.obs.t_s - self.position_last_stale_at_s <= POSITION_SETTLING_TIME_AFTER_GAP_S
+            and self.obs.t_s - self.position_last_stale_at_s
+            <= ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S
         )
         return not (doubted or self.is_position_stale or returns)
 
@@ -269,7 +270,7 @@ class Belief:
         )
 
     @cached_property
-    def has_uncorrected_gust(self) -> bool:
+    def is_estimate_missing_gust(self) -> bool:
         """True after an impact or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
         is_reckoned = self.dead_reckoning.imu is not None
@@ -305,7 +306,7 @@ class Belief:
         flight data is reliable."""
         return (
             self.is_position_trusted
-            and not self.has_uncorrected_gust
+            and not self.is_estimate_missing_gust
             and not self.is_flight_data_unreliable
         )
 
@@ -326,7 +327,7 @@ class Belief:
         replaced them, and the heading is not lost (unless the telemetry is too old for the
         alternative, raw thrust). With the target as the source,
         `can_descend_with_target_as_position_source` must hold as well."""
-        lost = self.is_position_diverged or self.dead_reckoning_since_s is not None
+        lost = self.is_position_diverged or self.dead_reckoning_began_at_s is not None
         if lost or (
             self.is_target_position_source and not self.can_descend_with_target_as_position_source
         ):
@@ -404,7 +405,9 @@ class Belief:
         """Vertical speed, m/s: from the state estimate while it is valid, otherwise from the
         accelerometer."""
         is_reckoned = self.dead_reckoning.imu is not None
-        if is_reckoned and (self.dead_reckoning_since_s is not None or not self.is_position_valid):
+        if is_reckoned and (
+            self.dead_reckoning_began_at_s is not None or not self.is_position_valid
+        ):
             return self.dead_reckoning.velocity_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 
@@ -428,8 +431,9 @@ class Belief:
         """True if the reported thrust can be used: no raw thrust is commanded, or the reported
         thrust agrees with it or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
         return (
-            self.thrust_differs_from_command_since_s is None
-            or self.obs.t_s - self.thrust_differs_from_command_since_s <= MAX_THRUST_REPORT_DELAY_S
+            self.thrust_began_to_differ_from_command_at_s is None
+            or self.obs.t_s - self.thrust_began_to_differ_from_command_at_s
+            <= MAX_THRUST_REPORT_DELAY_S
         )
 
     # --- The target ---
@@ -442,7 +446,7 @@ class Belief:
         )
 
     @cached_property
-    def lateral_state(self) -> LateralState | None:
+    def lateral_offset_and_velocity(self) -> LateralOffsetAndVelocity | None:
         """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, in
         world axes, estimated from pictures and tilt. None if the last pictures are too old or too
         few. Also None if the pictures contradict the vehicle's motion: the camera may then be
@@ -480,5 +484,5 @@ class Belief:
         the gear within its reach."""
         return (
             self.vehicle_world_z_at_last_contact_m is not None
-            or self.in_magnet_reach_since_s is not None
+            or self.magnet_reach_entered_at_s is not None
         )

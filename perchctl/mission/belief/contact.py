@@ -8,7 +8,7 @@ thrust: with more thrust, the vehicle presses; with less thrust, something suppo
 vehicle's position and its maneuver then distinguish the magnet from the floor, and both from
 another object.
 
-One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
+One threshold decides whether the thrust exceeds hover thrust (`is_thrust_above_hover`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`TARGET_CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and
 against an unknown object without a position (`IMU_SHOWS_SUPPORT`). `IMU_SHOWS_SUPPORT` also applies
@@ -44,7 +44,7 @@ MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
 how much the vehicle needs."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-MIN_PRESS_TO_COMMANDED_THRUST_RATIO = 0.99
+MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO = 0.99
 """Ratio of reported to commanded thrust at which a vehicle that presses by raw thrust always counts
 as pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
 vehicle seems to press while it hovers."""
@@ -54,7 +54,7 @@ press. Smaller: a press is never detected on a heavy vehicle."""
 MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
 """Fraction of hover thrust up to which thrust cannot hold the vehicle in the air. With more thrust,
 the ground effect of the ceiling may hold it."""
-MAX_MOTORS_STOPPED_THRUST = 5000
+MAX_RAW_THRUST_WITH_MOTORS_STOPPED = 5000
 """Largest raw thrust, 0..65535, at which the motors do not turn."""
 MIN_POSSIBLE_HOVER_THRUST = 1000
 """Smallest reported thrust, 0..65535, that may be hover thrust; the hover thrust of any vehicle is
@@ -68,9 +68,9 @@ MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
 MAX_HOVER_CLIMB_RATE_MPS = 0.27
 """Largest vertical speed at which the thrust is hover thrust, m/s."""
-MAX_HOVER_DEVIATION_FROM_1G_G = 0.1
+MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G = 0.1
 """Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
-MAX_HEIGHT_DRIFT_IN_PRESS_MPS = 0.1
+MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
@@ -86,11 +86,11 @@ DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M = 0.02
+MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M = 0.02
 """Largest upward drift of the estimated height despite which a slip is still detected, m."""
-MIN_DESCENT_TO_ACCEPT_FLOOR_M = 0.1
+MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M = 0.1
 """Height loss beyond which a descending vehicle counts as having come down, m."""
-MAX_DESCENT_IF_HELD_AT_START_M = 0.1
+MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M = 0.1
 """Height loss within which a descending vehicle may still be held where its descent began, m."""
 MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M = 0.3
 """Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
@@ -100,20 +100,20 @@ MIN_HEIGHT_OF_BLOCKED_CLIMB_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
 MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M = 0.1
 """Height below which a vehicle may still stand on the ground instead of pressing, m."""
-MAX_HANGING_GEAR_TO_TARGET_Z_M = 0.15
+MAX_GEAR_TO_TARGET_Z_WHEN_HANGING_M = 0.15
 """Largest height difference between gear and target, m, at which the vehicle may hang on its
 magnet."""
-MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M = 0.3
+MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M = 0.3
 """Smallest height difference between gear and target, m, of a vehicle that stands on the floor."""
-MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS = -0.05
+MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS = -0.05
 """Climb rate below which a vehicle with a low specific force is falling, once the weight transfer
 by raw thrust has begun, m/s."""
-MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS = -0.15
+MIN_CLIMB_RATE_IF_TOO_WEAK_TO_CLIMB_MPS = -0.15
 """Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
 falls."""
 
 # --- time ---
-MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S = 5.0
+MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S = 5.0
 """Time after a stop command from which zero thrust alone shows that the motors are off, s: the
 flying bit stays set for 2 s."""
 MOTORS_OFF_DWELL_S = 0.1
@@ -155,7 +155,7 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
     ):
         return None
     x_m, y_m, z_m = target.measured_gear_to_target_world_m.tolist()
-    before_touch_s = max(0.0, b.imu.climb_rate_steady_since_s - target.last_measured_at_s)
+    before_touch_s = max(0.0, b.imu.climb_rate_became_steady_at_s - target.last_measured_at_s)
     perch = b.profile.planner.perch
     if abs(z_m) > perch.contact_z_m + perch.climb_mps * before_touch_s:
         return None
@@ -223,7 +223,9 @@ def contact_height_tolerance_m(b: Belief) -> float:
     """
     planner = b.profile.planner
     drift_mps = (
-        MAX_HEIGHT_DRIFT_IN_PRESS_MPS if b.is_target_position_source else planner.landing.drift_mps
+        MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS
+        if b.is_target_position_source
+        else planner.landing.drift_mps
     )
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
 
@@ -251,8 +253,8 @@ def max_press_thrust(profile: Profile) -> float:
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
     """True if the present thrust is hover thrust: speed, climb rate and specific force are within
-    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and `MAX_HOVER_DEVIATION_FROM_1G_G` of those
-    in hover, and nothing blocks a climb."""
+    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and `MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G`
+    of those in hover, and nothing blocks a climb."""
     tel, setpoint = b.telemetry, b.command_history.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
@@ -268,7 +270,7 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
         < MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
         and b.speed_mps < MAX_HOVER_SPEED_MPS
         and abs(vz) < MAX_HOVER_CLIMB_RATE_MPS
-        and abs(tel.acc_z_g - 1.0) < MAX_HOVER_DEVIATION_FROM_1G_G
+        and abs(tel.acc_z_g - 1.0) < MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G
         and not stuck
     )
 
@@ -286,7 +288,7 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
     return b.is_reported_thrust_reliable and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
-def is_above_hover_thrust(b: Belief) -> bool:
+def is_thrust_above_hover(b: Belief) -> bool:
     """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If the
     vehicle cannot produce that much, a thrust close to the largest possible one is enough: close to
     the commanded thrust during a press by raw thrust, otherwise close to full thrust."""
@@ -295,7 +297,7 @@ def is_above_hover_thrust(b: Belief) -> bool:
         b.command_history.maneuver.presses_against_target
         and b.command_history.raw_thrust is not None
     ):
-        most = MIN_PRESS_TO_COMMANDED_THRUST_RATIO * max_press_thrust(b.profile)
+        most = MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO * max_press_thrust(b.profile)
     least = (
         min(MIN_PRESS_TO_HOVER_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
     )
@@ -305,7 +307,7 @@ def is_above_hover_thrust(b: Belief) -> bool:
 def is_pressing(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
     return (
-        is_above_hover_thrust(b)
+        is_thrust_above_hover(b)
         and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS
         and b.height_m >= MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M
     )
@@ -322,7 +324,7 @@ def is_slipping(b: Belief) -> bool:
     above_m = tel.position_m[2] - b.vehicle_world_z_at_last_contact_m
     return (
         not b.is_position_valid
-        or above_m < MAX_ESTIMATE_UPWARD_DRIFT_DURING_SLIP_M
+        or above_m < MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M
         or tel.acc_z_g < complete.slip_acc_g
     )
 
@@ -343,16 +345,20 @@ def _is_in_contact_with_target(b: Belief) -> bool:
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
-    motionless_s = b.obs.t_s - b.imu.climb_rate_steady_since_s
+    motionless_s = b.obs.t_s - b.imu.climb_rate_became_steady_at_s
     return (
         abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
-        + (MAX_HEIGHT_DRIFT_IN_PRESS_MPS * b.sighting_age_s if b.is_target_position_source else 0)
+        + (
+            MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS * b.sighting_age_s
+            if b.is_target_position_source
+            else 0
+        )
         and (steady or motionless_s >= perch.contact_dwell_s)
         and b.is_accelerometer_reading_one_g
         and b.hover_thrust > 0
         and b.is_reported_thrust_reliable
-        and is_above_hover_thrust(b)
+        and is_thrust_above_hover(b)
     )
 
 
@@ -368,7 +374,10 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
     """True if the motors have stopped and the vehicle hangs where it made contact."""
     return (
         b.command_history.weight_transfer_began_at_s is not None
-        and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_reported_thrust_reliable)
+        and (
+            b.telemetry.thrust <= MAX_RAW_THRUST_WITH_MOTORS_STOPPED
+            or not b.is_reported_thrust_reliable
+        )
         and is_vertically_motionless(b)
         and not is_slipping(b)
     )
@@ -394,11 +403,11 @@ def _is_hanging(b: Belief) -> bool:
     )
     at_target = (
         b.obs.target is not None
-        and abs(b.target.gear_to_target_z_m) <= MAX_HANGING_GEAR_TO_TARGET_Z_M
+        and abs(b.target.gear_to_target_z_m) <= MAX_GEAR_TO_TARGET_Z_WHEN_HANGING_M
     )
     stayed = (
         b.command_history.maneuver_start_position_m[2] - tel.position_m[2]
-        < MAX_DESCENT_IF_HELD_AT_START_M
+        < MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M
         and not b.target.is_far_above
     )
     return held and (at_contact or at_target or stayed)
@@ -406,11 +415,11 @@ def _is_hanging(b: Belief) -> bool:
 
 def _are_motors_off(b: Belief) -> bool:
     """True if the thrust is zero and the supervisor no longer reports the vehicle as flying.
-    `MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S` after a stop command, zero thrust is enough."""
+    `MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S` after a stop command, zero thrust is enough."""
     motor_stop_commanded_at_s = b.command_history.motor_stop_commanded_at_s
     long_off = (
         motor_stop_commanded_at_s is not None
-        and b.obs.t_s - motor_stop_commanded_at_s > MOTORS_OFF_DELAY_AFTER_STOP_COMMAND_S
+        and b.obs.t_s - motor_stop_commanded_at_s > MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S
     )
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
@@ -433,11 +442,12 @@ def _is_on_floor(b: Belief) -> bool:
     have drifted."""
     near_target = (
         b.obs.target is not None
-        and abs(b.target.gear_to_target_z_m) <= MIN_ON_FLOOR_GEAR_TO_TARGET_Z_M
+        and abs(b.target.gear_to_target_z_m) <= MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M
     )
     came_down_m = b.command_history.maneuver_start_position_m[2] - b.telemetry.position_m[2]
     came_down = (
-        b.command_history.maneuver.descends_to_floor and came_down_m > MIN_DESCENT_TO_ACCEPT_FLOOR_M
+        b.command_history.maneuver.descends_to_floor
+        and came_down_m > MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M
     )
     handover_m = b.profile.planner.landing.handover_m
     low = b.height_m < handover_m or (came_down and b.vehicle_world_z_at_last_contact_m is None)
@@ -455,7 +465,7 @@ def _is_pressing_against_obstacle(b: Belief) -> bool:
         return False
     strong = (
         b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
-        and is_above_hover_thrust(b)
+        and is_thrust_above_hover(b)
     )
     return strong and b.height_m > MIN_HEIGHT_OF_BLOCKED_CLIMB_M and is_vertically_motionless(b)
 
@@ -473,11 +483,11 @@ def _does_imu_show_support(b: Belief) -> bool:
         0 < hover < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
         and b.is_reported_thrust_reliable
         and (
-            is_above_hover_thrust(b)
+            is_thrust_above_hover(b)
             or tel.thrust <= (2.0 - MIN_PRESS_TO_HOVER_THRUST_RATIO) * hover
         )
         and b.is_accelerometer_reading_one_g
-        and b.obs.t_s - b.imu.climb_rate_steady_since_s >= perch.contact_dwell_s
+        and b.obs.t_s - b.imu.climb_rate_became_steady_at_s >= perch.contact_dwell_s
     )
 
 
@@ -485,7 +495,7 @@ def _is_thrust_saturated(b: Belief) -> bool:
     full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
     return (
         full
-        and MIN_CLIMB_RATE_AT_SATURATED_THRUST_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
+        and MIN_CLIMB_RATE_IF_TOO_WEAK_TO_CLIMB_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
     )
 
 
@@ -584,7 +594,7 @@ def find_support(b: Belief) -> Support:
     flies = (
         is_flying_at_hover_thrust(b)
         and not is_thrust_too_low_to_fly(b)
-        and not is_above_hover_thrust(b)
+        and not is_thrust_above_hover(b)
     )
     return Support.AIR if flies else Support.UNKNOWN
 
@@ -635,6 +645,6 @@ def has_slipped(b: Belief) -> bool:
         b.command_history.weight_transfer_began_at_s is not None
         and tel.acc_z_g < complete.slip_acc_g
     )
-    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_OF_FALL_AFTER_WEIGHT_TRANSFER_MPS:
+    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS:
         return True
     return b.true_for_s(SLIPPING) >= complete.slip_dwell_s

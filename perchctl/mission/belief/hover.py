@@ -15,7 +15,7 @@ import math
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import (
-    ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION,
+    HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION,
     MIN_FIRMWARE_POSITION_MODE_THRUST,
     HoverThrust,
 )
@@ -37,7 +37,7 @@ MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS = 3.0
 """Largest correction of the hover thrust during a descent, in standard deviations at the start of
 the descent. Larger: contact with an obstacle corrupts the estimate. Smaller: with a weak battery,
 the vehicle sinks too fast."""
-MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION = 0.2
+MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER = 0.2
 """Largest relative difference between the thrust in quiet flight and the estimated hover thrust; a
 larger difference means that the ceiling or a hand holds the vehicle. Larger: a held vehicle
 corrupts the estimate. Smaller: a real change is rejected."""
@@ -52,13 +52,13 @@ Smaller: a fall corrupts the estimate."""
 MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: an impact corrupts the estimate."""
-MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST = 0.5
+MIN_DESCENT_THRUST_TO_HOVER_RATIO_TO_LEARN = 0.5
 """Fraction of the hover thrust at the start of the descent below which thrust is not proportional
 to force, so nothing is learned from such a thrust."""
-MIN_SPECIFIC_FORCE_DIVISOR_G = 0.75
+MIN_SPECIFIC_FORCE_DIVIDING_THRUST_G = 0.75
 """Smallest specific force by which the thrust of a single sample is divided, g; a lower one is
 raised to this value."""
-MAX_SPECIFIC_FORCE_DIVISOR_G = 1.5
+MAX_SPECIFIC_FORCE_DIVIDING_THRUST_G = 1.5
 """Largest specific force by which the thrust of a single sample is divided, g; a higher one is
 lowered to this value."""
 
@@ -71,7 +71,9 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
     if b.hover_thrust_estimate.thrust > 0.0:
         return b.hover_thrust_estimate
     tel = b.telemetry
-    divisor_g = min(MAX_SPECIFIC_FORCE_DIVISOR_G, max(MIN_SPECIFIC_FORCE_DIVISOR_G, tel.acc_z_g))
+    divisor_g = min(
+        MAX_SPECIFIC_FORCE_DIVIDING_THRUST_G, max(MIN_SPECIFIC_FORCE_DIVIDING_THRUST_G, tel.acc_z_g)
+    )
     sample = max(MIN_FIRMWARE_POSITION_MODE_THRUST, tel.thrust / divisor_g)
     return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA_FRACTION)
 
@@ -92,9 +94,9 @@ def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
     if old.thrust == 0.0:
         return HoverThrust(
-            b.imu.mean_hover_thrust or thrust, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION
+            b.imu.mean_hover_thrust or thrust, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION
         )
-    if abs(thrust / old.thrust - 1.0) > MAX_THRUST_DEVIATION_TO_LEARN_HOVER_THRUST_FRACTION:
+    if abs(thrust / old.thrust - 1.0) > MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER:
         return old  # the ceiling or a hand holds the vehicle
     return old.with_measurement(thrust, dt_s)
 
@@ -115,7 +117,7 @@ def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
         MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
         <= tel.acc_z_g
         <= MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
-        and thrust >= MIN_THRUST_TO_HOVER_RATIO_TO_LEARN_HOVER_THRUST * first
+        and thrust >= MIN_DESCENT_THRUST_TO_HOVER_RATIO_TO_LEARN * first
     )
     is_on_floor = b.command_history.floor_detected_at_s is not None
     if (

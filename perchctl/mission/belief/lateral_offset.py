@@ -30,7 +30,7 @@ velocity follows the noise of single pictures. Smaller: after a gust, the offset
 ACCELERATION_NOISE_CORRELATION_TIME_S = 0.1
 """Correlation time of the acceleration that the tilt does not explain, s. A larger value has the
 same effect as a larger standard deviation."""
-MIN_PICTURE_OFFSET_SIGMA_M = 0.0005
+MIN_MEASURED_OFFSET_SIGMA_M = 0.0005
 """Smallest standard deviation of an offset measured in a picture, m: attitude and exposure time are
 not exact either. Smaller: the velocity follows their errors."""
 INITIAL_VELOCITY_SIGMA_MPS = 0.3
@@ -54,7 +54,7 @@ MAX_VELOCITY_SIGMA_TO_PREDICT_MPS = 0.03
 
 
 @dataclass(frozen=True)
-class LateralState:
+class LateralOffsetAndVelocity:
     """Horizontal vector from the gear to the target and horizontal velocity of the vehicle, both
     (x, y) in world axes, with their standard deviations per axis."""
 
@@ -64,7 +64,7 @@ class LateralState:
     velocity_sigma_mps: float
 
 
-class MotionSample(NamedTuple):
+class LateralMotionSample(NamedTuple):
     """Lateral motion of the vehicle at `t_s`, the time of a telemetry sample: the acceleration that
     its tilt causes and its estimated velocity, both (x, y) in world axes."""
 
@@ -100,9 +100,9 @@ class LateralOffsetFilter:
     gear_to_target_world_xy_m: LateralVector = (0.0, 0.0)
     vehicle_velocity_world_xy_mps: LateralVector = (0.0, 0.0)
     covariance: OffsetVelocityCovariance = UNSET_COVARIANCE
-    samples: tuple[MotionSample, ...] = ()
+    samples: tuple[LateralMotionSample, ...] = ()
 
-    def with_sample(self, sample: MotionSample) -> LateralOffsetFilter:
+    def with_sample(self, sample: LateralMotionSample) -> LateralOffsetFilter:
         """Return the filter with one more telemetry sample. A sample that is not newer than the
         last one is ignored. Samples too old for any later picture are dropped."""
         kept = self.samples
@@ -119,7 +119,7 @@ class LateralOffsetFilter:
         """Return the filter after a picture exposed at `t_s` that measured the offset."""
         if t_s <= self.t_s:
             return self
-        variance_m2 = max(sigma_m, MIN_PICTURE_OFFSET_SIGMA_M) ** 2
+        variance_m2 = max(sigma_m, MIN_MEASURED_OFFSET_SIGMA_M) ** 2
         if t_s - self.t_s > MAX_AGE_OF_NEWEST_PICTURE_S:
             return self._restart(t_s, gear_to_target_world_xy_m, variance_m2)
         predicted = self._propagate_through_samples(t_s)
@@ -145,7 +145,7 @@ class LateralOffsetFilter:
             ),
         )
 
-    def predict(self, t_s: float) -> LateralState | None:
+    def predict(self, t_s: float) -> LateralOffsetAndVelocity | None:
         """Return the estimate at `t_s`; None if the newest picture is older than
         `MAX_AGE_OF_NEWEST_PICTURE_S`, or while the velocity is less certain than
         `MAX_VELOCITY_SIGMA_TO_PREDICT_MPS`."""
@@ -155,7 +155,7 @@ class LateralOffsetFilter:
             return None
         predicted = self._propagate_through_samples(t_s)
         p_ee, _, p_vv = predicted.covariance
-        return LateralState(
+        return LateralOffsetAndVelocity(
             predicted.gear_to_target_world_xy_m,
             predicted.vehicle_velocity_world_xy_mps,
             math.sqrt(p_ee),

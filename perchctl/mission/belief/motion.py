@@ -43,14 +43,14 @@ as a gap."""
 MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
 """Largest change of a hanging vehicle's vertical speed across a gap due to noise of the estimate,
 m/s. Larger: a short fall goes undetected."""
-MAX_UNEXPLAINED_MOVE_IN_GAP_M = 0.25
+MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M = 0.25
 """Largest vertical movement across a gap that the speed before the gap does not explain, m. Larger:
 a short fall goes undetected."""
-MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS = -0.3
+MAX_CLIMB_RATE_IF_FALLEN_IN_GAP_MPS = -0.3
 """Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging
 vehicle never reaches it, and a falling one reaches it after 5 cm. Closer to 0: noise counts as a
 fall."""
-MAX_FROZEN_READING_S = 0.2
+MAX_FROZEN_READING_DURATION_S = 0.2
 """Duration of a series of identical readings that counts as a gap, s. Smaller: readings with a
 coarse resolution repeat by chance."""
 MAX_ACCELEROMETER_READING_IN_FREE_FALL_G = 0.6
@@ -59,11 +59,11 @@ fall."""
 MIN_FREE_FALL_DURATION_S = 0.1
 """Time for which a falling vehicle reads less than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`, s; a
 rebound is shorter. Larger: a fall is detected 5 cm later."""
-MAX_CLIMB_RATE_GAINED_IN_FALL_MPS = -0.25
+MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS = -0.25
 """Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle
 counts as falling, whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a
 fall."""
-MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS = 0.5
+FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS = 0.5
 """Largest upward speed, gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S`, that a vehicle
 must lose before it counts as falling, m/s. Larger: a fall just after a climb is detected later.
 Smaller: a climb that is braked counts as a fall."""
@@ -87,14 +87,14 @@ MAX_IMPACT_DETECTION_DELAY_S = 0.05
 taken from this far back."""
 MAX_BOUNCE_TIME_AFTER_IMPACT_S = 0.5
 """Time after an impact within which a further impact is a bounce, s."""
-MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
+MAX_STEADY_CLIMB_RATE_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
 counts as standing still."""
-MAX_STEADY_LATERAL_DEVIATION_MPS = 0.15
+MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS = 0.15
 """Largest difference between the lateral velocity and its mean over
-`LATERAL_VELOCITY_TIME_CONSTANT_S` that counts as constant, m/s; larger than
-`MAX_STEADY_CLIMB_DEVIATION_MPS` because the wind shakes the vehicle."""
-LATERAL_VELOCITY_TIME_CONSTANT_S = 0.15
+`MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S` that counts as constant, m/s; larger than
+`MAX_STEADY_CLIMB_RATE_DEVIATION_MPS` because the wind shakes the vehicle."""
+MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S = 0.15
 """Time constant of the mean lateral velocity, s."""
 ACCELEROMETER_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
@@ -102,7 +102,7 @@ of the floor is learned."""
 MIN_LATERAL_PUSH_G = 0.06
 """Lateral specific force that only a push can cause, g. Smaller: drag in flight counts as a
 push."""
-MAX_DELAY_OF_PUSH_IN_ESTIMATE_S = 1.5
+MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S = 1.5
 """Longest time until a push shows in the state estimate, s."""
 LATERAL_PUSH_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: the vibration of running motors affects single
@@ -110,16 +110,16 @@ samples as much as a push."""
 MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
 """Lateral speed gained between two samples above which it is a correction of the estimate and not a
 motion, m/s."""
-ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 = 5.0
+ESTIMATE_CORRECTION_VELOCITY_STEP_GROWTH_MPS2 = 5.0
 """Increase of `MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS` for each second between the two
 samples, m/s^2."""
 TILT_ERROR_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes an error of its tilt, s."""
 MEAN_HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
-MIN_HOVER_FRACTION_OF_FULL_THRUST = 0.4
+MIN_HOVER_TO_FULL_THRUST_RATIO = 0.4
 """Fraction of full thrust below which no vehicle can hover."""
-MAX_UNSATURATED_FRACTION_OF_FULL_THRUST = 0.95
+MAX_UNSATURATED_TO_FULL_THRUST_RATIO = 0.95
 """Fraction of full thrust above which the motors are saturated and the thrust for 1 g is
 unknown."""
 MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S = 5e-4
@@ -137,12 +137,12 @@ class FusionAge:
 
     climb_variance_m2ps2: float | None = None  # newest variance
     variance_changed_at_s: float = -math.inf  # time at which that variance arrived
-    no_fusion_since_s: float = math.inf  # time from which the variance has only grown
+    fusion_stopped_at_s: float = math.inf  # time from which the variance has only grown
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
-        certain = self.variance_changed_at_s - self.no_fusion_since_s >= NO_FUSION_TIMEOUT_S
-        return now_s - self.no_fusion_since_s if certain else 0.0
+        certain = self.variance_changed_at_s - self.fusion_stopped_at_s >= NO_FUSION_TIMEOUT_S
+        return now_s - self.fusion_stopped_at_s if certain else 0.0
 
     def update(self, sample: Telemetry) -> FusionAge:
         """Return the age after one more sample; unchanged if the sample has no new variance."""
@@ -153,10 +153,10 @@ class FusionAge:
             sample.t_s - self.variance_changed_at_s
         )
         grows = before is not None and variance - before >= least
-        no_fusion_since_s = (
-            min(self.no_fusion_since_s, self.variance_changed_at_s) if grows else math.inf
+        fusion_stopped_at_s = (
+            min(self.fusion_stopped_at_s, self.variance_changed_at_s) if grows else math.inf
         )
-        return FusionAge(variance, sample.t_s, no_fusion_since_s)
+        return FusionAge(variance, sample.t_s, fusion_stopped_at_s)
 
 
 @dataclass(frozen=True)
@@ -223,11 +223,11 @@ class FallDetector:
     `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`) minus its slowly learned offset. The climb rate v
     gained recently is
 
-        v' = min(MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
+        v' = min(FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
                  v + a dt - v dt / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
-    `MAX_CLIMB_RATE_GAINED_IN_FALL_MPS` (a negative limit), or if the accelerometer has read less
+    `MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS` (a negative limit), or if the accelerometer has read less
     than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G` for `MIN_FREE_FALL_DURATION_S`, longer than a
     rebound lasts. A slow sink goes undetected because it is learned as an offset.
     """
@@ -235,7 +235,7 @@ class FallDetector:
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
     # time from which the accelerometer has read less than
     # `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`
-    low_g_since_s: float = math.inf
+    low_g_began_at_s: float = math.inf
     climb_rate_gained_mps: float = 0.0
     up_acceleration_offset_mps2: float = 0.0
 
@@ -257,19 +257,21 @@ class FallDetector:
         )
         sink = self.climb_rate_gained_mps + corrected_mps2 * dt_s
         sink = min(
-            MAX_CLIMB_RATE_IN_FALL_DETECTOR_MPS,
+            FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
             sink - sink * dt_s / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S,
         )
         light = (
-            min(self.low_g_since_s, t_s)
+            min(self.low_g_began_at_s, t_s)
             if acc_z_g < MAX_ACCELEROMETER_READING_IN_FREE_FALL_G
             else math.inf
         )
-        fell = sink < MAX_CLIMB_RATE_GAINED_IN_FALL_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
+        fell = (
+            sink < MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS or t_s - light >= MIN_FREE_FALL_DURATION_S
+        )
         return replace(
             self,
             last_fall_at_s=t_s if fell else self.last_fall_at_s,
-            low_g_since_s=light,
+            low_g_began_at_s=light,
             climb_rate_gained_mps=sink,
             up_acceleration_offset_mps2=offset,
         )
@@ -369,35 +371,35 @@ class SteadySpeedDetector:
     came close to its mean."""
 
     # time from which the vertical speed has been constant
-    climb_rate_steady_since_s: float = math.inf
-    steady_climb_mps: float = 0.0
+    climb_rate_became_steady_at_s: float = math.inf
+    steady_climb_rate_mps: float = 0.0
     # time from which the lateral velocity has been constant
-    lateral_steady_since_s: float = math.inf
-    # mean over `LATERAL_VELOCITY_TIME_CONSTANT_S`
+    lateral_velocity_became_steady_at_s: float = math.inf
+    # mean over `MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S`
     mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
 
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """Return the detector after `dt_s`; `velocity_mps` is the newest velocity in world axes."""
         x, y, z = velocity_mps
-        climb_rate_steady_since_s, steady_climb_mps = (
-            self.climb_rate_steady_since_s,
-            self.steady_climb_mps,
+        climb_rate_became_steady_at_s, steady_climb_rate_mps = (
+            self.climb_rate_became_steady_at_s,
+            self.steady_climb_rate_mps,
         )
-        if abs(z - steady_climb_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
-            climb_rate_steady_since_s, steady_climb_mps = t_s, z
-        lateral_steady_since_s, (mean_x, mean_y) = (
-            self.lateral_steady_since_s,
+        if abs(z - steady_climb_rate_mps) > MAX_STEADY_CLIMB_RATE_DEVIATION_MPS:
+            climb_rate_became_steady_at_s, steady_climb_rate_mps = t_s, z
+        lateral_velocity_became_steady_at_s, (mean_x, mean_y) = (
+            self.lateral_velocity_became_steady_at_s,
             self.mean_lateral_velocity_mps,
         )
-        keeps = math.exp(-dt_s / LATERAL_VELOCITY_TIME_CONSTANT_S)
+        keeps = math.exp(-dt_s / MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S)
         mean_lateral_velocity_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-        if math.dist((x, y), mean_lateral_velocity_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
-            lateral_steady_since_s = t_s
+        if math.dist((x, y), mean_lateral_velocity_mps) > MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS:
+            lateral_velocity_became_steady_at_s = t_s
         return replace(
             self,
-            climb_rate_steady_since_s=climb_rate_steady_since_s,
-            steady_climb_mps=steady_climb_mps,
-            lateral_steady_since_s=lateral_steady_since_s,
+            climb_rate_became_steady_at_s=climb_rate_became_steady_at_s,
+            steady_climb_rate_mps=steady_climb_rate_mps,
+            lateral_velocity_became_steady_at_s=lateral_velocity_became_steady_at_s,
             mean_lateral_velocity_mps=mean_lateral_velocity_mps,
         )
 
@@ -442,7 +444,9 @@ class ImuMotion(
     event has not happened."""
 
     t_s: float = -math.inf  # time of the newest sample
-    velocity_gained_mps: Vector = ZERO_VECTOR  # velocity gained since the first sample, world axes
+    velocity_since_first_sample_world_mps: Vector = (
+        ZERO_VECTOR  # velocity gained since the first sample, world axes
+    )
     accelerometer_offset_g: Vector = ZERO_VECTOR  # offset of the accelerometer at rest, body axes
     last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest gap
     # end of the newest gap that may hide a fall
@@ -457,7 +461,7 @@ class ImuMotion(
     # age of the last correction of the state estimate, which this motion does not use
     fusion_age: FusionAge = FusionAge()
     # time at which the motors went off; inf while they turn
-    motors_off_since_s: float = math.inf
+    motors_stopped_at_s: float = math.inf
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
         """Return the motion after one more sample; `last` is the previous sample, None at the
@@ -469,22 +473,27 @@ class ImuMotion(
             t_s=new.t_s,
             vehicle_restarted_at_s=new.t_s if started_anew else self.vehicle_restarted_at_s,
             fusion_age=self.fusion_age.update(new),
-            motors_off_since_s=min(self.motors_off_since_s, new.t_s)
+            motors_stopped_at_s=min(self.motors_stopped_at_s, new.t_s)
             if new.thrust < 1
             else math.inf,
         )
         if (
             last is None
             or not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S
-            or motion.acceleration_frozen_for_s > MAX_FROZEN_READING_S
+            or motion.acceleration_frozen_for_s > MAX_FROZEN_READING_DURATION_S
         ):
             return _restart_after_gap(motion, last, new)
         motion, up_acceleration_mps2 = _integrate_acceleration(motion, last, new, dt_s)
-        now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_gained_mps[2], new.acc_z_g)
+        now = Impact(
+            new.t_s,
+            new.velocity_mps[2],
+            motion.velocity_since_first_sample_world_mps[2],
+            new.acc_z_g,
+        )
         motion = (
             motion.update_fall(new.t_s, up_acceleration_mps2, new.acc_z_g, dt_s)
             .update_impact(now, new.position_m[2], up_acceleration_mps2, dt_s)
-            .update_steady_speed(new.t_s, motion.velocity_gained_mps, dt_s)
+            .update_steady_speed(new.t_s, motion.velocity_since_first_sample_world_mps, dt_s)
             .update_lateral_push(new, motion.accelerometer_offset_g, dt_s)
         )
         hover_thrust = _filter_hover_thrust(motion.mean_hover_thrust, new, dt_s)
@@ -528,20 +537,23 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     the gap, and whether the vehicle may have fallen during it."""
     motion = replace(
         motion,
-        climb_rate_steady_since_s=new.t_s,
-        steady_climb_mps=motion.velocity_gained_mps[2],
-        lateral_steady_since_s=new.t_s,
-        mean_lateral_velocity_mps=motion.velocity_gained_mps[:2],
+        climb_rate_became_steady_at_s=new.t_s,
+        steady_climb_rate_mps=motion.velocity_since_first_sample_world_mps[2],
+        lateral_velocity_became_steady_at_s=new.t_s,
+        mean_lateral_velocity_mps=motion.velocity_since_first_sample_world_mps[:2],
         climb_rate_gained_mps=0.0,
         upward_speed_gained_mps=0.0,
-        low_g_since_s=math.inf,
+        low_g_began_at_s=math.inf,
     )
     if last is None:
         return replace(motion, height_change_in_gap_m=0.0)
     height_change_in_gap_m = min(
         0.0, motion.height_change_in_gap_m + new.position_m[2] - last.position_m[2]
     )
-    alive = 0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_S and new.start == last.start
+    alive = (
+        0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_DURATION_S
+        and new.start == last.start
+    )
     if alive and _can_exclude_fall(last, new, height_change_in_gap_m):
         return replace(
             motion,
@@ -564,12 +576,12 @@ def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: f
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return (
-            new.velocity_mps[2] > MAX_CLIMB_RATE_OF_FALL_ACROSS_GAP_MPS
-            and height_change_in_gap_m > -MAX_UNEXPLAINED_MOVE_IN_GAP_M
+            new.velocity_mps[2] > MAX_CLIMB_RATE_IF_FALLEN_IN_GAP_MPS
+            and height_change_in_gap_m > -MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M
         )
     return (
         abs(gained_mps) <= MAX_SPEED_NOISE_ACROSS_GAP_MPS
-        and abs(unexplained_m) <= MAX_UNEXPLAINED_MOVE_IN_GAP_M
+        and abs(unexplained_m) <= MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M
     )
 
 
@@ -592,10 +604,10 @@ def _integrate_acceleration(
         new, accelerometer_offset_g, roll_pitch_error_rad
     )
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
-    x, y, z = (v + d for v, d in zip(motion.velocity_gained_mps, dv, strict=True))
+    x, y, z = (v + d for v, d in zip(motion.velocity_since_first_sample_world_mps, dv, strict=True))
     motion = replace(
         motion,
-        velocity_gained_mps=(x, y, z),
+        velocity_since_first_sample_world_mps=(x, y, z),
         accelerometer_offset_g=accelerometer_offset_g,
         roll_pitch_error_rad=roll_pitch_error_rad,
         body_roll_pitch_rate_radps=body_roll_pitch_rate_radps,
@@ -626,7 +638,7 @@ def _estimate_tilt_error(
     if (
         gained_mps
         <= MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS
-        + ESTIMATE_CORRECTION_THRESHOLD_GROWTH_MPS2 * dt_s
+        + ESTIMATE_CORRECTION_VELOCITY_STEP_GROWTH_MPS2 * dt_s
     ):
         return TiltError((kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s))
     error = (
@@ -659,11 +671,11 @@ def _update_frozen_time_s(
 def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     flies = (
         sample.has_bit(FLYING)
-        and sample.thrust < MAX_UNSATURATED_FRACTION_OF_FULL_THRUST * FULL_THRUST
+        and sample.thrust < MAX_UNSATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
     )
     if (
         not flies
-        or sample.thrust < MIN_HOVER_FRACTION_OF_FULL_THRUST * FULL_THRUST
+        or sample.thrust < MIN_HOVER_TO_FULL_THRUST_RATIO * FULL_THRUST
         or not 0.8 <= sample.acc_z_g <= 1.2
     ):
         return old

@@ -26,7 +26,7 @@ MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
 """Ratio of the target's apparent motion to the vehicle's motion: below the first value, the target
 stands still; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
 camera rotated by a quarter turn shows 1.4."""
-MIN_TARGET_POSITION_SPREAD_RMS_M = 0.05
+MIN_MOVING_TARGET_POSITION_RMS_M = 0.05
 """Smallest RMS distance of the target's estimated world positions from their mean that shows that
 the target moves, m."""
 MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # fraction of the target's spread
@@ -42,9 +42,9 @@ distance plus twice the vehicle's motion within that time has been moved. `JUMP_
 pause of the check after a jump, s."""
 MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
 """Motion of the vehicle's estimated position between two sightings above which the state estimate
-has jumped, m; `ESTIMATE_JUMP_DISTANCE_GROWTH_MPS` times the time between them is added. Larger:
+has jumped, m; `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS` times the time between them is added. Larger:
 sightings from before and after a jump are compared."""
-ESTIMATE_JUMP_DISTANCE_GROWTH_MPS = 1.5
+ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
 """Increase of `MIN_ESTIMATE_JUMP_DISTANCE_M` for each second between the sightings, m/s. Smaller:
 the sightings of a fast vehicle are dropped."""
 _MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
@@ -141,7 +141,9 @@ def _is_target_or_estimate_jump(
     earlier_samples: tuple[CameraMountingSample, ...], sample: CameraMountingSample
 ) -> bool:
     last = earlier_samples[-1]
-    far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_DISTANCE_GROWTH_MPS * (sample.t_s - last.t_s)
+    far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (
+        sample.t_s - last.t_s
+    )
     if abs(sample.vehicle_world_xy_m - last.vehicle_world_xy_m) > far:
         return True
     for s in reversed(earlier_samples):
@@ -185,7 +187,7 @@ def _judge_camera_mounting(
         abs(along) >= MIN_MOVING_RATIO
         and abs(turn) >= MIN_FITTED_ROTATION_MODULUS
         and abs(cmath.phase(turn)) >= MIN_DETECTED_CAMERA_YAW_ERROR_RAD
-        and spread_m >= MIN_TARGET_POSITION_SPREAD_RMS_M
+        and spread_m >= MIN_MOVING_TARGET_POSITION_RMS_M
         and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO * spread_m
     ):
         return replace(

@@ -48,7 +48,7 @@ def _is_battery_low(b: Belief) -> bool:
 
 TILT_TOO_LARGE = Condition("tilted", _is_tilt_too_large, persists_across_phases=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
-LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT = Condition[Belief](
+LATERAL_SPEED_EXCEEDS_DRAUGHT = Condition[Belief](
     "lateral blow",
     lambda b: (
         b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
@@ -74,7 +74,7 @@ ESTIMATE_CONTRADICTS_IMU = Condition(
 """The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (
     TILT_TOO_LARGE,
-    LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT,
+    LATERAL_SPEED_EXCEEDS_DRAUGHT,
     ESTIMATE_VARIANCE_TOO_LARGE,
     TARGET_BELOW_VEHICLE,
     BATTERY_LOW,
@@ -106,7 +106,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 def position_loss_text(b: Belief) -> str:
     """Return a text that says how long no external position has been sent, and why."""
-    if b.has_uncorrected_gust:
+    if b.is_estimate_missing_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
     if b.profile.positioning.source.is_deck:
@@ -123,11 +123,11 @@ def position_loss_text(b: Belief) -> str:
 def excessive_variance_text(b: Belief) -> str:
     """Return a text that names the variance that is too large, and its limit."""
     safety = b.profile.safety
-    what, variance, unit = "velocity", b.worst_axis_velocity_variance_m2ps2, "(m/s)^2"
+    what, variance, unit = "velocity", b.max_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2
     if variance <= most:
         what = "height" if b.profile.positioning.source.is_deck else "position"
-        variance, most, unit = b.worst_axis_position_variance_m2, safety.flight_variance_m2, "m^2"
+        variance, most, unit = b.max_axis_position_variance_m2, safety.flight_variance_m2, "m^2"
     if math.isinf(variance):
         return f"the {what}'s variance is unknown"
     return f"the {what}'s variance is {variance:.2g} {unit}, but at most {most:g} is allowed"

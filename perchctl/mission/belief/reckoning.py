@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
     ACCELEROMETER_OFFSET_TIME_CONSTANT_S,
-    MAX_DELAY_OF_PUSH_IN_ESTIMATE_S,
-    MAX_FROZEN_READING_S,
+    MAX_FROZEN_READING_DURATION_S,
+    MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S,
     MAX_TELEMETRY_GAP_S,
     ZERO_VECTOR,
     ImuMotion,
@@ -87,7 +87,7 @@ offset of a contact is reported as more precise than it is."""
 VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
 """Standard deviation of the dead-reckoned velocity at the last sighting, m/s. Smaller: the offset
 of a contact is reported as more precise than it is."""
-POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN = 0.3
+POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO = 0.3
 """Fraction of the distance flown without a sighting that is added to the standard deviation of a
 dead-reckoned position."""
 VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S = 1.5
@@ -116,7 +116,7 @@ class DeadReckoning:
     gear_below_target_m: float = math.inf
     # lower bound of `gear_below_target_m`: it allows for climbs in telemetry gaps, and falls only
     # increase it
-    min_gear_below_target_m: float = math.inf
+    gear_below_target_lower_bound_m: float = math.inf
     # end of the newest gap after which the magnet may hold the vehicle
     last_gap_in_which_magnet_may_attach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
@@ -165,7 +165,7 @@ def advance_dead_reckoning(
         carried_mps = (
             old.velocity_mps[2]
             + impact.imu_climb_before_impact_mps
-            - old.imu.velocity_gained_mps[2]
+            - old.imu.velocity_since_first_sample_world_mps[2]
         )
         old = replace(
             old,
@@ -173,7 +173,7 @@ def advance_dead_reckoning(
             if carried
             else impact.estimated_climb_before_impact_mps,
         )
-    frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_S
+    frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_DURATION_S
     if old.imu is None or imu.last_telemetry_gap_ended_at_s > old.imu.t_s or frozen:
         return _restart(
             old,
@@ -212,7 +212,10 @@ def _restart(
     if is_position_diverged:
         vx, vy, vz = old.velocity_mps
         if old.imu is not None and imu.last_telemetry_gap_ended_at_s <= old.imu.t_s:
-            vz += imu.velocity_gained_mps[2] - old.imu.velocity_gained_mps[2]
+            vz += (
+                imu.velocity_since_first_sample_world_mps[2]
+                - old.imu.velocity_since_first_sample_world_mps[2]
+            )
         velocity_mps = (vx, vy, vz)
     elif not is_estimate_trusted and old.imu is not None:
         vx, vy, vz = (
@@ -235,17 +238,17 @@ def _restart(
     if imu.last_telemetry_gap_ended_at_s > old.imu.t_s:
         # A vehicle whose motors were off before and after the gap, or that has restarted, cannot
         # have climbed under power.
-        off = old.imu.motors_off_since_s <= old.imu.t_s and imu.motors_off_since_s <= imu.t_s
+        off = old.imu.motors_stopped_at_s <= old.imu.t_s and imu.motors_stopped_at_s <= imu.t_s
         flew = not (off or imu.vehicle_restarted_at_s > old.imu.t_s)
         climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
             climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
-        min_gear_below_target_m = old.min_gear_below_target_m - climb_m
-        near = min_gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
+        gear_below_target_lower_bound_m = old.gear_below_target_lower_bound_m - climb_m
+        near = gear_below_target_lower_bound_m < MAGNET_REACH_BELOW_TARGET_M
         unknown = replace(
             unknown,
-            min_gear_below_target_m=min_gear_below_target_m,
+            gear_below_target_lower_bound_m=gear_below_target_lower_bound_m,
             last_gap_in_which_magnet_may_attach_ended_at_s=imu.t_s
             if near
             else old.last_gap_in_which_magnet_may_attach_ended_at_s,
@@ -278,7 +281,7 @@ def _integrate_sample(
     keeps = math.exp(-dt_s / VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S)
     calm = (
         is_estimate_trusted
-        and imu.t_s - imu.last_lateral_push_at_s > MAX_DELAY_OF_PUSH_IN_ESTIMATE_S
+        and imu.t_s - imu.last_lateral_push_at_s > MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
     )
     cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
     ahead_g, left_g = imu.mean_specific_force_body_xy_g
@@ -288,7 +291,10 @@ def _integrate_sample(
     )
     mean_specific_force_world_xy_mps2 = [*old.mean_specific_force_world_xy_mps2]
     for i in range(3):
-        gained = imu.velocity_gained_mps[i] - previous_imu.velocity_gained_mps[i]
+        gained = (
+            imu.velocity_since_first_sample_world_mps[i]
+            - previous_imu.velocity_since_first_sample_world_mps[i]
+        )
         if (
             i == 2
             and is_estimate_trusted
@@ -334,7 +340,7 @@ def _integrate_sample(
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
         VELOCITY_SIGMA_AT_SIGHTING_MPS + ACCELERATION_BIAS_SIGMA_MPS2 * unseen_s
-    ) * dt_s + POSITION_SIGMA_FRACTION_OF_DISTANCE_FLOWN * step_m
+    ) * dt_s + POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO * step_m
     ex, ey = old.gear_to_target_world_xy_m
     return replace(
         old,
@@ -354,7 +360,7 @@ def _integrate_sample(
         gear_below_target_m=math.inf
         if fell
         else old.gear_below_target_m - (vz + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS) * dt_s,
-        min_gear_below_target_m=old.min_gear_below_target_m - vz * dt_s,
+        gear_below_target_lower_bound_m=old.gear_below_target_lower_bound_m - vz * dt_s,
         gear_to_target_world_xy_m=(ex - vx * dt_s, ey - vy * dt_s),
         gear_to_target_sigma_m=old.gear_to_target_sigma_m + growth_m,
     )
@@ -420,7 +426,12 @@ def learn_acceleration_bias_at_rest(
     dt_s = imu.t_s - previous_imu.t_s
     share = 1.0 - math.exp(-dt_s / ACCELEROMETER_OFFSET_TIME_CONSTANT_S)
     x_mps2, y_mps2 = (
-        (imu.velocity_gained_mps[i] - previous_imu.velocity_gained_mps[i]) / dt_s for i in range(2)
+        (
+            imu.velocity_since_first_sample_world_mps[i]
+            - previous_imu.velocity_since_first_sample_world_mps[i]
+        )
+        / dt_s
+        for i in range(2)
     )
     bx, by, bz = old.acceleration_bias_world_mps2
     bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
@@ -490,7 +501,7 @@ def _position_timestamp_s(sample: Telemetry) -> float:
     return sample.t_s - max(0.0, sample.behind_s - MAX_NEGLIGIBLE_POSITION_LAG_S)
 
 
-def add_sighting(
+def restart_dead_reckoning_at_sighting(
     old: DeadReckoning,
     t_s: float,
     gear_to_target_world_xy_m: tuple[float, float],
@@ -507,6 +518,6 @@ def add_sighting(
         last_sighting_at_s=t_s,
         gear_to_target_world_xy_m=gear_to_target_world_xy_m,
         gear_below_target_m=gear_below_target_m,
-        min_gear_below_target_m=gear_below_target_m,
+        gear_below_target_lower_bound_m=gear_below_target_m,
         gear_to_target_sigma_m=sigma_m,
     )

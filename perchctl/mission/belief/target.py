@@ -15,17 +15,17 @@ MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M = 0.5
 """Height above the gear beyond which the target cannot hold the vehicle, m. Larger: a vehicle that
 has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
 hold."""
-CAMERA_VELOCITY_TIME_CONSTANT_S = 0.1
+VISUAL_VELOCITY_TIME_CONSTANT_S = 0.1
 """Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent
 controlled with this velocity oscillates. Smaller: the noise of single detections moves the
 vehicle."""
-MAX_DETECTION_GAP_S = 1.0
+MAX_DETECTION_GAP_FOR_VELOCITY_S = 1.0
 """Longest time between two detections from which a velocity is computed, s. Larger: a motion that
 has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
 MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S = 0.3
 """Time for which the target must be detected before the velocity is used, s. Smaller: the low-pass
 filter has not settled."""
-MAX_PLAUSIBLE_CAMERA_VELOCITY_MPS = 1.5
+MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS = 1.5
 """Largest velocity between two detections, m/s; a larger one is a step of the pose. Larger: a step
 counts as motion. Smaller: a fast motion is ignored."""
 
@@ -111,20 +111,20 @@ class VisualMotion:
 
     Attributes:
         t_s: exposure time of the newest detection.
-        detected_since_s: exposure time of the first detection after the last gap.
+        detection_began_at_s: exposure time of the first detection after the last gap.
         gear_to_target_level_m: newest position of the target from the gear (ahead, left, up), m.
         vehicle_velocity_level_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf
-    detected_since_s: float = -math.inf
+    detection_began_at_s: float = -math.inf
     gear_to_target_level_m: Vector = ZERO_VECTOR
     vehicle_velocity_level_mps: Vector = ZERO_VECTOR
 
     @property
     def is_velocity_known(self) -> bool:
         """True if the target was detected for long enough to determine the velocity."""
-        return self.t_s - self.detected_since_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
+        return self.t_s - self.detection_began_at_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
 
     def with_detection(self, target: TargetEstimate) -> VisualMotion:
         """Return the motion after a frame that measured the target."""
@@ -133,17 +133,17 @@ class VisualMotion:
         dt_s = t_s - self.t_s
         if dt_s <= 0.0:
             return self
-        if dt_s > MAX_DETECTION_GAP_S:
+        if dt_s > MAX_DETECTION_GAP_FOR_VELOCITY_S:
             return VisualMotion(t_s, t_s, e_m)
         moved_mps = [
             (before - now) / dt_s
             for before, now in zip(self.gear_to_target_level_m, e_m, strict=True)
         ]
-        if math.hypot(*moved_mps) > MAX_PLAUSIBLE_CAMERA_VELOCITY_MPS:
+        if math.hypot(*moved_mps) > MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS:
             return replace(self, t_s=t_s, gear_to_target_level_m=e_m)
-        share = 1.0 - math.exp(-dt_s / CAMERA_VELOCITY_TIME_CONSTANT_S)
+        share = 1.0 - math.exp(-dt_s / VISUAL_VELOCITY_TIME_CONSTANT_S)
         ahead, left, up = (
             old + share * (new - old)
             for old, new in zip(self.vehicle_velocity_level_mps, moved_mps, strict=True)
         )
-        return VisualMotion(t_s, self.detected_since_s, e_m, (ahead, left, up))
+        return VisualMotion(t_s, self.detection_began_at_s, e_m, (ahead, left, up))

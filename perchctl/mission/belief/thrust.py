@@ -17,7 +17,7 @@ from perchctl.values import replace
 
 MIN_FIRMWARE_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION = 0.02
+ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION = 0.02
 """Standard deviation of a hover-thrust measurement averaged over one second, as a fraction of the
 thrust; position control varies the thrust by 1 to 2 % for half a second. Larger: the filter adapts
 too slowly to a sagging battery. Smaller: the filter learns these variations."""
@@ -25,7 +25,7 @@ HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT = 0.01
 """Random walk of the hover thrust in quiet flight, as a fraction of the thrust per square root of a
 second. Larger: the filter learns a lasting push. Smaller: the filter adapts too slowly to a sagging
 battery."""
-ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION = 0.03
+HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION = 0.03
 """Relative standard deviation of a hover thrust estimated from the accelerometer in flight, due to
 the accelerometer's scale error. Larger: quiet flight just after take-off has more weight. Smaller:
 quiet flight just after take-off has less weight."""
@@ -73,7 +73,7 @@ class HoverThrust:
         return replace(
             self,
             sigma_fraction=min(
-                sigma, max(self.sigma_fraction, ACCELEROMETER_HOVER_THRUST_SIGMA_FRACTION)
+                sigma, max(self.sigma_fraction, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
             ),
         )
 
@@ -86,9 +86,9 @@ class HoverThrust:
             return replace(
                 self,
                 thrust=thrust,
-                sigma_fraction=ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION / math.sqrt(dt_s),
+                sigma_fraction=ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION / math.sqrt(dt_s),
             )
         variance = self.sigma_fraction**2
-        gain = variance / (variance + ONE_SECOND_HOVER_THRUST_SIGMA_FRACTION**2 / dt_s)
+        gain = variance / (variance + ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
         return replace(self, thrust=corrected, sigma_fraction=math.sqrt((1.0 - gain) * variance))

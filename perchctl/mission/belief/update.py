@@ -22,7 +22,7 @@ import numpy as np
 
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.battery import update_battery_fit_from_telemetry
-from perchctl.mission.belief.belief import POSITION_SETTLING_TIME_AFTER_GAP_S, Belief
+from perchctl.mission.belief.belief import ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S, Belief
 from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     IMU_SHOWS_SUPPORT,
@@ -39,7 +39,7 @@ from perchctl.mission.belief.evidence import (
     keep_persistent_start_times,
     update_condition_start_times,
 )
-from perchctl.mission.belief.lateral_offset import MotionSample
+from perchctl.mission.belief.lateral_offset import LateralMotionSample
 from perchctl.mission.belief.maneuver import CommandHistory
 from perchctl.mission.belief.motion import ZERO_VECTOR, Vector
 from perchctl.mission.belief.mounting import (
@@ -54,10 +54,10 @@ from perchctl.mission.belief.reckoning import (
     MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S,
     DeadReckoning,
     accumulate_unexplained_position_step,
-    add_sighting,
     advance_dead_reckoning,
     learn_acceleration_bias_at_rest,
     learn_estimated_velocity_bias,
+    restart_dead_reckoning_at_sighting,
     restart_velocity_bias_filters,
 )
 from perchctl.mission.observation import Observation
@@ -67,12 +67,12 @@ from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawTh
 
 BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions that are evaluated on the belief."""
-MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M = 0.3
+MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M = 0.3
 """Distance of the gear below the target within which it must be the target that supports the
 vehicle, m."""
 STILL_AT_CONTACT_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
-MAX_FILTER_STEP_S = 0.1
+MAX_SAMPLE_INTERVAL_IN_FILTERS_S = 0.1
 """Longest time that a single sample may represent in the filters of hover thrust and tilt, s.
 Larger: after a gap, a single sample has the weight of many."""
 MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
@@ -103,7 +103,7 @@ def update_belief(
         command_history=command_history,
         world_frame_shift_in_tick_m=ZERO_VECTOR,
     )
-    sample = MotionSample(
+    sample = LateralMotionSample(
         obs.telemetry.t_s, b.acceleration_from_tilt_world_xy_mps2, b.velocity_mps[:2]
     )
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
@@ -122,7 +122,7 @@ def update_belief(
         command_history.maneuver.descends_to_floor
         and command_history.is_before_weight_transfer_and_motor_stop
     )
-    if comes_down and b.dead_reckoning_since_s is None and b.has_only_imu_for_descent:
+    if comes_down and b.dead_reckoning_began_at_s is None and b.has_only_imu_for_descent:
         b = start_dead_reckoning(b)
     return _update_estimators(b)
 
@@ -137,7 +137,7 @@ def start_dead_reckoning(b: Belief) -> Belief:
     """Return the belief switched permanently to dead reckoning from accelerometer and attitude."""
     return replace(
         b,
-        dead_reckoning_since_s=b.obs.t_s,
+        dead_reckoning_began_at_s=b.obs.t_s,
         dead_reckoned_height_m=b.height_m,
         hover_thrust_estimate=hover.estimate_hover_thrust(b),
     )
@@ -156,7 +156,7 @@ def update_after_command(b: Belief, command: Command) -> Belief:
     the check that the reported thrust follows the commanded raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
-    return replace(b, thrust_differs_from_command_since_s=None)
+    return replace(b, thrust_began_to_differ_from_command_at_s=None)
 
 
 # --- Direct consequences of the observation ---
@@ -192,7 +192,7 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
     """Return the belief after a gap in which the planner did not run: all conditions restart."""
     imu = b.obs.imu
     kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
-    off_s = max(imu.motors_off_since_s, imu.last_telemetry_gap_ended_at_s)
+    off_s = max(imu.motors_stopped_at_s, imu.last_telemetry_gap_ended_at_s)
     if MOTORS_OFF_AS_COMMANDED in b.condition_start_times_s and math.isfinite(off_s):
         # All samples from the gap have arrived, and the motors are off in each. Without this
         # exception, a loop with a gap in every tick would never see the end of a landing.
@@ -227,7 +227,7 @@ def _shift_remembered_positions(b: Belief) -> Belief:
     moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
     returns = (
         b.position_last_stale_at_s is not None
-        and obs.t_s - b.position_last_stale_at_s <= POSITION_SETTLING_TIME_AFTER_GAP_S
+        and obs.t_s - b.position_last_stale_at_s <= ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S
     )
     if dt_s > MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S or returns:
         moved_m = (0.0, 0.0, 0.0)
@@ -267,10 +267,10 @@ def _compare_thrust_with_command(b: Belief) -> Belief:
     )
     since_s = (
         b.obs.t_s
-        if b.thrust_differs_from_command_since_s is None
-        else b.thrust_differs_from_command_since_s
+        if b.thrust_began_to_differ_from_command_at_s is None
+        else b.thrust_began_to_differ_from_command_at_s
     )
-    b = replace(b, thrust_differs_from_command_since_s=since_s if apart else None)
+    b = replace(b, thrust_began_to_differ_from_command_at_s=since_s if apart else None)
     return (
         b
         if b.is_reported_thrust_reliable
@@ -285,14 +285,14 @@ def _update_dead_reckoning(b: Belief) -> Belief:
     """Return the belief with the dead reckoning one tick later, the time within the magnet's reach,
     and the height of a vehicle without a position."""
     new = _integrate_dead_reckoning(b)
-    new = _stop_dead_reckoning_at_contact(b, new)
-    new = _adopt_camera_velocity(b, new)
+    new = _zero_reckoned_velocity_at_contact(b, new)
+    new = _adopt_visual_inertial_velocity(b, new)
     new = _restart_at_sighting(b, new)
     new = _correct_height_of_supported_vehicle(b, new)
     return replace(
         b,
         dead_reckoning=new,
-        in_magnet_reach_since_s=_find_in_magnet_reach_since_s(b, new),
+        magnet_reach_entered_at_s=_find_magnet_reach_entry_time_s(b, new),
         dead_reckoned_height_m=b.dead_reckoned_height_m + _climb_since_last_tick_m(b, new),
     )
 
@@ -303,7 +303,7 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     is_estimate_trusted = (
         b.is_position_valid
         and b.is_telemetry_fresh
-        and b.dead_reckoning_since_s is None
+        and b.dead_reckoning_began_at_s is None
         and b.first_estimate_jump_at_s is None
     )
     new = advance_dead_reckoning(
@@ -334,21 +334,23 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     return new
 
 
-def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Return the dead reckoning with zero velocity if the vehicle has been steady at its contact,
     or is within the magnet's reach at a thrust too small to support it. Otherwise, the
     accelerometer's bias would move the estimate of a hanging vehicle out of the magnet's reach
     within ten seconds."""
     obs = b.obs
     rests = (
-        obs.t_s - obs.imu.climb_rate_steady_since_s >= STILL_AT_CONTACT_DWELL_S
+        obs.t_s - obs.imu.climb_rate_became_steady_at_s >= STILL_AT_CONTACT_DWELL_S
         and obs.t_s - obs.imu.last_fall_at_s > HANGING_CONFIRMATION_DWELL_S
     )
-    hangs = b.in_magnet_reach_since_s is not None and is_thrust_too_low_to_fly(b)
+    hangs = b.magnet_reach_entered_at_s is not None and is_thrust_too_low_to_fly(b)
     touched = b.vehicle_world_z_at_last_contact_m is not None or hangs
     if not touched or not new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M or not rests:
         return new
-    is_laterally_unsteady = obs.t_s - obs.imu.lateral_steady_since_s < STILL_AT_CONTACT_DWELL_S
+    is_laterally_unsteady = (
+        obs.t_s - obs.imu.lateral_velocity_became_steady_at_s < STILL_AT_CONTACT_DWELL_S
+    )
     x_mps, y_mps, _ = new.velocity_mps
     new = replace(
         new, velocity_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
@@ -365,7 +367,7 @@ def _stop_dead_reckoning_at_contact(b: Belief, new: DeadReckoning) -> DeadReckon
     return new
 
 
-def _adopt_camera_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """Adopt the velocity on which pictures and accelerometer agree, each time the visual-inertial
     estimate (`VisualInertialMotion`) has a new one."""
     motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu
@@ -406,7 +408,7 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
             new.gear_to_target_world_xy_m,
             new.gear_to_target_sigma_m,
         )
-    new = add_sighting(
+    new = restart_dead_reckoning_at_sighting(
         new, target.last_measured_at_s, gear_to_target_world_xy_m, float(ez), sigma_m
     )
     if seen and target.last_measured_at_s > new.last_unexplained_position_step_at_s:
@@ -424,26 +426,26 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
     near = (
         b.is_target_position_source
         and not b.command_history.maneuver.descends_to_floor
-        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_WHEN_HELD_BY_IT_M
+        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M
     )
     if not near or b.true_for_s(IMU_SHOWS_SUPPORT) < b.profile.planner.perch.contact_dwell_s:
         return new
     return replace(
         new,
         gear_below_target_m=min(0.0, new.gear_below_target_m),
-        min_gear_below_target_m=min(0.0, new.min_gear_below_target_m),
+        gear_below_target_lower_bound_m=min(0.0, new.gear_below_target_lower_bound_m),
         velocity_mps=(*new.velocity_mps[:2], 0.0),
     )
 
 
-def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
+def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | None:
     """Return the loop time from which the magnet may have held the vehicle; None if it cannot hold
     it."""
-    in_magnet_reach_since_s = b.in_magnet_reach_since_s
+    magnet_reach_entered_at_s = b.magnet_reach_entered_at_s
     # once the weight transfer or the motor stop has begun, the vehicle does not move into or out of
     # the magnet's reach
     if not b.command_history.is_before_weight_transfer_and_motor_stop:
-        return in_magnet_reach_since_s
+        return magnet_reach_entered_at_s
     # A vehicle that has touched the floor does not climb, whatever the dead reckoning says.
     near = (
         new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
@@ -453,18 +455,18 @@ def _find_in_magnet_reach_since_s(b: Belief, new: DeadReckoning) -> float | None
         return None
     # A vehicle caught below the magnet may be drawn to it again, so an earlier fall proves nothing.
     again = (
-        in_magnet_reach_since_s is not None
-        and b.imu.last_fall_at_s > in_magnet_reach_since_s
+        magnet_reach_entered_at_s is not None
+        and b.imu.last_fall_at_s > magnet_reach_entered_at_s
         and new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M
     )
-    return b.obs.t_s if in_magnet_reach_since_s is None or again else in_magnet_reach_since_s
+    return b.obs.t_s if magnet_reach_entered_at_s is None or again else magnet_reach_entered_at_s
 
 
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     """Return how far a vehicle without a position has climbed since the previous tick, m; 0 for a
     vehicle with a position."""
     obs, before, last = b.obs, b.dead_reckoning.imu, b.last_telemetry
-    if b.dead_reckoning_since_s is None or before is None:
+    if b.dead_reckoning_began_at_s is None or before is None:
         return 0.0
     dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
     tel = obs.telemetry
@@ -495,7 +497,7 @@ def _update_estimators(b: Belief) -> Belief:
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     # 0: no new sample
-    sample_dt_s = max(0.0, min(MAX_FILTER_STEP_S, obs.telemetry.t_s - last_s))
+    sample_dt_s = max(0.0, min(MAX_SAMPLE_INTERVAL_IN_FILTERS_S, obs.telemetry.t_s - last_s))
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.climbs_to_target or b.target.gear_to_target_z_m > near_m
     b = replace(

@@ -7,17 +7,17 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase
-from perchctl.mission.setpoints import Action, fly_to, step_towards
+from perchctl.mission.setpoints import Action, fly_to, step_setpoint_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
+MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on
 the ground jumps up."""
 MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
 """Fraction of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
-MIN_REACHED_TAKEOFF_HEIGHT_FRACTION = 0.8
+MIN_TAKEOFF_HEIGHT_FRACTION_TO_END_TAKEOFF = 0.8
 """Fraction of the take-off height that counts as reached."""
 MAX_TAKEOFF_END_SPEED_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
@@ -27,7 +27,7 @@ TAKEOFF_END_DWELL_S = 0.3
 TAKEOFF_HEIGHT_REACHED = Condition[Context](
     "at take-off height",
     lambda c: (
-        c.belief.height_m >= MIN_REACHED_TAKEOFF_HEIGHT_FRACTION * c.planner.takeoff_height_m
+        c.belief.height_m >= MIN_TAKEOFF_HEIGHT_FRACTION_TO_END_TAKEOFF * c.planner.takeoff_height_m
         and c.belief.speed_mps <= MAX_TAKEOFF_END_SPEED_MPS
         and c.state.setpoint is not None
     ),
@@ -48,8 +48,8 @@ def act_in_approach(c: Context) -> Action:
     ):
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
-    setpoint = step_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M)
+    setpoint = step_setpoint_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M)
 
 
 APPROACH = PhaseDefinition(

@@ -11,7 +11,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.setpoints import (
-    MAX_SPEED_HOVERING_IN_PLACE_MPS,
+    MAX_SPEED_TO_COUNT_AS_HOVERING_MPS,
     Action,
     fly_under_target,
     make_setpoint_at_vehicle,
@@ -35,7 +35,7 @@ HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
 """Largest vertical distance of the setpoint from the hover position at which the hover can begin,
 m; the setpoint stays at its height during the hover. Larger: the vehicle hovers too low. Smaller:
 noise in the target's estimated height prevents the hover from beginning."""
-MAX_TIME_WITHOUT_TARGET_S = 1.5
+MAX_TARGET_OUT_OF_VIEW_DURATION_S = 1.5
 """Time since the last sighting of the target after which an ascent or a hover is given up, s, if a
 positioning system holds the vehicle in place meanwhile. Larger: the vehicle waits for a target that
 has moved or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
@@ -65,7 +65,11 @@ def has_reached_ascent_end_height(c: Context) -> bool:
 def _is_settled_at_standoff(c: Context) -> bool:
     """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
     the small marker recently."""
-    ascend, target, lateral = c.planner.ascend, c.belief.target, c.belief.lateral_state
+    ascend, target, lateral = (
+        c.planner.ascend,
+        c.belief.target,
+        c.belief.lateral_offset_and_velocity,
+    )
     gear_to_target_distance_xy_m = (
         target.gear_to_target_distance_xy_m
         if lateral is None
@@ -95,7 +99,7 @@ def _is_at_hover_position(c: Context) -> bool:
         <= HOVER_HEIGHT_TOLERANCE_M
         and target.gear_to_target_distance_xy_m <= align.xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
-        and c.belief.speed_mps <= MAX_SPEED_HOVERING_IN_PLACE_MPS
+        and c.belief.speed_mps <= MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
     )
 
 
@@ -112,7 +116,7 @@ def is_target_lost(c: Context) -> bool:
     """True if the target has been out of view for too long. If the target itself is the positioning
     system, any time without it is too long, since the position drifts."""
     b = c.belief
-    patience_s = 0.0 if b.is_target_position_source else MAX_TIME_WITHOUT_TARGET_S
+    patience_s = 0.0 if b.is_target_position_source else MAX_TARGET_OUT_OF_VIEW_DURATION_S
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 

@@ -25,7 +25,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
-MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S = 10.0
+MOTOR_STOP_TIMEOUT_AFTER_HANG_MONITORING_S = 10.0
 """Time after the end of the monitoring at which the flight ends although telemetry still shows
 thrust, s."""
 
@@ -116,7 +116,7 @@ COMPLETE = PhaseDefinition(
             {Phase.COMPLETE},
             lambda c: (
                 time_since_motor_stop_command_s(c)
-                > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_AFTER_MONITORING_S
+                > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_AFTER_HANG_MONITORING_S
             ),
             lambda c: (
                 f"motors stopped, but telemetry still reports a thrust of {c.telemetry.thrust:.0f}"

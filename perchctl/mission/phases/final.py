@@ -5,7 +5,7 @@ from __future__ import annotations
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.descent import has_landing_command_reached_end
+from perchctl.mission.descent import has_descent_command_reached_minimum
 from perchctl.mission.phase import Phase
 from perchctl.mission.release import has_thrust_ramped_down
 from perchctl.mission.setpoints import Action
@@ -24,7 +24,9 @@ def act_in_aborted(c: Context) -> Action:
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (
-        StopMotors() if has_thrust_ramped_down(c) or has_landing_command_reached_end(c) else Idle()
+        StopMotors()
+        if has_thrust_ramped_down(c) or has_descent_command_reached_minimum(c)
+        else Idle()
     )
     return replace(
         c.state, stop_or_land_command_count=1, last_stop_or_land_command_at_s=c.t_s

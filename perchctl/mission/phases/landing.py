@@ -109,7 +109,7 @@ LANDING = PhaseDefinition(
                 "motors off"
                 + (
                     ""
-                    if c.belief.dead_reckoning_since_s is None
+                    if c.belief.dead_reckoning_began_at_s is None
                     else "; the height was dead-reckoned during the descent"
                 )
             ),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import TARGET_CONTACT, current_gear_to_target
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.quality import LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT, position_loss_text
+from perchctl.mission.belief.quality import LATERAL_SPEED_EXCEEDS_DRAUGHT, position_loss_text
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase
@@ -24,12 +24,12 @@ from perchctl.mission.setpoints import (
     fly_to,
     make_setpoint_at_vehicle,
     make_setpoint_under_target,
-    step_towards,
+    step_setpoint_towards,
 )
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
-LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT_DWELL_S = 0.04
+LATERAL_SPEED_EXCEEDS_DRAUGHT_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
 MAX_PRESS_DURATION_WITHOUT_SIGHTING_S = 1.25
 """Longest press after the last sighting, s. The vehicle flies the last centimetres without the
@@ -52,7 +52,7 @@ def act_in_perch(c: Context) -> Action:
     if target.world_position_m is None:
         return fly_to(c, old, corrects_height=False)
     goal = make_setpoint_under_target(c, target.vehicle_world_z_when_touching_m + perch.press_m)
-    setpoint = step_towards(c, old, goal, max_up_mps=perch.climb_mps, max_down_mps=0.0)
+    setpoint = step_setpoint_towards(c, old, goal, max_up_mps=perch.climb_mps, max_down_mps=0.0)
     return fly_to(c, setpoint, corrects_height=False)
 
 
@@ -104,8 +104,7 @@ PERCH = PhaseDefinition(
             "knocked-aside",
             {Phase.PERCH},
             lambda c: (
-                c.true_for_s(LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT)
-                >= LATERAL_SPEED_TOO_HIGH_FOR_DRAUGHT_DWELL_S
+                c.true_for_s(LATERAL_SPEED_EXCEEDS_DRAUGHT) >= LATERAL_SPEED_EXCEEDS_DRAUGHT_DWELL_S
             ),
             "pushed sideways under the target",
         ),

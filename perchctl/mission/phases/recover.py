@@ -27,14 +27,14 @@ from perchctl.mission.setpoints import (
     body_world_xy_under_target,
     fly_to,
     make_setpoint_at_vehicle,
-    step_towards,
+    step_setpoint_towards,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_THRUST_TO_HOVER_RATIO_WITHOUT_FALL_CATCH = 0.85
+MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_CATCH = 0.85
 """Fraction of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
 MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
@@ -44,7 +44,7 @@ MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time for which the vehicle recovers before the last failed attempt ends the flight, s."""
-UNLIMITED_SETPOINT_DESCENT_RATE_MPS = 10.0
+SETPOINT_STEP_DOWN_RATE_MPS = 10.0
 """Downward speed of the setpoint, m/s: so high that the setpoint reaches its goal at once."""
 
 STEADY_AFTER_ATTEMPT = Condition[Context](
@@ -61,7 +61,7 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
     # A vehicle whose motors carry most of its weight hardly falls.
     falls = (
         VehicleDiagnosis.SLIPPED_OFF_CONTACT in diagnosis
-        and thrust < MIN_THRUST_TO_HOVER_RATIO_WITHOUT_FALL_CATCH * b.hover_thrust
+        and thrust < MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_CATCH * b.hover_thrust
     )
     belief = replace(
         state.belief,
@@ -79,9 +79,9 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
         )
         if falls
         else None,
-        obstacle_blocked_at_z_m=z_m
+        vehicle_world_z_when_blocked_m=z_m
         if VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis
-        else old.obstacle_blocked_at_z_m,
+        else old.vehicle_world_z_when_blocked_m,
     )
 
 
@@ -139,7 +139,7 @@ def act_in_recover(c: Context) -> Action:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
     return fly_to(
-        c, step_towards(c, setpoint, goal, max_down_mps=UNLIMITED_SETPOINT_DESCENT_RATE_MPS)
+        c, step_setpoint_towards(c, setpoint, goal, max_down_mps=SETPOINT_STEP_DOWN_RATE_MPS)
     )
 
 

@@ -14,7 +14,7 @@ from perchctl.mission.setpoints import (
     body_world_xy_under_target,
     fly_to,
     make_setpoint_at_vehicle,
-    step_towards,
+    step_setpoint_towards,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, land_row
@@ -62,13 +62,13 @@ def act_in_search(c: Context) -> Action:
         height = min(z, b.target.vehicle_world_z_when_touching_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
-        if state.obstacle_blocked_at_z_m is not None:
-            top = min(top, state.obstacle_blocked_at_z_m - MIN_CLEARANCE_BELOW_OBSTACLE_M)
+        if state.vehicle_world_z_when_blocked_m is not None:
+            top = min(top, state.vehicle_world_z_when_blocked_m - MIN_CLEARANCE_BELOW_OBSTACLE_M)
         height = min(z + search.step_m * state.searched_position_count, top)
     yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_position_count
     goal = PositionSetpoint(x, y, height, yaw)
     old = state.setpoint or make_setpoint_at_vehicle(c)
-    return fly_to(c, step_towards(c, old, goal, max_up_mps=c.planner.ascend.speed_mps))
+    return fly_to(c, step_setpoint_towards(c, old, goal, max_up_mps=c.planner.ascend.speed_mps))
 
 
 def _limit_move_before_camera_mounting_check(
@@ -89,7 +89,7 @@ def _limit_move_before_camera_mounting_check(
     return start_world_xy_m[0] + part * dx, start_world_xy_m[1] + part * dy
 
 
-def not_found_reason(c: Context) -> str:
+def target_not_found_reason(c: Context) -> str:
     """Return a text that says that the target was not found, and why if known."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refusal_reason
@@ -113,7 +113,7 @@ SEARCH = PhaseDefinition(
             "searched-out",
             {Phase.SEARCH},
             lambda c: c.state.searched_position_count >= c.planner.search.attempts,
-            not_found_reason,
+            target_not_found_reason,
             Outcome.TARGET_NOT_FOUND,
         ),
     ),

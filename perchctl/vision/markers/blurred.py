@@ -36,9 +36,9 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import DetectorInput, make_quad_detector
 from perchctl.vision.markers.edge_fit import (
-    CLIPPED_CORNER_SIGMA_PX,
-    CLIPPED_GREY,
-    MIN_CLIPPED_FRACTION,
+    CORNER_SIGMA_IF_WHITE_CLIPPED_PX,
+    MIN_CLIPPED_GREY,
+    MIN_CLIPPED_WHITE_FRACTION,
 )
 from perchctl.vision.markers.pattern import (
     MIN_MARKER_SIDE_PX,
@@ -67,19 +67,19 @@ _MIN_PAPER_REACH_HALF_SIDES = 1.3
 def find_expected_blurred(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    initial_blur_frame_counter: int | None = None,
+    frame_counter_for_initial_blur: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """Find blurred markers near their expected corners (4, 2) px. Return the first marker found, or
     an empty dict if there is none.
 
-    The caller increments `initial_blur_frame_counter` with each frame. To save time, the fits start
-    with a small blur if the counter is even and with a large blur if it is odd. If the counter is
-    None, both are tried in this frame."""
+    The caller increments `frame_counter_for_initial_blur` with each frame. To save time, the fits
+    start with a small blur if the counter is even and with a large blur if it is odd. If the
+    counter is None, both are tried in this frame."""
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _START_BLURS_PX
-        if initial_blur_frame_counter is None
-        else (_START_BLURS_PX[initial_blur_frame_counter % len(_START_BLURS_PX)],)
+        if frame_counter_for_initial_blur is None
+        else (_START_BLURS_PX[frame_counter_for_initial_blur % len(_START_BLURS_PX)],)
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
@@ -208,7 +208,7 @@ _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
 _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = 0.012
 _MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
-_MAX_CELL_DEVIATION_PER_CONTRAST = 0.3
+_MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO = 0.3
 _MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
 _ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
@@ -271,9 +271,9 @@ def align_marker(
         alignment.corners_px.max(axis=0),
     )
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    if int(np.count_nonzero(part > CLIPPED_GREY)) > MIN_CLIPPED_FRACTION * part.size:
+    if int(np.count_nonzero(part > MIN_CLIPPED_GREY)) > MIN_CLIPPED_WHITE_FRACTION * part.size:
         # The illumination model does not explain clipped white.
-        sigma_px = math.hypot(sigma_px, CLIPPED_CORNER_SIGMA_PX)
+        sigma_px = math.hypot(sigma_px, CORNER_SIGMA_IF_WHITE_CLIPPED_PX)
     return RefinedCorners(alignment.corners_px, sigma_px, True)
 
 
@@ -291,7 +291,8 @@ def is_alignment_confirmed(
         and _MIN_PATTERN_CONTRAST
         < alignment.pattern_to_border_contrast_ratio
         < _MAX_PATTERN_CONTRAST
-        and alignment.largest_cell_deviation_per_contrast < _MAX_CELL_DEVIATION_PER_CONTRAST
+        and alignment.largest_cell_grey_deviation_to_contrast_ratio
+        < _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO
         and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 

@@ -44,7 +44,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.detector import (
     DetectorInput,
     HiddenMask,
-    is_any_part_hidden,
+    is_any_marker_part_hidden,
     make_detector_setup,
 )
 from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS_HALF_LENGTHS, sample_profiles
@@ -63,12 +63,12 @@ _MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose h
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
 _RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
-_MIN_FOUND_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
+_MIN_FOUND_EDGE_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
 _MAX_TRUNCATED_FIT_RESIDUAL_PX = 1.2
 _MAX_CENTRE_SIGMA_HALF_SIDES = 0.04
 _MIN_CORNER_SIGMA_PX = 0.02
 # The small marker is reported if at least this number of its edge points is found.
-_MIN_SMALL_MARKER_POINTS = 12
+_MIN_SMALL_MARKER_EDGE_POINTS = 12
 # The lens model is valid where its inverse exists.
 _MAX_LENS_INVERSION_ERROR_NORMALISED = 1e-3
 # Rotation from the coordinates of the drawing to the axes of the marker.
@@ -99,7 +99,9 @@ def is_target_truncated(
         for corners in expected_corners_px.values()
         if is_inside_image(corners, shape, _UNCERTAIN_TRUNCATION_MARGIN_PX)
     ]
-    return bool(expected_corners_px) and all(is_any_part_hidden(hidden_mask, c) for c in whole)
+    return bool(expected_corners_px) and all(
+        is_any_marker_part_hidden(hidden_mask, c) for c in whole
+    )
 
 
 def can_complete_marker_be_in_view(
@@ -149,7 +151,7 @@ def fit_truncated_markers(
     if near is None:
         return {}
     pose_fit = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
-    if pose_fit is None or not _is_reliable(pose_fit):
+    if pose_fit is None or not _is_pose_fit_reliable(pose_fit):
         return {}
     like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
     if like < _MIN_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
@@ -169,7 +171,7 @@ def shows_enough_of_target(
     patterns = _make_patterns(target)
     pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
-    if pose_fit is None or not _is_reliable(pose_fit):
+    if pose_fit is None or not _is_pose_fit_reliable(pose_fit):
         return False
     side_to_large_side_ratio = (
         patterns["large"].drawing.small_to_large_side_ratio
@@ -197,7 +199,9 @@ def _select_marker_to_report(pose_fit: PoseFit) -> MarkerName:
     """Return the marker to report: the small one if enough of its edge points were found, otherwise
     the large one."""
     return (
-        "small" if pose_fit.found_small_marker_point_count >= _MIN_SMALL_MARKER_POINTS else "large"
+        "small"
+        if pose_fit.found_small_marker_point_count >= _MIN_SMALL_MARKER_EDGE_POINTS
+        else "large"
     )
 
 
@@ -253,14 +257,14 @@ def _search_near_pose(
     return pose
 
 
-def _is_reliable(pose_fit: PoseFit) -> bool:
+def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     """True if most of the visible edge points were found and if they determine the position
     accurately."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
     return (
-        pose_fit.found_point_count >= _MIN_FOUND_POINT_FRACTION * pose_fit.visible_point_count
+        pose_fit.found_point_count >= _MIN_FOUND_EDGE_POINT_FRACTION * pose_fit.visible_point_count
         and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RESIDUAL_PX
         and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
     )
@@ -305,10 +309,10 @@ FloatImage = NDArray[np.float32]
 _LATTICE_COLUMNS = 80  # approximate number of nodes across the image
 _SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # corresponds to 56 degrees off the optical axis
-_POINTS_PER_IMAGE_SIDE = 40
+_BORDER_POINTS_PER_IMAGE_SIDE = 40
 _VALID_LENS_TO_IMAGE_RADIUS_RATIO = 1.02
 _SEARCH_RANGE_NODES = 6  # The search covers this number of nodes to each side.
-_MIN_PAPER_NODES = 200  # Minimum number of visible nodes on the paper.
+_MIN_VISIBLE_PAPER_NODES = 200  # Minimum number of visible nodes on the paper.
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,7 +354,7 @@ class CoarseUndistortedImage:
 def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     """Return the lattice that covers the camera's field of view."""
     w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _POINTS_PER_IMAGE_SIDE)
+    s = np.linspace(0.0, 1.0, _BORDER_POINTS_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
     rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
     rays = undistort_to_normalised(rim * (w - 1.0, h - 1.0), camera)
@@ -404,11 +408,13 @@ def make_coarse_image(
     seen = lattice.is_in_image
     if hidden_mask_u8 is not None:
         covered = (hidden_mask_u8 != 0).astype(np.float32)
-        seen = seen & (_sample_at_nodes(covered, lattice) < 1e-3)
-    return CoarseUndistortedImage(lattice, _sample_at_nodes(image, lattice), seen)
+        seen = seen & (_sample_image_at_nodes(covered, lattice) < 1e-3)
+    return CoarseUndistortedImage(lattice, _sample_image_at_nodes(image, lattice), seen)
 
 
-def _sample_at_nodes(image: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice) -> FloatImage:
+def _sample_image_at_nodes(
+    image: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice
+) -> FloatImage:
     small = cv2.resize(image, lattice.reduced_image_size_px, interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
@@ -482,7 +488,7 @@ def correlate_drawing(
         ).max(axis=1)
         < PAPER_REACH_LARGE_MARKER_HALF_SIDES
     )
-    if np.count_nonzero(on) < _MIN_PAPER_NODES:
+    if np.count_nonzero(on) < _MIN_VISIBLE_PAPER_NODES:
         return DrawingMatch(0.0, 0.0)
     white = render_drawing(H_normalised_drawing, texture, lattice)[rows[on], columns[on]].astype(
         np.float64
@@ -516,16 +522,16 @@ class TargetOutline:
             from the target's centre, and unit normals (n, 2) from black to white.
         line_index: index (n,) of the straight line that each point is on.
         print_error_sigma_half_sides: standard deviation (n,) of the print error of that line.
-        cell_width_half_sides: width (n,) of the adjacent cell.
-        is_small_marker: True for edges of the small marker, (n,).
+        adjacent_cell_width_half_sides: width (n,) of the adjacent cell.
+        is_on_small_marker: True for edges of the small marker, (n,).
     """
 
     points_half_sides: Array
     drawing_normal_to_white: Array
     line_index: NDArray[np.intp]
     print_error_sigma_half_sides: Array
-    cell_width_half_sides: Array
-    is_small_marker: NDArray[np.bool_]
+    adjacent_cell_width_half_sides: Array
+    is_on_small_marker: NDArray[np.bool_]
 
 
 class DrawingTexture(NamedTuple):
@@ -568,8 +574,8 @@ def make_outline(
             small, small_print_tolerance_cells, large_print_tolerance_cells
         )
         * cell,
-        cell_width_half_sides=cell,
-        is_small_marker=small,
+        adjacent_cell_width_half_sides=cell,
+        is_on_small_marker=small,
     )
 
 
@@ -596,7 +602,7 @@ class _CellEdge(NamedTuple):
     points_half_sides: Array
     drawing_normal_to_white: tuple[float, float]
     line_key: tuple[float, int, int]
-    cell_width_half_sides: float
+    adjacent_cell_width_half_sides: float
 
 
 def _iterate_cell_edges(
@@ -646,7 +652,7 @@ _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 # Robust weights make the squared residuals smaller; this factor compensates for it.
 _ROBUST_VARIANCE_FACTOR = 1.3
 # Error of a whole line, due to the lens and the illumination.
-_WHOLE_LINE_OFFSET_SIGMA_PX = 0.02
+_COMMON_LINE_OFFSET_SIGMA_PX = 0.02
 # Standard deviations of the predicted pose.
 _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     math.radians(2.0),
@@ -654,7 +660,7 @@ _TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
     1.0,
 )
 _EDGE_SHIFT_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
-_POSE_PREDICTION_INFORMATION: Array = (
+_POSE_PRIOR_INFORMATION_DIAGONAL: Array = (
     np.array(
         [
             _TILT_SIGMA_RAD,
@@ -761,11 +767,11 @@ def fit_pose(
             return None
         reach_cells_px = (
             _PROFILE_REACH_CELLS
-            * outline.cell_width_half_sides[edge_points.outline_point_index]
+            * outline.adjacent_cell_width_half_sides[edge_points.outline_point_index]
             * edge_points.px_per_half_side
         )
         profile_half_lengths_px = np.minimum(max_profile_half_length_px, reach_cells_px)
-        edge_offset_to_white_px, is_edge_found = _measure_offsets(
+        edge_offset_to_white_px, is_edge_found = _measure_edge_offsets(
             image, edge_points, profile_half_lengths_px
         )
         if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
@@ -869,7 +875,7 @@ def _edge_points_in_view(
     return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
-def _measure_offsets(
+def _measure_edge_offsets(
     image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return two values for each edge point: the distance (n,), px, of the edge in the image from
@@ -902,7 +908,7 @@ def _solve_gauss_newton_step(
     pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
     """Return one Gauss-Newton step with robust weights; None if too few edges were found.
-    `edge_offset_to_white_px` (n,) is the result of `_measure_offsets`. A prior pulls
+    `edge_offset_to_white_px` (n,) is the result of `_measure_edge_offsets`. A prior pulls
     `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps, towards zero."""
     J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
@@ -917,11 +923,11 @@ def _solve_gauss_newton_step(
         if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
         variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(_POSE_PREDICTION_INFORMATION)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_POSE_PRIOR_INFORMATION_DIAGONAL)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (
             J.T @ (weight * edge_offset_to_white_px) / variance
-            - _POSE_PREDICTION_INFORMATION * pose_and_edge_shift_change_from_start
+            - _POSE_PRIOR_INFORMATION_DIAGONAL * pose_and_edge_shift_change_from_start
         )
     return _GaussNewtonStep(step, inverse, weight, variance)
 
@@ -934,12 +940,12 @@ def _make_pose_fit(
     common_px = np.hypot(
         outline.print_error_sigma_half_sides[edge_points.outline_point_index]
         * edge_points.px_per_half_side,
-        _WHOLE_LINE_OFFSET_SIGMA_PX,
+        _COMMON_LINE_OFFSET_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    cov = inverse @ (middle / variance**2 + np.diag(_POSE_PREDICTION_INFORMATION)) @ inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_POSE_PRIOR_INFORMATION_DIAGONAL)) @ inverse
     shown = w > 0.0
     return PoseFit(
         pose=pose,
@@ -947,7 +953,7 @@ def _make_pose_fit(
         visible_point_count=len(shown),
         found_point_count=int(np.count_nonzero(shown)),
         found_small_marker_point_count=int(
-            np.count_nonzero(shown & outline.is_small_marker[edge_points.outline_point_index])
+            np.count_nonzero(shown & outline.is_on_small_marker[edge_points.outline_point_index])
         ),
         rms_residual_px=math.sqrt(variance),
     )

@@ -43,12 +43,12 @@ from perchctl.vision.markers.detector import (
     DetectorInput,
     DetectorSetup,
     fill_hidden_pixels,
-    is_any_part_hidden,
+    is_any_marker_part_hidden,
     make_hidden_mask,
 )
 from perchctl.vision.markers.edge_fit import refine_corners_by_lines
 from perchctl.vision.markers.partial import (
-    IMAGE_MARGIN_PX,
+    IMAGE_BORDER_MARGIN_PX,
     IdentificationEvidence,
     fit_partly_visible_marker,
     is_fully_visible,
@@ -60,8 +60,8 @@ from perchctl.vision.markers.pattern import (
     has_mostly_matching_cells,
     is_correlated_with_pattern,
 )
-from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size
-from perchctl.vision.target_selection import OwnTargetDistanceFunction
+from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size_image
+from perchctl.vision.target_selection import MarkerToOwnTargetDistanceFunction
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -73,7 +73,7 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-_MIN_SEARCHED_SIDE_PX = 13.0  # The search does not find smaller markers.
+_MIN_MARKER_SIDE_FOUND_BY_SEARCH_PX = 13.0  # The search does not find smaller markers.
 # A measured edge shift stays valid for this number of frames because the light changes slowly.
 _MAX_EDGE_SHIFT_AGE_FRAMES = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
@@ -92,7 +92,7 @@ class DetectionPrior:
         expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
             missing marker is derived from the other one. Empty if no target is expected.
         search_mode: the kinds of search for this frame.
-        initial_blur_frame_counter: frame counter; its parity selects a small or a large initial
+        frame_counter_for_initial_blur: frame counter; its parity selects a small or a large initial
             blur for the fits to blurred markers (see `find_expected_blurred`).
         was_target_seen_recently: True if a marker was found at most
             `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
@@ -101,19 +101,20 @@ class DetectionPrior:
             truncated every marker that was detected last.
         previous_edge_shift: how far white has grown over black (blooming), measured in a recent
             frame; None if it must be measured in this frame.
-        measure_own_target_distance_m: function that returns a marker's horizontal distance, m, from
-            the expected position of this vehicle's own target. It selects one of several targets if
-            none is expected at a known position. None if only the image is used to select a target.
+        measure_marker_to_own_target_distance_m: function that returns a marker's horizontal
+            distance, m, from the expected position of this vehicle's own target. It selects one of
+            several targets if none is expected at a known position. None if only the image is used
+            to select a target.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
     expected_corners_both_markers_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    initial_blur_frame_counter: int | None
+    frame_counter_for_initial_blur: int | None
     was_target_seen_recently: bool
     was_target_truncated: bool
     previous_edge_shift: EdgeShift | None
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,12 +178,12 @@ def _has_edge_fit_found_nothing(
     )
 
 
-def _search_half_size(
+def _search_half_size_image(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     # If the edge fit found no sides, a close target has usually moved further than a profile
     # reaches.
-    searched = search_half_size(detector_input, prior.expected_corners_both_markers_px)
+    searched = search_half_size_image(detector_input, prior.expected_corners_both_markers_px)
     if searched is None:
         return earlier_results
     corners = _refine_found_markers(detector_input, searched)
@@ -227,7 +228,7 @@ def _fit_drawing(
     )
 
 
-def _can_be_truncated(
+def _can_target_be_truncated(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     if earlier_results.corners or not prior.was_target_seen_recently:
@@ -269,14 +270,14 @@ def _search(
         detector_input,
         prior.expected_corners_px,
         prior.search_mode,
-        prior.measure_own_target_distance_m,
+        prior.measure_marker_to_own_target_distance_m,
     )
     if len(searched.corners_px) < len(earlier_results.corners):
         return replace(earlier_results, search_result=searched)
     return CornerResults(_refine_found_markers(detector_input, searched), searched)
 
 
-def _can_be_blurred(
+def _can_target_be_blurred(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     allowed = prior.search_mode not in ("whole_sharp", "expected_window")
@@ -289,7 +290,7 @@ def _search_blurred(
     bare = replace(detector_input, hidden_mask=None)
     if prior.expected_corners_px:
         found_corners = find_expected_blurred(
-            bare, prior.expected_corners_px, prior.initial_blur_frame_counter
+            bare, prior.expected_corners_px, prior.frame_counter_for_initial_blur
         )
     else:
         found_corners = find_blurred(bare)
@@ -311,7 +312,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="5 ms, including the measurement of the markers found",
         run_condition_text="the edge fit was tried and found no marker",
         should_run=_has_edge_fit_found_nothing,
-        find=_search_half_size,
+        find=_search_half_size_image,
     ),
     CornerMethod(
         name="Partial-view fit",
@@ -339,7 +340,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="7 ms",
         run_condition_text="nothing was found, and each expected marker may be cut off by the edge "
         "of the image or hidden",
-        should_run=_can_be_truncated,
+        should_run=_can_target_be_truncated,
         find=_fit_truncated_target,
     ),
     CornerMethod(
@@ -357,7 +358,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         requirements_text="a whole marker with sides of 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
         run_condition_text="nothing was found; after a loss, in one of four images",
-        should_run=_can_be_blurred,
+        should_run=_can_target_be_blurred,
         find=_search_blurred,
     ),
 )
@@ -383,7 +384,7 @@ def detect_markers(
     camera: CameraModel,
     expected_corners_px: Mapping[MarkerName, Array] | None = None,
     frames_without_markers: int | None = None,
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
@@ -391,8 +392,8 @@ def detect_markers(
     otherwise near the `previous` detections. The kinds of search alternate depending on
     `frames_without_markers`, the number of successive frames without a marker. If it is None, as
     for the first frame, all kinds of search are used. If no target is expected,
-    `measure_own_target_distance_m` chooses one of several targets. For a frame of two fields, the
-    result is the mean of the fields.
+    `measure_marker_to_own_target_distance_m` chooses one of several targets. For a frame of two
+    fields, the result is the mean of the fields.
     """
     prior = make_detection_prior(
         frame,
@@ -401,11 +402,11 @@ def detect_markers(
         camera,
         expected_corners_px,
         frames_without_markers,
-        measure_own_target_distance_m,
+        measure_marker_to_own_target_distance_m,
     )
     if frame.picture_kind == "woven":
         first, second = (_detect(each, setup, camera, prior) for each in interpolate_fields(frame))
-        return add_marker_flow(average_fields(first, second), previous)
+        return add_marker_flow(average_field_detections(first, second), previous)
     return add_marker_flow(_detect(frame, setup, camera, prior), previous)
 
 
@@ -416,7 +417,7 @@ def make_detection_prior(
     camera: CameraModel,
     expected_corners_px: Mapping[MarkerName, Array] | None = None,
     frames_without_markers: int | None = None,
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> DetectionPrior:
     """Return what is known about the target before the frame. The arguments are those of
     `detect_markers`."""
@@ -428,9 +429,9 @@ def make_detection_prior(
     search_mode = _choose_search_mode(
         frames_without_markers, bool(expected_corners_px), setup.is_line_fit_enabled
     )
-    initial_blur_frame_counter = None
+    frame_counter_for_initial_blur = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
-        initial_blur_frame_counter = (frames_without_markers + 2) // 4
+        frame_counter_for_initial_blur = (frames_without_markers + 2) // 4
     # A part of the target is only recognized at a position that was measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
@@ -452,12 +453,12 @@ def make_detection_prior(
             expected_corners_px, setup.small_to_large_side_ratio, camera
         ),
         search_mode=search_mode,
-        initial_blur_frame_counter=initial_blur_frame_counter,
+        frame_counter_for_initial_blur=frame_counter_for_initial_blur,
         was_target_seen_recently=was_recent,
         was_target_truncated=was_recent
         and not can_complete_marker_be_in_view(last, frame.image.shape),
         previous_edge_shift=previous_edge_shift,
-        measure_own_target_distance_m=measure_own_target_distance_m,
+        measure_marker_to_own_target_distance_m=measure_marker_to_own_target_distance_m,
     )
 
 
@@ -511,8 +512,8 @@ def _is_marker_missing(
     return any(
         name not in found_corners
         and is_inside_image(corners, detector_input.image.shape)
-        and side_lengths_px(corners).min() > _MIN_SEARCHED_SIDE_PX
-        and not is_any_part_hidden(detector_input.hidden_mask, corners)
+        and side_lengths_px(corners).min() > _MIN_MARKER_SIDE_FOUND_BY_SEARCH_PX
+        and not is_any_marker_part_hidden(detector_input.hidden_mask, corners)
         for name, corners in expected_corners_px.items()
     )
 
@@ -556,9 +557,9 @@ def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) ->
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not is_inside_image(r.corners_px, image.shape, IMAGE_MARGIN_PX) or is_any_part_hidden(
-            detector_input.hidden_mask, r.corners_px, 1.0
-        ):
+        elif not is_inside_image(
+            r.corners_px, image.shape, IMAGE_BORDER_MARGIN_PX
+        ) or is_any_marker_part_hidden(detector_input.hidden_mask, r.corners_px, 1.0):
             del fitted[name]
     return refine_photometrically(detector_input, fitted, is_from_search=True)
 
@@ -590,7 +591,7 @@ def _make_detection(
 
 
 _MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
-_MAX_FLOW_AGE_S = 0.25  # older image motion is useless for predicting positions
+_MAX_MARKER_FLOW_AGE_S = 0.25  # older image motion is useless for predicting positions
 
 
 def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
@@ -600,7 +601,7 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
-    moves = 0.0 < gap_s <= _MAX_FLOW_AGE_S
+    moves = 0.0 < gap_s <= _MAX_MARKER_FLOW_AGE_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
         flow = previous.flow_pxps.get(d.marker)
@@ -611,7 +612,7 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
 def add_marker_flow(current: Detections, previous: Detections | None) -> Detections:
     """Return `current` with the image velocity, px/s, of its markers' corners since the `previous`
     detections."""
-    if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_FLOW_AGE_S:
+    if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_MARKER_FLOW_AGE_S:
         return current
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
@@ -628,9 +629,9 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
 
 
 # With larger cells, a line fit is as accurate as a photometric fit, and faster.
-_MIN_ACCURATE_LINE_FIT_CELL_PX = 6.0
+_MIN_CELL_FOR_ACCURATE_LINE_FIT_PX = 6.0
 # For this accuracy, a cell must also be wider than this multiple of the blur's standard deviation.
-_MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO = 6.0
+_MIN_CELL_TO_BLUR_RATIO_FOR_ACCURATE_LINE_FIT = 6.0
 _MAX_ALIGNMENT_MOTION_SIDES = 0.3
 # A marker that is located from the other marker may have a larger standard deviation.
 _MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12
@@ -646,8 +647,8 @@ def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> b
     a cell must be at least 6 px wide, and at least 6 times as wide as the blur."""
     cell_size_px = mean_side_px(corners.corners_px) / pattern.cells_along_border.cells_per_side
     return corners.are_corners_fitted and cell_size_px >= max(
-        _MIN_ACCURATE_LINE_FIT_CELL_PX,
-        _MIN_ACCURATE_LINE_FIT_CELL_TO_BLUR_RATIO * corners.blurriest_side_blur_sigma_px,
+        _MIN_CELL_FOR_ACCURATE_LINE_FIT_PX,
+        _MIN_CELL_TO_BLUR_RATIO_FOR_ACCURATE_LINE_FIT * corners.blurriest_side_blur_sigma_px,
     )
 
 
@@ -674,7 +675,7 @@ def refine_photometrically(
         if (
             start is None
             or not is_inside_image(start, image.shape)
-            or is_any_part_hidden(detector_input.hidden_mask, start)
+            or is_any_marker_part_hidden(detector_input.hidden_mask, start)
         ):
             continue
         is_single = _OTHER_MARKER[name] not in better
@@ -736,7 +737,7 @@ def _initial_corners_px(
 # --- Markers at their expected positions, which are only verified, not searched for ---
 
 
-_MIN_LINE_FIT_CELL_PX = 2.5
+_MIN_CELL_FOR_LINE_FIT_PX = 2.5
 _MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES = 0.12
 
 
@@ -783,9 +784,9 @@ def refine_expected_markers(
         name: expected_corners_px[name]
         for name in MARKERS
         if name in expected_corners_px
-        and is_inside_image(expected_corners_px[name], image.shape, IMAGE_MARGIN_PX)
+        and is_inside_image(expected_corners_px[name], image.shape, IMAGE_BORDER_MARGIN_PX)
         and side_lengths_px(expected_corners_px[name]).min()
-        > _MIN_LINE_FIT_CELL_PX * patterns[name].cells_along_border.cells_per_side
+        > _MIN_CELL_FOR_LINE_FIT_PX * patterns[name].cells_along_border.cells_per_side
     }
     return {
         name: found
@@ -851,7 +852,7 @@ def find_large_marker_around_small(
             _MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES * mean_side_px(small.corners_px), 1.0
         )
 
-    if is_inside_image(start, image.shape, IMAGE_MARGIN_PX):
+    if is_inside_image(start, image.shape, IMAGE_BORDER_MARGIN_PX):
         # The small marker only yields an approximate position, so the fit is repeated from its
         # first result.
         found = fit_lines(detector_input, {"large": start}).get("large")
@@ -869,10 +870,10 @@ def find_large_marker_around_small(
 # --- Mean of the markers in two fields, at the time halfway between the fields ---
 
 
-_MAX_FIELD_MOTION_SIDES = 1.5  # corresponds to 1.9 m/s for the small marker
+_MAX_MOTION_BETWEEN_FIELDS_SIDES = 1.5  # corresponds to 1.9 m/s for the small marker
 
 
-def average_fields(first: Detections, second: Detections) -> Detections:
+def average_field_detections(first: Detections, second: Detections) -> Detections:
     """Return the mean of the corners in two fields, which does not depend on the order of the
     fields. If any marker was detected in both fields, markers detected in only one field are
     omitted."""
@@ -882,7 +883,7 @@ def average_fields(first: Detections, second: Detections) -> Detections:
         if one is None or other is None:
             continue
         offset_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
-        if float(np.linalg.norm(offset_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(
+        if float(np.linalg.norm(offset_px)) < _MAX_MOTION_BETWEEN_FIELDS_SIDES * mean_side_px(
             one.corners_px
         ):
             averaged[name] = _average_detections(one, other)

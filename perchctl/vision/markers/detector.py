@@ -30,8 +30,8 @@ MIRRORED_MARKER_ID = 1
 """Index of the marker's mirror image in its dictionary."""
 # The error of an edge is small because the errors of its hundreds of printed dots average out.
 _PRINT_EDGE_SIGMA_M = 1e-6
-_MIN_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
-_LOOSE_PERIMETER_RATE = 0.05
+_MIN_MARKER_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
+_LOOSE_MIN_PERIMETER_RATE = 0.05
 _LOOSE_POLYGON_ACCURACY_RATE = 0.1
 
 
@@ -107,7 +107,7 @@ def make_aruco_detector(
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = threshold_windows_px
-    parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
+    parameters.minMarkerPerimeterRate = min(1.0, _MIN_MARKER_PERIMETER_PX / max(size_px))
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
@@ -120,7 +120,7 @@ def make_quad_detector(setup: DetectorSetup) -> Any:
     least_px, most_px = _LOOSE_THRESHOLD_WINDOWS_PX
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
-    parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
+    parameters.minMarkerPerimeterRate = _LOOSE_MIN_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
@@ -190,7 +190,7 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
     return np.where(hidden_mask, np.rint(smooth).astype(np.uint8), image)
 
 
-def is_any_part_hidden(
+def is_any_marker_part_hidden(
     hidden_mask: HiddenMask | None,
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,

@@ -69,7 +69,7 @@ PROFILE_POSITIONS_ALONG_SIDE: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
 _SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(
     np.float32
 )
-_PROFILE_BASIS: Floats = np.stack(
+_PROFILE_SAMPLING_MATRIX: Floats = np.stack(
     [np.ones_like(_SAMPLE_POSITIONS_HALF_LENGTHS), _SAMPLE_POSITIONS_HALF_LENGTHS]
 )
 # Positions of the gradient samples along a profile.
@@ -165,7 +165,9 @@ def sample_profiles(
         out=lines[1, ..., 1],
         casting="same_kind",
     )
-    x, y = (lines.reshape(-1, 2) @ _PROFILE_BASIS).reshape(2, rows, n * (SAMPLES_PER_PROFILE + 1))
+    x, y = (lines.reshape(-1, 2) @ _PROFILE_SAMPLING_MATRIX).reshape(
+        2, rows, n * (SAMPLES_PER_PROFILE + 1)
+    )
     profile_greys = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(profile_greys, dtype=np.float32).reshape(rows, n, SAMPLES_PER_PROFILE + 1)
 
@@ -177,7 +179,7 @@ MIN_LINE_SIGMA_PX = 0.015
 """Lower bound of a fitted line's standard deviation, px."""
 
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
-_MAX_RESIDUAL_PX = 0.6
+_MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
 # Robust weights reduce the squared residuals and the number of samples; this factor compensates.
 _ROBUST_LINE_VARIANCE_FACTOR = 1.7
@@ -186,9 +188,9 @@ _NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
 # Profiles are too short for wide edges. The error, px, grows with the cube of the blur.
 _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = 0.0022
 # If white is clipped, edges move by different amounts.
-CLIPPED_CORNER_SIGMA_PX = 0.1
+CORNER_SIGMA_IF_WHITE_CLIPPED_PX = 0.1
 # White counts as clipped if more than this fraction of the profiles (or pixels) is clipped.
-MIN_CLIPPED_FRACTION = 0.05
+MIN_CLIPPED_WHITE_FRACTION = 0.05
 # A wide edge that is off centre extends beyond its profile.
 _MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # Profiles reach at most 7 px to each side. An edge 6 px off the centre extended beyond its profile
@@ -202,10 +204,10 @@ _MIN_FLANK_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side 
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
 _MAX_EDGE_BLUR_CELLS = 0.45  # with more blur, the two edges of a border merge
-_MIN_SIDE_WEIGHT_SUM = 3.0
+_MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
 _EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # The shift is due to glare and gamma.
-_CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.4  # The shift is due to clipping.
-CLIPPED_GREY = 248.0
+_EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX = 0.4  # The shift is due to clipping.
+MIN_CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
 _PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
 _PROFILE_ONES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
@@ -263,10 +265,10 @@ def _refine_lines_once(
         image, markers, camera, with_inner_edges=known_edge_shift is None
     )
     glaring = (
-        np.count_nonzero(outer_edges.profile_greys[:, :, -1] > CLIPPED_GREY, axis=1)
+        np.count_nonzero(outer_edges.profile_greys[:, :, -1] > MIN_CLIPPED_GREY, axis=1)
         / PROFILES_PER_SIDE
     )
-    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_FRACTION
+    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_WHITE_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light, so it is measured again.
         return _refine_lines_once(image, raw_corners_px, cells_along_border, camera, None)
@@ -285,7 +287,7 @@ def _refine_lines_once(
     if applied.white_growth_px != 0.0:
         line_nx_ny_c = line_nx_ny_c.copy()
         line_nx_ny_c[:, 2] += _line_normal_outward_signs(markers, line_nx_ny_c) * (
-            applied.white_growth_px / markers.px_per_normalised
+            applied.white_growth_px / markers.px_per_normalised_unit
         )
     corners = _intersect_adjacent_sides(line_nx_ny_c)
     if not is_finite(corners):
@@ -349,7 +351,7 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
         ny,
         nx * cx + ny * cy,
     )
-    return line_nx_ny_c, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised
+    return line_nx_ny_c, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised_unit
 
 
 def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
@@ -371,8 +373,8 @@ def edge_shift_prior_sigma_px(white_grey: float) -> float:
     """Return the prior standard deviation, px, of the growth of white over black, before any
     measurement. It is larger if `white_grey`, the grey level of the white paper, is clipped."""
     return (
-        _CLIPPED_EDGE_SHIFT_PRIOR_SIGMA_PX
-        if white_grey > CLIPPED_GREY
+        _EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX
+        if white_grey > MIN_CLIPPED_GREY
         else _EDGE_SHIFT_PRIOR_SIGMA_PX
     )
 
@@ -413,7 +415,7 @@ def _measure_edge_shift(
     w = inner_edges.weight * (inner_edges.blur_sigma_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
     w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
     mass = w.sum(axis=1)
-    some = mass > _MIN_SIDE_WEIGHT_SUM
+    some = mass > _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
     if not some.any():
         return EdgeShift(0.0, prior_px)
     # If the sheet is curled, the outer edges move further than the inner ones, and the ends of a
@@ -457,7 +459,8 @@ def _side_bow_px(
         - line_nx_ny_c[four, 2:]
     )
     scale = (
-        _line_normal_outward_signs(markers, line_nx_ny_c)[four] * markers.px_per_normalised[four]
+        _line_normal_outward_signs(markers, line_nx_ny_c)[four]
+        * markers.px_per_normalised_unit[four]
     )
     mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
     bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
@@ -482,7 +485,7 @@ def _are_sides_accepted(
     contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
         _PROFILE_ONES_F32
     )
-    lines = (rms_residual_px < _MAX_RESIDUAL_PX) & (
+    lines = (rms_residual_px < _MAX_EDGE_FIT_RMS_RESIDUAL_PX) & (
         inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE
     )
     lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
@@ -510,7 +513,7 @@ def _corner_sigma_px(
         * math.exp(-cell_size_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_sigma_px))
     )
     reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_sigma_px**3
-    clipped_px = CLIPPED_CORNER_SIGMA_PX if is_white_clipped else 0.0
+    clipped_px = CORNER_SIGMA_IF_WHITE_CLIPPED_PX if is_white_clipped else 0.0
     # Printed edges deviate from their nominal positions.
     print_px = print_tolerance_cells * cell_size_px
     noise_px = max(math.sqrt(line_end_variance_px2), MIN_LINE_SIGMA_PX)
@@ -546,7 +549,9 @@ def _row_jitter_sigma_px(
 # more rows.
 
 
-_MIN_EDGE_SHIFT_CELL_PX = 6.0  # with smaller cells, the border's inner edge is not measured
+_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX = (
+    6.0  # with smaller cells, the border's inner edge is not measured
+)
 _SIDE_INDICES = np.arange(4)[:, None]
 
 
@@ -563,7 +568,7 @@ class MarkerSides:
         cell_size_px: mean width of a cell, (m,).
         widest_marker_index: index of the marker with the widest cells.
         winding_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
-        px_per_normalised: pixels per unit of normalised coordinates along each side, (4m,).
+        px_per_normalised_unit: pixels per unit of normalised coordinates along each side, (4m,).
     """
 
     raw_corners_px: Array
@@ -574,7 +579,7 @@ class MarkerSides:
     cell_size_px: Array
     widest_marker_index: int
     winding_sign: Array
-    px_per_normalised: Array
+    px_per_normalised_unit: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -623,7 +628,7 @@ def prepare_marker_sides(
         cell_size_px=cell_size_px,
         widest_marker_index=int(cell_size_px.argmax()),
         winding_sign=turn,
-        px_per_normalised=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
+        px_per_normalised_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
@@ -642,7 +647,8 @@ def measure_edges(
     widest = markers.widest_marker_index
     rim = markers.cells_along_border[widest]
     with_inner_edges = (
-        with_inner_edges and float(markers.cell_size_px[widest]) > _MIN_EDGE_SHIFT_CELL_PX
+        with_inner_edges
+        and float(markers.cell_size_px[widest]) > _MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX
     )
     if with_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
@@ -752,8 +758,8 @@ _MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9
 # Limits of an edge's second moment; the upper one is relative to the window's variance.
 _MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
 # Half length of the wide window, in units of its standard deviation.
-_WIDE_WINDOW_HALF_LENGTH_SIGMAS = 1.0 / 0.6
-_TUKEY_CUTOFF_MEDIANS = 3.5 * 1.4826
+_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA = 1.0 / 0.6
+_TUKEY_CUTOFF_TO_MEDIAN_RESIDUAL_RATIO = 3.5 * 1.4826
 _PROFILE_POSITION_POWERS: Floats = (PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(3)).astype(
     np.float32
 )
@@ -762,21 +768,21 @@ _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
 _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = 0.3
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # A smaller cutoff would reject ordinary noise.
 # If the wide window is off by less than this, one iteration with the narrow window is enough.
-_MAX_WIDE_WINDOW_ERROR_PX = 0.2
+_MAX_WIDE_WINDOW_EDGE_ERROR_PX = 0.2
 _MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
-_OUT_OF_RANGE_PX = 1e6
+_OUT_OF_RANGE_OFFSET_PX = 1e6
 _PROFILES_PER_QUARTER_SIDE = PROFILES_PER_SIDE // 4
 _QUARTER_SIDE_ONES: Floats = np.ones(_PROFILES_PER_QUARTER_SIDE, dtype=np.float32)
 # Matrix (2, n) that maps the midmeans in both halves of a side to the line through them.
-_HALF_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
+_HALF_SIDE_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
     0.5 / float(PROFILE_POSITIONS_ALONG_SIDE[PROFILES_PER_SIDE // 2 :].mean())
 )
-_HALF_MIDMEANS_TO_LINE: Floats = np.stack(
-    [0.5 - _HALF_MIDMEANS_TO_SLOPE, 0.5 + _HALF_MIDMEANS_TO_SLOPE]
+_HALF_SIDE_MIDMEANS_TO_LINE: Floats = np.stack(
+    [0.5 - _HALF_SIDE_MIDMEANS_TO_SLOPE, 0.5 + _HALF_SIDE_MIDMEANS_TO_SLOPE]
 )
 _MEDIAN_PRESERVING_FILL_PX: Floats = np.where(
-    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE_PX, -_OUT_OF_RANGE_PX
+    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE_OFFSET_PX, -_OUT_OF_RANGE_OFFSET_PX
 ).astype(np.float32)
 
 
@@ -819,10 +825,10 @@ def locate_edges(
     )
     edge_offsets_px, is_usable = profiles.locate_in_wide_window()
     blur_variance_px2 = np.ones(len(window_half_length_px), dtype=np.float32)
-    line = weight = _fit_line_to_half_midmeans(edge_offsets_px, is_usable)
+    line = weight = _fit_line_to_half_side_midmeans(edge_offsets_px, is_usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
-        if k == 1 and moved_px < _MAX_WIDE_WINDOW_ERROR_PX:
+        if k == 1 and moved_px < _MAX_WIDE_WINDOW_EDGE_ERROR_PX:
             continue
         edge_offsets_px, is_usable, blur_variance_px2 = profiles.locate_in_narrow_window(
             line, blur_variance_px2
@@ -874,7 +880,7 @@ class _EdgeProfiles:
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Locate the edge on each profile with a wide window around the middle of the profile.
         Return the edge offsets, px (rows, n), and whether each profile is usable (rows, n)."""
-        spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_SIGMAS / self.near)[:, None]
+        spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
         np.exp(-0.5 * spread, out=window[..., 0])
@@ -928,7 +934,9 @@ class _EdgeProfiles:
         return line_offsets_px + np.minimum(np.maximum(centroid, -limit), limit), is_usable, found2
 
 
-def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bool_]) -> Floats:
+def _fit_line_to_half_side_midmeans(
+    edge_offsets_px: Floats, is_usable: NDArray[np.bool_]
+) -> Floats:
     """Fit a line to each side through the midmeans (the means of the middle 50 %) of the offsets in
     both halves of its profiles. Up to a quarter of the profiles in each half may be outliers.
     Returns the line's offsets (rows, n)."""
@@ -940,10 +948,10 @@ def _fit_line_to_half_midmeans(edge_offsets_px: Floats, is_usable: NDArray[np.bo
     middle = halves[:, :, first : first + _PROFILES_PER_QUARTER_SIDE]
     # Exclude fill values before the sum: added to such large values, the edge positions would be
     # lost to rounding.
-    shown = np.abs(middle) < _OUT_OF_RANGE_PX
+    shown = np.abs(middle) < _OUT_OF_RANGE_OFFSET_PX
     count = shown @ _QUARTER_SIDE_ONES
     mean = (middle * shown) @ _QUARTER_SIDE_ONES / np.maximum(count, 1.0)
-    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALF_MIDMEANS_TO_LINE)
+    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALF_SIDE_MIDMEANS_TO_LINE)
 
 
 def _fit_robust_line(
@@ -955,7 +963,8 @@ def _fit_robust_line(
     for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)
         size /= np.maximum(
-            _TUKEY_CUTOFF_MEDIANS * median_per_row(size, is_usable), _MIN_TUKEY_CUTOFF_PX
+            _TUKEY_CUTOFF_TO_MEDIAN_RESIDUAL_RATIO * median_per_row(size, is_usable),
+            _MIN_TUKEY_CUTOFF_PX,
         )[:, None]
         size *= size
         weight = np.maximum(1.0 - size, 0.0)
@@ -976,4 +985,4 @@ def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
-    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE_PX, found, 0.0))
+    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE_OFFSET_PX, found, 0.0))

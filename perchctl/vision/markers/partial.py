@@ -45,7 +45,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.detector import DetectorInput, is_any_part_hidden
+from perchctl.vision.markers.detector import DetectorInput, is_any_marker_part_hidden
 from perchctl.vision.markers.edge_fit import (
     MIN_LINE_SIGMA_PX,
     PROFILES_PER_SIDE,
@@ -61,7 +61,7 @@ from perchctl.vision.markers.edge_fit import (
     window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST,
+    MIN_CELL_MARGIN_TO_CONTRAST_RATIO,
     MIN_CONTRAST_GREY,
     MIN_MATCHING_CELL_FRACTION,
     MarkerPattern,
@@ -69,10 +69,10 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 # With smaller cells, a part of a side carries no information.
-MIN_PARTIAL_FIT_CELL_PX = 4.0
+MIN_CELL_FOR_PARTIAL_FIT_PX = 4.0
 _PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
-_MAX_RESIDUAL_PX = 0.6
-_MAX_BLUR_PER_WINDOW_HALF_LENGTH = 0.9
+_MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
+_MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
 _MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 # Robust weights make the squared residuals smaller; this factor compensates for it.
@@ -101,7 +101,7 @@ def fit_partly_visible_marker(
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
         not mean_side_px(start_corners_px) / pattern.cells_along_border.cells_per_side
-        >= MIN_PARTIAL_FIT_CELL_PX
+        >= MIN_CELL_FOR_PARTIAL_FIT_PX
     ):
         return None
     # Enough cells must be in the image wherever the fit may converge.
@@ -110,7 +110,7 @@ def fit_partly_visible_marker(
         detector_input.image.shape,
         _MAX_MOTION_FROM_START_PX,
     )
-    if not _has_enough_known_cells(_is_cell_known(in_picture, pattern), pattern, identified_by):
+    if not _are_enough_cells_visible(_is_cell_visible(in_picture, pattern), pattern, identified_by):
         return None
     start = undistort_px(start_corners_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
@@ -149,10 +149,10 @@ def fit_partly_visible_marker(
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
     """True if no part of the marker is hidden or outside the image."""
-    margin_px = IMAGE_MARGIN_PX + corners.blurriest_side_blur_sigma_px
+    margin_px = IMAGE_BORDER_MARGIN_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
-    ) and not is_any_part_hidden(detector_input.hidden_mask, corners.corners_px)
+    ) and not is_any_marker_part_hidden(detector_input.hidden_mask, corners.corners_px)
 
 
 def _linearize_edges(
@@ -212,11 +212,12 @@ def _make_refined_corners(
     if (
         not used.any()
         or (
-            visible_edges.blur_sigma_per_window_half_length[used] > _MAX_BLUR_PER_WINDOW_HALF_LENGTH
+            visible_edges.blur_sigma_to_window_half_length_ratio[used]
+            > _MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO
         ).any()
     ):
         return None
-    if float((w * residual_px**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
+    if float((w * residual_px**2).sum() / w.sum()) > _MAX_EDGE_FIT_RMS_RESIDUAL_PX**2:
         return None
     mean = (w * residual_px).sum(axis=1) / np.maximum(mass, 1e-9)
     scatter = float((w * (residual_px - mean[:, None]) ** 2).sum() / w.sum())
@@ -303,16 +304,16 @@ def _has_matching_visible_cells(
     means = np.bincount(pattern.sample_cell_index, weights=grey * is_sample_visible) / np.maximum(
         count, 1.0
     )
-    is_known = _is_cell_known(is_sample_visible, pattern)
+    is_known = _is_cell_visible(is_sample_visible, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_cell_white, 1.0, -1.0)
-    wrong = np.count_nonzero(is_known & (share < MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST))
+    wrong = np.count_nonzero(is_known & (share < MIN_CELL_MARGIN_TO_CONTRAST_RATIO))
     most_wrong = 0
     if identified_by == "other_marker":
         most_wrong = math.floor(
             (1.0 - MIN_MATCHING_CELL_FRACTION)
             * np.count_nonzero(is_known & pattern.is_cell_inside_border)
         )
-    return bool(wrong <= most_wrong) and _has_enough_known_cells(is_known, pattern, identified_by)
+    return bool(wrong <= most_wrong) and _are_enough_cells_visible(is_known, pattern, identified_by)
 
 
 def _project_sample_points_px(
@@ -347,7 +348,7 @@ def _is_point_in_image(
     return np.asarray(inside.all(axis=1))
 
 
-def _is_cell_known(
+def _is_cell_visible(
     is_sample_visible: NDArray[np.bool_], pattern: MarkerPattern
 ) -> NDArray[np.bool_]:
     """Return for each cell (cells,) whether at least half of its sample points are visible, given
@@ -359,7 +360,7 @@ def _is_cell_known(
     return is_known
 
 
-def _has_enough_known_cells(
+def _are_enough_cells_visible(
     is_known: NDArray[np.bool_], pattern: MarkerPattern, identified_by: IdentificationEvidence
 ) -> bool:
     most_unknown = (
@@ -374,18 +375,20 @@ def _has_enough_known_cells(
 # --- The visible edges of a marker: its sides, and the inner edges of its border ---
 
 
-IMAGE_MARGIN_PX = 2.0
+IMAGE_BORDER_MARGIN_PX = 2.0
 """Closer than this to the image border, px, the blur of an edge would extend beyond the image."""
 # With smaller cells, the inner and the outer edge of the border are not separate.
-_MIN_INNER_EDGE_CELL_PX = 6.0
+_MIN_CELL_TO_MEASURE_INNER_EDGE_PX = 6.0
 # A clean profile deviates from black on its dark side, and from white on its bright side, by less
 # than these fractions of the contrast.
 _BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
-_MIN_SIDE_WEIGHT_SUM = 3.0
+_MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
 _MIN_VISIBLE_EDGES = 4  # A square has eight unknowns, and an edge determines two of them.
-_OUT_OF_RANGE_PX = 1e6
-_WINDOW_SAMPLE_OFFSETS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[:, None]
+_OUT_OF_RANGE_OFFSET_PX = 1e6
+_WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[
+    :, None
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,8 +405,8 @@ class VisibleEdges:
         edge_to_centre_half_sides: distance of the edge from the marker's centre: 1 for a side,
             less for an inner edge of the border, (rows,).
         px_per_half_side: image scale across the edge, (rows,).
-        blur_sigma_per_window_half_length: standard deviation of the blur divided by the half length
-            of the window, (rows,).
+        blur_sigma_to_window_half_length_ratio: standard deviation of the blur divided by the half
+            length of the window, (rows,).
         white_grey: grey level of white paper.
     """
 
@@ -413,7 +416,7 @@ class VisibleEdges:
     side_index: NDArray[np.intp]
     edge_to_centre_half_sides: Array
     px_per_half_side: Array
-    blur_sigma_per_window_half_length: Array
+    blur_sigma_to_window_half_length_ratio: Array
     white_grey: float
 
 
@@ -431,7 +434,9 @@ def find_visible_edges(
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
     cell_size_px = float(sides_px.mean()) / cells
-    rings = (1.0, 1.0 - 2.0 / cells) if cell_size_px > _MIN_INNER_EDGE_CELL_PX else (1.0,)
+    rings = (
+        (1.0, 1.0 - 2.0 / cells) if cell_size_px > _MIN_CELL_TO_MEASURE_INNER_EDGE_PX else (1.0,)
+    )
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H_pinhole_marker
@@ -441,7 +446,7 @@ def find_visible_edges(
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     # Far outside the image, a lens model may return any position, even NaN.
-    if not (np.abs(origin) < _OUT_OF_RANGE_PX).all():
+    if not (np.abs(origin) < _OUT_OF_RANGE_OFFSET_PX).all():
         return None
     # The paper is white outside the marker and, for the inner edges, inside the border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
@@ -456,7 +461,9 @@ def find_visible_edges(
     is_unobstructed = around.is_edge_locatable & _is_profile_in_view(
         detector_input, origin, normal, window_half_length_px
     )
-    kept = np.flatnonzero(np.count_nonzero(is_unobstructed, axis=1) >= _MIN_SIDE_WEIGHT_SUM)
+    kept = np.flatnonzero(
+        np.count_nonzero(is_unobstructed, axis=1) >= _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
+    )
     if len(kept) < _MIN_VISIBLE_EDGES:
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
@@ -479,7 +486,7 @@ def find_visible_edges(
         profile_greys, profile_half_length_px, window_half_length_px, around
     )
     weight = np.where(good, weight, 0.0)
-    weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT_SUM] = 0.0
+    weight[weight.sum(axis=1) < _MIN_PROFILE_WEIGHT_SUM_PER_SIDE] = 0.0
     found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = apply_homography(
         np.asarray(np.linalg.inv(H_pinhole_marker)), pinhole_px(found, camera)
@@ -494,7 +501,7 @@ def find_visible_edges(
         side_index=side,
         edge_to_centre_half_sides=at,
         px_per_half_side=scale_px,
-        blur_sigma_per_window_half_length=blur_px / window_half_length_px,
+        blur_sigma_to_window_half_length_ratio=blur_px / window_half_length_px,
         white_grey=white,
     )
 
@@ -509,15 +516,17 @@ def _is_profile_in_view(
     # A profile is in the image if both of its ends are in the image.
     reach, last = (
         window_half_length_px[:, None, None] * np.abs(profile_direction),
-        (w - 1 - IMAGE_MARGIN_PX, h - 1 - IMAGE_MARGIN_PX),
+        (w - 1 - IMAGE_BORDER_MARGIN_PX, h - 1 - IMAGE_BORDER_MARGIN_PX),
     )
-    x_and_y = (profile_centre_px - reach >= IMAGE_MARGIN_PX) & (profile_centre_px + reach <= last)
+    x_and_y = (profile_centre_px - reach >= IMAGE_BORDER_MARGIN_PX) & (
+        profile_centre_px + reach <= last
+    )
     seen = x_and_y[..., 0] & x_and_y[..., 1]
     if hidden_mask is not None and seen.any():
         at = (
             profile_centre_px[:, :, None]
             + window_half_length_px[:, None, None, None]
-            * _WINDOW_SAMPLE_OFFSETS
+            * _WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS
             * profile_direction[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)

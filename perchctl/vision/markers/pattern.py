@@ -21,7 +21,7 @@ from perchctl.vision.markers.corners import (
 MIN_MARKER_SIDE_PX = 7.0  # A smaller marker looks like a blob.
 MIN_CONTRAST_GREY = 10.0
 # A cell must differ from the threshold by at least this fraction of the contrast.
-MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST = 0.1
+MIN_CELL_MARGIN_TO_CONTRAST_RATIO = 0.1
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Fraction of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
@@ -148,7 +148,7 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Mar
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), MIN_CELL_THRESHOLD_MARGIN_PER_CONTRAST * contrast
+    middle, margin = 0.5 * (high + low), MIN_CELL_MARGIN_TO_CONTRAST_RATIO * contrast
     return bool(
         contrast >= MIN_CONTRAST_GREY
         and white.min() > middle + margin

@@ -56,7 +56,7 @@ _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
 """Number of iterations after which the fit fails unless its correlation has reached
 `_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two iterations."""
-_CONVERGED_STEP_PX = 0.05  # After a step this small, the next one is usually a tenth of it.
+_MAX_CONVERGED_STEP_PX = 0.05  # After a step this small, the next one is usually a tenth of it.
 # After a larger motion, the lens distortion is computed again.
 _MAX_DISTORTION_REUSE_MOTION_PX = 0.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5  # With a larger increment, the fit has diverged.
@@ -72,7 +72,7 @@ _MAX_BLUR_VARIANCE_STEP_FRACTION = 0.5
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
 """The drawing is not rendered again for a change of the blur that is below both limits: a fraction
 of the blur, and a fraction of a cell."""
-_MIN_GAIN_GREY = 10.0
+_MIN_FITTED_CONTRAST_GREY = 10.0
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 # Indices of the unknowns: homography increment, blur, illumination.
 _SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
@@ -104,8 +104,8 @@ class DrawingAlignment:
             square of the same size leaves in the image.
         pattern_to_border_contrast_ratio: contrast of the inner bits relative to the contrast of the
             border.
-        largest_cell_deviation_per_contrast: largest deviation of a cell's mean grey from its mean
-            grey in the fitted drawing, relative to the contrast of black and white.
+        largest_cell_grey_deviation_to_contrast_ratio: largest deviation of a cell's mean grey from
+            its mean grey in the fitted drawing, relative to the contrast of black and white.
         worst_cell_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as
             drawn) to 1 (flipped bit).
         largest_cell_flip_fraction_sigma: standard deviation of `worst_cell_flip_fraction` for the
@@ -119,7 +119,7 @@ class DrawingAlignment:
     fit_correlation: float
     pattern_correlation: float
     pattern_to_border_contrast_ratio: float
-    largest_cell_deviation_per_contrast: float
+    largest_cell_grey_deviation_to_contrast_ratio: float
     worst_cell_flip_fraction: float
     largest_cell_flip_fraction_sigma: float
     blur_sigma_px: float
@@ -226,7 +226,9 @@ def align_drawing(
         drawn_px = rendered_drawing.blur_sigma_nodes * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_size_px):
             rendered_drawing = drawn(wanted_px)
-        elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX:
+        elif (
+            motion_px < _MAX_CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX
+        ):
             break
     assert equations is not None
     # These are the residuals of the last iteration, whose step was negligible.
@@ -259,7 +261,7 @@ def align_drawing(
         fit_correlation=fit_correlation(grey, grey_residual),
         pattern_correlation=pattern_correlation,
         pattern_to_border_contrast_ratio=pattern_to_border_contrast_ratio,
-        largest_cell_deviation_per_contrast=_largest_cell_deviation(
+        largest_cell_grey_deviation_to_contrast_ratio=_largest_cell_grey_deviation(
             grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
         worst_cell_flip_fraction=worst_cell_flip_fraction,
@@ -279,7 +281,7 @@ def _linearize_greys(
     A[BEND, BEND] += 1e-3 * len(grey)  # keeps the bend at zero unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     contrast_grey = float(illumination[GAIN])
-    if contrast_grey < _MIN_GAIN_GREY:
+    if contrast_grey < _MIN_FITTED_CONTRAST_GREY:
         return None
     grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
     J = np.concatenate(
@@ -373,7 +375,7 @@ def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     return factor
 
 
-def _largest_cell_deviation(
+def _largest_cell_grey_deviation(
     residual_per_contrast: Array, grid: SamplingGrid, cells_per_side: int
 ) -> float:
     index, count = _assign_nodes_to_cells(grid, cells_per_side)

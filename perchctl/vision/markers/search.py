@@ -30,7 +30,7 @@ from perchctl.vision.markers.detector import (
     ThresholdWindowRange,
     make_aruco_detector,
 )
-from perchctl.vision.target_selection import OwnTargetDistanceFunction
+from perchctl.vision.target_selection import MarkerToOwnTargetDistanceFunction
 from perchctl.vision.types import MARKERS, MarkerName
 
 SearchMode = Literal[
@@ -41,10 +41,10 @@ with OpenCV, "expected_fits" fits a blurred target at that position, and "near_e
 "whole_sharp" searches the whole image with OpenCV, which needs a sharp target, and "whole_blurred"
 searches it for a blurred target. "all" combines all of these."""
 _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25
-_WINDOW_MARGIN_PX = 24
-_MIN_WINDOW_PX = 16
+_SEARCH_WINDOW_MARGIN_PX = 24
+_MIN_SEARCH_WINDOW_SIDE_PX = 16
 _MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8
-_MIN_SIDE_BEFORE_HALVING_PX = 60.0
+_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX = 60.0
 """Markers whose sides, px, are longer than this are searched for in an image of half the size,
 which takes a quarter of the time."""
 _NESTING_TOLERANCE_SMALL_MARKER_SIDES = 0.35
@@ -69,7 +69,7 @@ def search(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
     """Search the window around the expected markers with OpenCV's detector. If markers are missing
     in the window, search the whole image.
@@ -78,7 +78,7 @@ def search(
     two modes differ in the fits to blurred markers that follow. With "whole_sharp", only the whole
     image is searched. Other modes search both. If several targets are found and none is expected,
     the search returns the one closest to this vehicle's own target
-    (`measure_own_target_distance_m`).
+    (`measure_marker_to_own_target_distance_m`).
     """
     setup, shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
@@ -89,12 +89,12 @@ def search(
             part,
             expected_corners_px,
             threshold_windows_px,
-            measure_own_target_distance_m,
+            measure_marker_to_own_target_distance_m,
         )
 
     if setup.is_line_fit_enabled and expected_corners_px and search_mode != "whole_sharp":
-        quickly = search_half_size(
-            detector_input, expected_corners_px, measure_own_target_distance_m
+        quickly = search_half_size_image(
+            detector_input, expected_corners_px, measure_marker_to_own_target_distance_m
         )
         if quickly is not None:
             return quickly
@@ -113,10 +113,10 @@ def search(
     return search_part(whole, OPENCV_THRESHOLD_WINDOWS_PX)
 
 
-def search_half_size(
+def search_half_size_image(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
     """Search the window in an image of half the size, which takes 1 ms. Return None if this search
     misses a marker that is expected to be completely in view, or if the expected markers are not
@@ -126,7 +126,7 @@ def search_half_size(
     if (
         len(expected_corners_px) < 2
         or not in_view
-        or min(map(mean_side_px, in_view)) <= _MIN_SIDE_BEFORE_HALVING_PX
+        or min(map(mean_side_px, in_view)) <= _MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX
     ):
         return None
     window = make_search_window(
@@ -138,7 +138,7 @@ def search_half_size(
         window,
         expected_corners_px,
         QUICK_THRESHOLD_WINDOWS_PX,
-        measure_own_target_distance_m,
+        measure_marker_to_own_target_distance_m,
         must_halve_image=True,
     )
     return found if len(found.corners_px) >= len(in_view) else None
@@ -163,12 +163,14 @@ def make_search_window(
         inside = (whole >= 0).all() and (whole < (w, h)).all()
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = np.maximum(_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _WINDOW_MARGIN_PX)
+    margin = np.maximum(
+        _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _SEARCH_WINDOW_MARGIN_PX
+    )
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
     width, height = int(right - left), int(bottom - top)
     if (
-        min(width, height) < _MIN_WINDOW_PX
+        min(width, height) < _MIN_SEARCH_WINDOW_SIDE_PX
         or width * height > _MAX_WINDOW_TO_IMAGE_AREA_RATIO * w * h
     ):
         return None
@@ -180,7 +182,7 @@ def _search_once(
     window: ImageWindow,
     expected_corners_px: Mapping[MarkerName, Array],
     threshold_windows_px: ThresholdWindowRange,
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None,
     must_halve_image: bool = False,
 ) -> FoundMarkers:
     setup, part = detector_input.setup, detector_input.image[window]
@@ -207,7 +209,7 @@ def _search_once(
         candidates,
         expected_corners_px,
         setup.small_to_large_side_ratio,
-        measure_own_target_distance_m,
+        measure_marker_to_own_target_distance_m,
     )
     return FoundMarkers(chosen, is_mirrored_marker_seen, targets)
 
@@ -216,16 +218,18 @@ def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
     expected_corners_px: Mapping[MarkerName, Array],
     small_to_large_side_ratio: float,
-    measure_own_target_distance_m: OwnTargetDistanceFunction | None = None,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
     A small marker with the right size and rotation in the centre of a large one confirms both
     markers. Markers at expected positions take precedence over a pair elsewhere. Among single
-    markers, the one with the shortest `measure_own_target_distance_m` is chosen.
+    markers, the one with the shortest `measure_marker_to_own_target_distance_m` is chosen.
     """
-    if measure_own_target_distance_m is not None and not expected_corners_px:
-        candidates = _sort_by_own_target_distance(candidates, measure_own_target_distance_m)
+    if measure_marker_to_own_target_distance_m is not None and not expected_corners_px:
+        candidates = _sort_by_own_target_distance(
+            candidates, measure_marker_to_own_target_distance_m
+        )
     large, small = candidates["large"], candidates["small"]
     wholes = _pair_markers(candidates, small_to_large_side_ratio)
     near_large = _nearest_candidate("large", large, expected_corners_px, small_to_large_side_ratio)
@@ -238,7 +242,7 @@ def choose_markers(
                 float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes
             ]
             _, i, j = wholes[int(np.argmin(distances_px))]
-        elif measure_own_target_distance_m is not None:
+        elif measure_marker_to_own_target_distance_m is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = (
             _nearest_candidate("large", [large[i]], expected_corners_px, small_to_large_side_ratio)
@@ -250,7 +254,7 @@ def choose_markers(
         return {"large": near_large}
     if near_small is not None:
         return {"small": near_small}
-    if measure_own_target_distance_m is not None and not expected_corners_px:
+    if measure_marker_to_own_target_distance_m is not None and not expected_corners_px:
         large, small = large[:1], small[:1]
     # A small marker next to a complete large one does not belong to the target.
     if len(large) == 1:
@@ -262,7 +266,7 @@ def choose_markers(
 
 def _sort_by_own_target_distance(
     candidates: Mapping[MarkerName, list[Array]],
-    measure_own_target_distance_m: OwnTargetDistanceFunction,
+    measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction,
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates, sorted by their distance from the position of this vehicle's own
     target, without those that are too far away to be this target.
@@ -274,7 +278,7 @@ def _sort_by_own_target_distance(
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
     for name, quads in candidates.items():
-        distances_m = [measure_own_target_distance_m(name, quad) for quad in quads]
+        distances_m = [measure_marker_to_own_target_distance_m(name, quad) for quad in quads]
         order = np.argsort(distances_m, kind="stable").tolist()
         kept[name] = [quads[k] for k in order if math.isfinite(distances_m[k])]
     return kept if any(kept.values()) else candidates

@@ -11,7 +11,7 @@ from perchctl.vision import project, square_corners
 from perchctl.vision.markers import detect
 from perchctl.vision.markers.detect import (
     CORNER_METHODS,
-    average_fields,
+    average_field_detections,
     detect_markers,
     find_corners,
     find_large_marker_around_small,
@@ -151,7 +151,7 @@ def test_nothing_is_between_two_targets() -> None:
         Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, are_corners_fitted=True))
         for x in (100.0, 400.0)
     ]
-    mean = average_fields(*fields)
+    mean = average_field_detections(*fields)
     assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)
 
 

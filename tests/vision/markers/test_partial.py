@@ -25,7 +25,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
     DetectorInput,
-    is_any_part_hidden,
+    is_any_marker_part_hidden,
     make_detector_setup,
     make_hidden_mask,
 )
@@ -249,7 +249,7 @@ LEGS = {
 def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
-    assert is_any_part_hidden(covered, TRUE)
+    assert is_any_marker_part_hidden(covered, TRUE)
     bare, at = render(*POSE, noise=2.0), homography_from_centred_square(undistort_px(TRUE, CAMERA))
     seen = [
         find_visible_edges(DetectorInput(bare, gear, SETUP, CAMERA), at, LARGE)
